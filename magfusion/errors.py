@@ -1,0 +1,13 @@
+"""The two ways in which a job ends without its result."""
+
+
+class InputError(ValueError):
+    """Input that a user can mend.
+
+    The message is one sentence that names the file, the place in it, what was found and the
+    remedy; the command line prints it and exits with 2.
+    """
+
+
+class EstimationError(RuntimeError):
+    """An estimator that failed on input that was well formed; the command line exits with 1."""

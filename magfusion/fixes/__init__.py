@@ -1,0 +1,1 @@
+"""From one epoch to a pose, without a prior guess."""

@@ -1,0 +1,1 @@
+"""Fields and inertial data in one estimate."""

@@ -1,0 +1,1 @@
+"""The ground: pure functions of physics on arrays, batched."""

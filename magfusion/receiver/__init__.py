@@ -1,0 +1,1 @@
+"""From the raw waveform to phasors with covariance."""

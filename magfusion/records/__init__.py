@@ -1,0 +1,1 @@
+"""Recorded data: the log and its readers and writers."""

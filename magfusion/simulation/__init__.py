@@ -1,0 +1,1 @@
+"""Motion, inertial sensors, field and waveform: a log in the same files a user has."""

@@ -1,0 +1,232 @@
+"""The installation: beacons, the platform that moves among them, and how well each is known."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from magfusion.units import Array, ComplexArray
+
+
+def _zeros3() -> Array:
+    return np.zeros(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Coil:
+    """One coil of a beacon, driven by ``cos(2 pi f t + phase)``.
+
+    Parameters
+    ----------
+    moment_beacon : ndarray, shape (3,)
+        Peak moment (A m^2).
+    phase : float
+        Drive phase relative to the log clock (rad).
+    centre_beacon : ndarray, shape (3,)
+        Magnetic centre relative to the beacon's origin (m).
+    radius, length : float, optional
+        Finite size (m); the simulator uses it, the dipole model does not.
+    frequency_hz : float, optional
+        Drive frequency where it differs from the beacon's (frequency division).
+    slot : int, optional
+        Time slot, counted from 0, where coils are driven in turn (time division).
+    """
+
+    moment_beacon: Array
+    phase: float = 0.0
+    centre_beacon: Array = field(default_factory=_zeros3)
+    radius: float | None = None
+    length: float | None = None
+    frequency_hz: float | None = None
+    slot: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class BeaconSigma:
+    """Prior standard deviations of a beacon's calibration; zero means known.
+
+    Parameters
+    ----------
+    position_world : ndarray, shape (3,)
+        Of the centre, world axes (m).
+    rotation_beacon : ndarray, shape (3,)
+        Of the attitude, beacon axes (rad).
+    log_moment : ndarray, shape (coils,)
+        Of the natural logarithm of each coil's moment.
+    """
+
+    position_world: Array
+    rotation_beacon: Array
+    log_moment: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Beacon:
+    """A magnetic source: one or more coils on a common rigid frame.
+
+    Parameters
+    ----------
+    name : str
+    position_world : ndarray, shape (3,)
+        Surveyed centre (m).
+    world_from_beacon : ndarray, shape (3, 3)
+        Rotation of the coil axes.
+    frequency_hz : float
+    coils : tuple of Coil
+    synchronised : bool
+        False where the drive phase relative to the log clock is unknown and drifts.
+    sigma : BeaconSigma
+    """
+
+    name: str
+    position_world: Array
+    world_from_beacon: Array
+    frequency_hz: float
+    coils: tuple[Coil, ...]
+    synchronised: bool
+    sigma: BeaconSigma
+
+    @cached_property
+    def tones(self) -> tuple[tuple[float, int | None], ...]:
+        """Distinct (frequency in Hz, slot) pairs in the order in which the coils name them."""
+        return tuple(dict.fromkeys((c.frequency_hz or self.frequency_hz, c.slot) for c in self.coils))
+
+    @cached_property
+    def tone_frequencies_hz(self) -> Array:
+        """Frequency of each tone (Hz), shape (tones,)."""
+        return np.array([frequency for frequency, _ in self.tones])
+
+    @cached_property
+    def excitation(self) -> ComplexArray:
+        """Complex drive of each coil in each tone, shape (coils, tones)."""
+        drive = np.zeros((len(self.coils), len(self.tones)), dtype=np.complex128)
+        for j, coil in enumerate(self.coils):
+            k = self.tones.index((coil.frequency_hz or self.frequency_hz, coil.slot))
+            drive[j, k] = np.exp(1j * coil.phase)
+        return drive
+
+    @cached_property
+    def moments_beacon(self) -> Array:
+        """Peak moments (A m^2), shape (coils, 3)."""
+        return np.array([c.moment_beacon for c in self.coils])
+
+    @cached_property
+    def centres_beacon(self) -> Array:
+        """Magnetic centres of the coils (m), shape (coils, 3)."""
+        return np.array([c.centre_beacon for c in self.coils])
+
+
+@dataclass(frozen=True)
+class ImuModel:
+    """Inertial noise: densities per square root of hertz, walks per square root of second.
+
+    ``time_offset`` says that the sample stamped t was taken at t + offset on the log's clock (s).
+    """
+
+    gyro_noise: float
+    accel_noise: float
+    gyro_bias_walk: float
+    accel_bias_walk: float
+    gyro_bias_sigma: float
+    accel_bias_sigma: float
+    time_offset: float = 0.0
+    time_offset_sigma: float = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class MagnetometerSigma:
+    """Prior standard deviations of the magnetometer's calibration; zero means known.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (3, 3)
+    offset : ndarray, shape (3,)
+        (T)
+    rotation_sensor : ndarray, shape (3,)
+        Of the mounting, sensor axes (rad).
+    position_body : ndarray, shape (3,)
+        Of the lever arm, body axes (m).
+    """
+
+    matrix: Array
+    offset: Array
+    rotation_sensor: Array
+    position_body: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Magnetometer:
+    """``measured = matrix @ field_sensor + offset`` at ``position_body`` on the platform.
+
+    Parameters
+    ----------
+    position_body : ndarray, shape (3,)
+        Lever arm (m).
+    body_from_sensor : ndarray, shape (3, 3)
+        Mounting rotation.
+    noise_density : float
+        One-sided white noise (T/sqrt(Hz)).
+    matrix : ndarray, shape (3, 3)
+    offset : ndarray, shape (3,)
+        (T)
+    sigma : MagnetometerSigma
+    """
+
+    position_body: Array
+    body_from_sensor: Array
+    noise_density: float
+    matrix: Array
+    offset: Array
+    sigma: MagnetometerSigma
+
+
+@dataclass(frozen=True)
+class Platform:
+    """What moves: an IMU and a magnetometer rigidly mounted beside it."""
+
+    imu: ImuModel
+    magnetometer: Magnetometer
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where and when, for the geomagnetic reference field; ``date`` is ISO 8601 (YYYY-MM-DD)."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    date: str
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """Everything that is known before a log is read.
+
+    Parameters
+    ----------
+    gravity : float
+        (m/s^2)
+    model_error : float
+        Relative error of the field model, one sigma per phasor.
+    beacons : tuple of Beacon
+    platform : Platform
+    earth_field_world : ndarray, shape (3,), optional
+        (T); from ``location`` by the IGRF where that is given instead.
+    location : Location, optional
+    calibration : mapping, optional
+        Where refined values came from: log, parameters that it determined and that it did not.
+    """
+
+    gravity: float
+    model_error: float
+    beacons: tuple[Beacon, ...]
+    platform: Platform
+    earth_field_world: Array | None = None
+    location: Location | None = None
+    calibration: Mapping[str, object] | None = None
+
+    @cached_property
+    def channels(self) -> tuple[tuple[str, int], ...]:
+        """(beacon, tone) of each phasor, in site order: the channel axis of `FieldSamples`."""
+        return tuple((b.name, k) for b in self.beacons for k in range(len(b.tones)))

@@ -1,0 +1,17 @@
+"""Constants and the type of every numeric array."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+ComplexArray = npt.NDArray[np.complex128]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+AnyArray = npt.NDArray[Any]
+
+MU0_OVER_4PI = 1e-7  # T m / A
+NANOTESLA = 1e-9  # T
+DEGREE = np.pi / 180.0  # rad
+NANOSECOND = 1e-9  # s
