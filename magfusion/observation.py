@@ -1,0 +1,202 @@
+"""The one measurement model: what a magnetometer sees of a beacon, and how that changes.
+
+Every solver predicts through `observe`; the simulator does not.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.physics.dipole import dipole_field, dipole_gradient
+from magfusion.site import Beacon, Magnetometer
+from magfusion.units import Array, ComplexArray
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """Predicted phasors of one beacon with their Jacobian blocks.
+
+    Every block has the shape of ``phasor_sensor`` with one axis more, of the length given.
+
+    Parameters
+    ----------
+    phasor_sensor : complex ndarray, shape (..., tones, 3)
+        (T), measured axes.
+    platform_pose : complex ndarray, 6
+        Right perturbation of world_from_body: rotation, translation, body axes (T/rad, T/m).
+    beacon_pose : complex ndarray, 6
+        Right perturbation of world_from_beacon: rotation, translation, beacon axes.
+    log_moments : complex ndarray, coils
+        Logarithm of each coil's moment (T).
+    phase : complex ndarray
+        Drive phase of the phasor's own tone; no further axis (T/rad).
+    matrix : complex ndarray, 9
+        Magnetometer matrix, row by row (T).
+    body_from_sensor : complex ndarray, 6
+        Right perturbation of the sensor's pose in the body: rotation, translation, sensor axes.
+    time_offset : complex ndarray, optional
+        IMU time offset; no further axis (T/s).  None where no twist was given.
+    """
+
+    phasor_sensor: ComplexArray
+    platform_pose: ComplexArray
+    beacon_pose: ComplexArray
+    log_moments: ComplexArray
+    phase: ComplexArray
+    matrix: ComplexArray
+    body_from_sensor: ComplexArray
+    time_offset: ComplexArray | None
+
+
+def skew(vector: Array | ComplexArray) -> Array | ComplexArray:
+    """Return the matrix of the cross product, shape (..., 3, 3), of vectors (..., 3)."""
+    matrix = np.zeros((*vector.shape, 3), dtype=vector.dtype)
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -z, y, -x
+    matrix[..., 1, 0], matrix[..., 2, 0], matrix[..., 2, 1] = z, -y, x
+    return matrix
+
+
+def _offset_beacon(
+    beacon: Beacon, magnetometer: Magnetometer, world_from_body: Array, position_world: Array
+) -> Array:
+    sensor_world = position_world + world_from_body @ magnetometer.position_body
+    return np.asarray((sensor_world - beacon.position_world) @ beacon.world_from_beacon)
+
+
+def _turned(excitation: ComplexArray, phase: Array | None) -> ComplexArray:
+    """Excitation with the drive phase applied, shape (..., coils, tones)."""
+    return excitation if phase is None else excitation * np.exp(1j * phase)[..., None, :]
+
+
+def _coil_fields(beacon: Beacon, offset_beacon: Array) -> tuple[Array, Array]:
+    """Offset from, and field of, each coil; shape (..., coils, 3), beacon axes."""
+    offset = offset_beacon[..., None, :] - beacon.centres_beacon
+    return offset, dipole_field(offset, beacon.moments_beacon)
+
+
+def predict(
+    beacon: Beacon,
+    magnetometer: Magnetometer,
+    world_from_body: Array,
+    position_world: Array,
+    phase: Array | None = None,
+) -> ComplexArray:
+    """Return the phasors that `observe` returns, without their Jacobian.
+
+    Parameters
+    ----------
+    beacon, magnetometer, world_from_body, position_world, phase
+        As in `observe`.
+
+    Returns
+    -------
+    complex ndarray, shape (..., tones, 3)
+        (T), measured axes.
+    """
+    offset = _offset_beacon(beacon, magnetometer, world_from_body, position_world)
+    _, coils = _coil_fields(beacon, offset)
+    in_beacon = np.swapaxes(_turned(beacon.excitation, phase), -1, -2) @ coils
+    beacon_from_body = beacon.world_from_beacon.T @ world_from_body
+    in_body = in_beacon @ beacon_from_body
+    return np.asarray(in_body @ (magnetometer.body_from_sensor @ magnetometer.matrix.T))
+
+
+def observe(
+    beacon: Beacon,
+    magnetometer: Magnetometer,
+    world_from_body: Array,
+    position_world: Array,
+    phase: Array | None = None,
+    twist_body: Array | None = None,
+) -> Observation:
+    """Predict the phasors of one beacon, with the Jacobian in the same call.
+
+    ::
+
+        Y = S sensor_from_body body_from_world world_from_beacon [G(r_j) m_j]_j X diag(exp(i phase))
+
+    Parameters
+    ----------
+    beacon : Beacon
+        Coils with their moments, centres, and complex drive in each tone.
+    magnetometer : Magnetometer
+        Matrix, mounting and lever arm.
+    world_from_body : ndarray, shape (..., 3, 3)
+    position_world : ndarray, shape (..., 3)
+        Origin of the body (m).
+    phase : ndarray, shape (..., tones), optional
+        Drive phase relative to the log clock beyond what the coils declare (rad).
+    twist_body : ndarray, shape (..., 6), optional
+        Angular rate (rad/s) and velocity (m/s) of the body, body axes, for the time offset.
+
+    Returns
+    -------
+    Observation
+        Leading axes as those of the poses.
+    """
+    mounting, matrix = magnetometer.body_from_sensor, magnetometer.matrix
+    offset_beacon = _offset_beacon(beacon, magnetometer, world_from_body, position_world)
+    offset, coils = _coil_fields(beacon, offset_beacon)
+    drive = _turned(beacon.excitation, phase)
+    tones_from_coils = np.swapaxes(drive, -1, -2)  # (..., tones, coils)
+    field_beacon = tones_from_coils @ coils
+    gradients = dipole_gradient(offset, beacon.moments_beacon)
+    flat = gradients.reshape(*gradients.shape[:-2], 9)
+    gradient_beacon = (tones_from_coils @ flat).reshape(*field_beacon.shape, 3)
+
+    body_from_beacon = np.swapaxes(world_from_body, -1, -2) @ beacon.world_from_beacon
+    sensor_from_body = matrix @ mounting.T
+    measured_from_beacon = (sensor_from_body @ body_from_beacon)[..., None, :, :]
+    field_body = field_beacon @ np.swapaxes(body_from_beacon, -1, -2)
+    phasor = field_body @ sensor_from_body.T
+    in_sensor = field_body @ mounting
+
+    by_beacon_offset = measured_from_beacon @ gradient_beacon
+    by_body = by_beacon_offset @ np.swapaxes(body_from_beacon, -1, -2)[..., None, :, :]
+    platform_rotation = sensor_from_body @ skew(field_body) - by_body @ skew(
+        magnetometer.position_body
+    )
+    platform_pose = np.concatenate([platform_rotation, by_body], axis=-1)
+    beacon_rotation = (
+        by_beacon_offset @ skew(offset_beacon)[..., None, :, :]
+        - measured_from_beacon @ skew(field_beacon)
+    )
+    by_coil = coils[..., None, :, :] * tones_from_coils[..., None]  # (..., tones, coils, 3)
+    by_matrix = np.zeros((*in_sensor.shape, 3, 3), dtype=np.complex128)
+    for row in range(3):
+        by_matrix[..., row, row, :] = in_sensor
+    return Observation(
+        phasor_sensor=phasor,
+        platform_pose=platform_pose,
+        beacon_pose=np.concatenate([beacon_rotation, -by_beacon_offset], axis=-1),
+        log_moments=measured_from_beacon @ np.swapaxes(by_coil, -1, -2),
+        phase=1j * phasor,
+        matrix=by_matrix.reshape(*in_sensor.shape, 9),
+        body_from_sensor=np.concatenate([matrix @ skew(in_sensor), by_body @ mounting], axis=-1),
+        time_offset=None
+        if twist_body is None
+        else -(platform_pose @ twist_body[..., None, :, None])[..., 0],
+    )
+
+
+def model_error_cov(phasor_sensor: ComplexArray, model_error: float) -> Array:
+    """Return the variance that an inexact field model adds to each component of a phasor.
+
+    ``eps^2 |b|^2 / 3``, with ``|b|^2`` the mean square of the two quadratures: plain white-noise
+    weights let the nearest beacon's model error swamp everything else (paper 004 re-examined).
+
+    Parameters
+    ----------
+    phasor_sensor : complex ndarray, shape (..., 3)
+        (T)
+    model_error : float
+        Relative error of the field model, one sigma.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        (T^2)
+    """
+    power = 0.5 * np.sum(np.abs(phasor_sensor) ** 2, axis=-1)
+    return np.asarray(model_error**2 * power[..., None, None] / 3.0 * np.eye(3))

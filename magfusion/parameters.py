@@ -1,0 +1,345 @@
+"""Calibration parameters: which are estimated, their priors, and how they move a site.
+
+A site's calibration lives in one tangent vector, the same for the fix, the smoother and the
+filter: a beacon's rotation in beacon axes and its position in world axes, log-moments, drive phase
+and drift, magnetometer matrix, the sensor's rotation in sensor axes and its position in body axes,
+and the IMU's time offset.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.observation import Observation, observe, predict
+from magfusion.site import Beacon, Site
+from magfusion.units import Array, ComplexArray
+
+GROUPS = ("beacons", "moments", "phase", "magnetometer", "extrinsics", "time-offset")
+
+PHASE_SIGMA = 1e2  # rad; wide enough to be no information
+DRIFT_SIGMA = 2e-5  # relative; ordinary crystal oscillators
+
+# A survey this good moves a fix by less than the noise of one window: it is held.
+NEGLIGIBLE = {
+    "position": 2e-3,  # m
+    "rotation": 1.75e-3,  # rad
+    "log_moment": 2e-3,
+    "matrix": 1e-3,
+    "time_offset": 1e-4,  # s
+    "phase": 0.0,
+    "drift": 0.0,
+}
+
+
+class Block(NamedTuple):
+    """One named part of the tangent vector, e.g. the position of beacon A."""
+
+    group: str
+    owner: str
+    kind: str
+    columns: slice
+    sigma: Array
+
+    @property
+    def name(self) -> str:
+        """E.g. ``A.position`` or ``magnetometer.matrix``."""
+        return f"{self.owner}.{self.kind}"
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Current values of everything that can be estimated besides the trajectory.
+
+    Parameters
+    ----------
+    site : Site
+    phase : ndarray, shape (channels,)
+        Drive phase of each channel at ``reference_time`` beyond the coils' own (rad).
+    drift : ndarray, shape (beacons,)
+        Relative error of each beacon's clock.
+    time_offset : float
+        The IMU's sample stamped t was taken at t + time_offset (s).
+    reference_time : float
+        Where ``phase`` holds (s).
+    """
+
+    site: Site
+    phase: Array
+    drift: Array
+    time_offset: float
+    reference_time: float
+
+    def drive_phase(self, time: Array) -> Array:
+        """Return the phase of every channel at the given times, shape (..., channels) (rad)."""
+        owner = [i for i, b in enumerate(self.site.beacons) for _ in b.tones]
+        frequencies = np.concatenate([b.tone_frequencies_hz for b in self.site.beacons])
+        rate = 2.0 * np.pi * frequencies * self.drift[owner]
+        return np.asarray(self.phase + (time[..., None] - self.reference_time) * rate)
+
+
+def initial_calibration(site: Site, reference_time: float) -> Calibration:
+    """Return the calibration that the site declares."""
+    return Calibration(
+        site=site,
+        phase=np.zeros(len(site.channels)),
+        drift=np.zeros(len(site.beacons)),
+        time_offset=site.platform.imu.time_offset,
+        reference_time=reference_time,
+    )
+
+
+def _candidates(site: Site) -> Iterable[tuple[str, str, str, Array]]:
+    for beacon in site.beacons:
+        yield "beacons", beacon.name, "rotation", beacon.sigma.rotation_beacon
+        yield "beacons", beacon.name, "position", beacon.sigma.position_world
+        yield "moments", beacon.name, "log_moment", beacon.sigma.log_moment
+        if not beacon.synchronised:
+            yield "phase", beacon.name, "phase", np.full(len(beacon.tones), PHASE_SIGMA)
+            yield "phase", beacon.name, "drift", np.array([DRIFT_SIGMA])
+    sigma = site.platform.magnetometer.sigma
+    yield "magnetometer", "magnetometer", "matrix", sigma.matrix.ravel()
+    yield "extrinsics", "sensor", "rotation", sigma.rotation_sensor
+    yield "extrinsics", "sensor", "position", sigma.position_body
+    yield "time-offset", "imu", "time_offset", np.array([site.platform.imu.time_offset_sigma])
+
+
+def choose_blocks(site: Site, groups: Iterable[str] | None = None) -> tuple[Block, ...]:
+    """Choose the calibration parameters to estimate.
+
+    Parameters
+    ----------
+    site : Site
+        Its sigmas are the priors; a parameter whose sigma is zero is known and never chosen.
+    groups : iterable of str, optional
+        Any of `GROUPS`.  None takes every parameter whose sigma is not negligible.
+
+    Returns
+    -------
+    tuple of Block
+        In the order of the tangent vector.
+    """
+    wanted = None if groups is None else set(groups)
+    if wanted is not None and not wanted <= set(GROUPS):
+        raise ValueError(f"groups must be among {GROUPS}; got {sorted(wanted - set(GROUPS))}")
+    blocks: list[Block] = []
+    start = 0
+    for group, owner, kind, sigma in _candidates(site):
+        chosen = np.max(sigma) > (NEGLIGIBLE[kind] if wanted is None else 0.0)
+        if chosen and (wanted is None or group in wanted):
+            columns = slice(start, start + len(sigma))
+            floor = 1e-6 * np.max(sigma)  # one known axis in an unknown block
+            blocks.append(Block(group, owner, kind, columns, np.maximum(sigma, floor)))
+            start += len(sigma)
+    return tuple(blocks)
+
+
+def dimension(blocks: tuple[Block, ...]) -> int:
+    """Return the length of the tangent vector."""
+    return blocks[-1].columns.stop if blocks else 0
+
+
+def prior_sigma(blocks: tuple[Block, ...]) -> Array:
+    """Return the prior standard deviations, shape (dimension,)."""
+    return np.concatenate([b.sigma for b in blocks]) if blocks else np.zeros(0)
+
+
+def _turn(rotation: Array, vector: Array) -> Array:
+    return np.asarray(rotation @ Rotation.from_rotvec(vector).as_matrix())
+
+
+def _moved_beacon(beacon: Beacon, kind: str, step: Array) -> Beacon:
+    if kind == "rotation":
+        return replace(beacon, world_from_beacon=_turn(beacon.world_from_beacon, step))
+    if kind == "position":
+        return replace(beacon, position_world=beacon.position_world + step)
+    coils = tuple(
+        replace(coil, moment_beacon=coil.moment_beacon * np.exp(change))
+        for coil, change in zip(beacon.coils, step, strict=True)
+    )
+    return replace(beacon, coils=coils)
+
+
+def _moved_magnetometer(site: Site, kind: str, step: Array) -> Site:
+    sensor = site.platform.magnetometer
+    if kind == "matrix":
+        sensor = replace(sensor, matrix=sensor.matrix + step.reshape(3, 3))
+    elif kind == "rotation":
+        sensor = replace(sensor, body_from_sensor=_turn(sensor.body_from_sensor, step))
+    else:
+        sensor = replace(sensor, position_body=sensor.position_body + step)
+    return replace(site, platform=replace(site.platform, magnetometer=sensor))
+
+
+def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) -> Calibration:
+    """Return the calibration moved by a tangent vector, shape (dimension,)."""
+    site, phase, drift = calibration.site, calibration.phase.copy(), calibration.drift.copy()
+    time_offset = calibration.time_offset
+    names = [b.name for b in site.beacons]
+    for block in blocks:
+        part = step[block.columns]
+        if block.kind == "time_offset":
+            time_offset += float(part[0])
+        elif block.owner in ("magnetometer", "sensor") and block.group != "beacons":
+            site = _moved_magnetometer(site, block.kind, part)
+        elif block.kind == "phase":
+            phase[[owner == block.owner for owner, _ in site.channels]] += part
+        elif block.kind == "drift":
+            drift[names.index(block.owner)] += float(part[0])
+        else:
+            index = names.index(block.owner)
+            moved = _moved_beacon(site.beacons[index], block.kind, part)
+            site = replace(site, beacons=(*site.beacons[:index], moved, *site.beacons[index + 1 :]))
+    return replace(calibration, site=site, phase=phase, drift=drift, time_offset=time_offset)
+
+
+def difference(reference: Calibration, moved: Calibration, blocks: tuple[Block, ...]) -> Array:
+    """Return the tangent vector that takes ``reference`` to ``moved``: the inverse of `retract`."""
+    step = np.zeros(dimension(blocks))
+    names = [b.name for b in reference.site.beacons]
+    old_sensor, new_sensor = (c.site.platform.magnetometer for c in (reference, moved))
+    for block in blocks:
+        if block.kind == "time_offset":
+            value: Array = np.array([moved.time_offset - reference.time_offset])
+        elif block.group == "magnetometer":
+            value = (new_sensor.matrix - old_sensor.matrix).ravel()
+        elif block.group == "extrinsics" and block.kind == "rotation":
+            value = _rotation_between(old_sensor.body_from_sensor, new_sensor.body_from_sensor)
+        elif block.group == "extrinsics":
+            value = new_sensor.position_body - old_sensor.position_body
+        else:
+            i = names.index(block.owner)
+            value = _beacon_difference(reference, moved, block, i)
+        step[block.columns] = value
+    return step
+
+
+def _rotation_between(old: Array, new: Array) -> Array:
+    return np.asarray(Rotation.from_matrix(old.T @ new).as_rotvec())
+
+
+def _beacon_difference(old: Calibration, new: Calibration, block: Block, index: int) -> Array:
+    a, b = old.site.beacons[index], new.site.beacons[index]
+    if block.kind == "rotation":
+        return _rotation_between(a.world_from_beacon, b.world_from_beacon)
+    if block.kind == "position":
+        return b.position_world - a.position_world
+    if block.kind == "drift":
+        return np.asarray(new.drift[[index]] - old.drift[[index]])
+    if block.kind == "phase":
+        mine = [owner == block.owner for owner, _ in old.site.channels]
+        return np.asarray(new.phase[mine] - old.phase[mine])
+    sizes = [np.linalg.norm(c.moments_beacon, axis=1) for c in (a, b)]
+    return np.asarray(np.log(sizes[1] / sizes[0]))
+
+
+def predict_channels(
+    calibration: Calibration, time: Array, world_from_body: Array, position_world: Array
+) -> ComplexArray:
+    """Return the phasors of every channel, shape (..., channels, 3), measured axes (T)."""
+    phase = calibration.drive_phase(time)
+    site = calibration.site
+    parts, start = [], 0
+    for beacon in site.beacons:
+        tones = slice(start, start + len(beacon.tones))
+        parts.append(
+            predict(
+                beacon,
+                site.platform.magnetometer,
+                world_from_body,
+                position_world,
+                phase[..., tones],
+            )
+        )
+        start = tones.stop
+    return np.concatenate(parts, axis=-2)
+
+
+def linearize_channels(
+    calibration: Calibration,
+    blocks: tuple[Block, ...],
+    time: Array,
+    world_from_body: Array,
+    position_world: Array,
+    twist_body: Array | None = None,
+) -> tuple[Array, Array, Array]:
+    """Predict every channel as real numbers, with the Jacobian by pose and calibration.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    blocks : tuple of Block
+        Columns of the calibration's tangent vector.
+    time : ndarray, shape (n,)
+    world_from_body : ndarray, shape (n, 3, 3)
+    position_world : ndarray, shape (n, 3)
+    twist_body : ndarray, shape (n, 6), optional
+        Needed where the time offset is among the blocks.
+
+    Returns
+    -------
+    value : ndarray, shape (n, channels, 6)
+        Real parts, then imaginary parts (T).
+    by_pose : ndarray, shape (n, channels, 6, 6)
+    by_calibration : ndarray, shape (n, channels, 6, dimension)
+    """
+    phase = calibration.drive_phase(time)
+    site, n = calibration.site, len(time)
+    channels = len(site.channels)
+    value = np.empty((n, channels, 6))
+    by_pose = np.empty((n, channels, 6, 6))
+    by_calibration = np.zeros((n, channels, 6, dimension(blocks)))
+    start = 0
+    for beacon in site.beacons:
+        rows = slice(start, start + len(beacon.tones))
+        seen = observe(
+            beacon,
+            site.platform.magnetometer,
+            world_from_body,
+            position_world,
+            phase[..., rows],
+            twist_body,
+        )
+        value[:, rows] = _stacked(seen.phasor_sensor[..., None])[..., 0]
+        by_pose[:, rows] = _stacked(seen.platform_pose)
+        for block in blocks:
+            part = _block_jacobian(beacon, site, block, seen, time - calibration.reference_time)
+            if part is not None:
+                by_calibration[:, rows, :, block.columns] = _stacked(part)
+        start = rows.stop
+    return value, by_pose, by_calibration
+
+
+def _stacked(block: ComplexArray) -> Array:
+    return np.concatenate([block.real, block.imag], axis=-2)
+
+
+def _block_jacobian(
+    beacon: Beacon, site: Site, block: Block, seen: Observation, elapsed: Array
+) -> ComplexArray | None:
+    """Columns of one block, shape (n, tones, 3, columns); None where it has no bearing."""
+    if block.group in ("beacons", "moments", "phase") and block.owner != beacon.name:
+        return None
+    if block.group == "beacons":
+        if block.kind == "rotation":
+            return seen.beacon_pose[..., :3]
+        return np.asarray(seen.beacon_pose[..., 3:] @ beacon.world_from_beacon.T)
+    if block.kind == "log_moment":
+        return seen.log_moments
+    if block.kind == "phase":
+        return np.asarray(seen.phase[..., None] * np.eye(len(beacon.tones))[:, None, :])
+    if block.kind == "drift":
+        rate = 2.0 * np.pi * beacon.tone_frequencies_hz[:, None] * elapsed[:, None, None]
+        return np.asarray((seen.phase * rate)[..., None])
+    if block.kind == "matrix":
+        return seen.matrix
+    if block.kind == "time_offset":
+        if seen.time_offset is None:
+            raise ValueError("twist_body must be given where the time offset is estimated")
+        return seen.time_offset[..., None]
+    if block.kind == "rotation":
+        return seen.body_from_sensor[..., :3]
+    mounting = site.platform.magnetometer.body_from_sensor
+    return np.asarray(seen.body_from_sensor[..., 3:] @ mounting.T)
