@@ -1,0 +1,168 @@
+"""Trajectory errors agree with evo, and consistency figures with their definition."""
+
+import gtsam
+import numpy as np
+import pytest
+from evo.core.metrics import APE, RPE, PoseRelation, Unit
+from evo.core.trajectory import PosePath3D
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.evaluation.consistency import average_nees_bounds, pooled_nees
+from magfusion.evaluation.errors import relative_errors, time_pairs, trajectory_errors
+from magfusion.trajectory import Trajectory
+
+POSES = 80
+
+
+def _pair(seed: int, attitude_sigma: float = 0.3) -> tuple[Trajectory, Trajectory]:
+    rng = np.random.default_rng(seed)
+    time = np.cumsum(rng.uniform(0.05, 0.09, POSES))
+    true = Rotation.random(POSES, random_state=rng)
+    error = Rotation.from_rotvec(attitude_sigma * rng.standard_normal((POSES, 3)))
+    position = 3.0 * rng.standard_normal((POSES, 3))
+    truth = Trajectory(time, true.as_matrix(), position)
+    tilt = Rotation.from_rotvec([0.2, -0.1, 0.4])
+    shift = np.array([0.5, -1.0, 0.2])  # m
+    moved = tilt.apply(position + 0.2 * rng.standard_normal((POSES, 3))) + shift
+    return Trajectory(time, (tilt * true * error).as_matrix(), moved), truth
+
+
+def _evo(trajectory: Trajectory) -> PosePath3D:
+    poses = np.tile(np.eye(4), (len(trajectory), 1, 1))
+    poses[:, :3, :3] = trajectory.world_from_body
+    poses[:, :3, 3] = trajectory.position_world
+    return PosePath3D(poses_se3=list(poses))
+
+
+def _ape(estimate: PosePath3D, truth: PosePath3D, relation: PoseRelation) -> np.ndarray:
+    metric = APE(relation)
+    metric.process_data((truth, estimate))
+    return metric.error
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_absolute_errors_are_those_of_evo(seed: int) -> None:
+    estimate, truth = _pair(seed)
+    errors = trajectory_errors(estimate, truth)
+    position = _ape(_evo(estimate), _evo(truth), PoseRelation.translation_part)
+    angle = _ape(_evo(estimate), _evo(truth), PoseRelation.rotation_angle_rad)
+    np.testing.assert_allclose(np.linalg.norm(errors.position_world, axis=1), position, rtol=1e-9)
+    np.testing.assert_allclose(errors.attitude, angle, rtol=1e-9)
+    assert errors.ate == pytest.approx(np.sqrt(np.mean(position**2)), rel=1e-9)
+    rms_deg = np.rad2deg(np.sqrt(np.mean(angle**2)))
+    assert errors.attitude_rmse_deg == pytest.approx(rms_deg, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_aligned_position_errors_are_those_of_evo(seed: int) -> None:
+    estimate, truth = _pair(seed)
+    aligned = _evo(estimate)
+    aligned.align(_evo(truth))
+    errors = trajectory_errors(estimate, truth)
+    expected = _ape(aligned, _evo(truth), PoseRelation.translation_part)
+    found = np.linalg.norm(errors.aligned_position_world, axis=1)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    assert errors.aligned_ate < 0.5 * errors.ate
+
+
+@pytest.mark.parametrize("delta", [1, 5])
+def test_relative_errors_are_those_of_evo(delta: int) -> None:
+    estimate, truth = _pair(4)
+    relative = trajectory_errors(estimate, truth, delta_frames=delta).relative
+    for relation, found in (
+        (PoseRelation.translation_part, relative.translation),
+        (PoseRelation.rotation_angle_rad, relative.rotation),
+    ):
+        metric = RPE(relation, delta=delta, delta_unit=Unit.frames)
+        metric.process_data((_evo(truth), _evo(estimate)))
+        np.testing.assert_allclose(found, metric.error, rtol=1e-9)
+
+
+def test_pairs_in_seconds_are_chained_and_no_shorter_than_asked() -> None:
+    estimate, truth = _pair(5)
+    pairs = time_pairs(estimate.time, 0.5)
+    lengths = np.diff(estimate.time[pairs], axis=1)
+    assert lengths.min() >= 0.5
+    assert lengths.max() < 0.5 + 0.09  # s, one step
+    assert np.array_equal(pairs[1:, 0], pairs[:-1, 1])
+    found = relative_errors(estimate.world_from_body, estimate.position_world, truth, pairs)
+    metric = RPE(PoseRelation.translation_part, delta=1, delta_unit=Unit.frames)
+    ids = np.append(pairs[:, 0], pairs[-1, 1])
+    paths = _evo(truth), _evo(estimate)
+    for path in paths:
+        path.reduce_to_ids(ids)
+    metric.process_data(paths)
+    np.testing.assert_allclose(found.translation, metric.error, rtol=1e-9)
+
+
+def test_a_constant_world_rotation_is_no_aligned_attitude_error() -> None:
+    estimate, truth = _pair(6, attitude_sigma=0.0)
+    errors = trajectory_errors(estimate, truth)
+    tilt_deg = np.rad2deg(np.linalg.norm([0.2, -0.1, 0.4]))
+    assert errors.attitude_rmse_deg == pytest.approx(tilt_deg, rel=1e-9)
+    assert errors.aligned_attitude_rmse_deg < 1e-6  # deg, rounding of arccos near one
+
+
+def test_the_truth_is_interpolated_but_not_across_its_gaps() -> None:
+    rate = np.array([0.3, -0.2, 0.5])  # rad/s
+    velocity = np.array([0.4, 0.1, -0.2])  # m/s
+
+    def at(time: np.ndarray) -> Trajectory:
+        turn = Rotation.from_rotvec(time[:, None] * rate).as_matrix()
+        return Trajectory(time, turn, time[:, None] * velocity)
+
+    known = np.concatenate([np.arange(0.0, 2.0, 0.05), np.arange(5.0, 7.0, 0.05)])
+    wanted = np.arange(-0.51, 8.0, 0.1)
+    errors = trajectory_errors(at(wanted), at(known))
+    inside = (wanted >= 0.0) & (wanted <= 1.95) | (wanted >= 5.0) & (wanted <= 6.95)
+    assert np.array_equal(errors.compared, inside)
+    assert errors.ate < 1e-12  # m, rounding
+    assert errors.attitude_rmse_deg < 1e-9  # deg, rounding
+    assert errors.aligned_ate < 1e-12  # m: the path is straight, its alignment not unique
+
+
+def test_a_truth_on_another_clock_is_refused_with_the_remedy() -> None:
+    estimate, truth = _pair(7)
+    late = Trajectory(truth.time + 1e3, truth.world_from_body, truth.position_world)
+    with pytest.raises(InputError, match=r"0 of the estimate's 80 epochs.*same clock"):
+        trajectory_errors(estimate, late)
+
+
+def test_nees_of_errors_drawn_from_the_covariance_is_chi_square() -> None:
+    rng = np.random.default_rng(8)
+    runs = 2000
+    root = 0.02 * rng.standard_normal((6, 6))
+    cov = root @ root.T + 1e-5 * np.eye(6)
+    true = [gtsam.Pose3.Expmap(rng.standard_normal(6)) for _ in range(runs)]
+    drawn = rng.multivariate_normal(np.zeros(6), cov, runs)
+    moved = [pose.retract(step) for pose, step in zip(true, drawn, strict=True)]
+
+    def build(poses: list[gtsam.Pose3], scale: float) -> Trajectory:
+        return Trajectory(
+            np.arange(float(runs)),
+            np.array([p.rotation().matrix() for p in poses]),
+            np.array([p.translation() for p in poses]),
+            pose_cov=np.tile(scale * cov, (runs, 1, 1)),
+        )
+
+    errors = trajectory_errors(build(moved, 1.0), build(true, 1.0))
+    low, high = average_nees_bounds(6, runs, 0.999)
+    assert errors.nees is not None
+    assert low < errors.nees.mean() < high
+    assert errors.inside_3_sigma == pytest.approx(0.9973, abs=0.0015)  # three binomial sigmas
+    claimed = trajectory_errors(build(moved, 1.1**-2), build(true, 1.0))
+    assert claimed.nees is not None
+    assert claimed.nees.mean() > high
+
+
+def test_pooled_nees_catches_sigmas_that_are_ten_percent_wrong() -> None:
+    rng = np.random.default_rng(9)
+    runs, n, epochs = 50, 500, np.array([50, 150, 250, 350, 450])
+    covs = np.tile(np.diag([1.0, 4.0, 9.0, 1.0, 2.0, 3.0]), (runs, n, 1, 1))
+    errors = rng.standard_normal((runs, n, 6)) * np.sqrt(np.diag(covs[0, 0]))
+    low, high = average_nees_bounds(6, runs * len(epochs), 0.99)
+    assert low < 6.0 < high
+    assert low < pooled_nees(errors, covs, epochs) < high
+    assert pooled_nees(1.15 * errors, covs, epochs) > high
+    assert pooled_nees(0.85 * errors, covs, epochs) < low
