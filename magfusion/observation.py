@@ -158,10 +158,9 @@ def observe(
         magnetometer.position_body
     )
     platform_pose = np.concatenate([platform_rotation, by_body], axis=-1)
-    beacon_rotation = (
-        by_beacon_offset @ skew(offset_beacon)[..., None, :, :]
-        - measured_from_beacon @ skew(field_beacon)
-    )
+    beacon_rotation = by_beacon_offset @ skew(offset_beacon)[
+        ..., None, :, :
+    ] - measured_from_beacon @ skew(field_beacon)
     by_coil = coils[..., None, :, :] * tones_from_coils[..., None]  # (..., tones, coils, 3)
     by_matrix = np.zeros((*in_sensor.shape, 3, 3), dtype=np.complex128)
     for row in range(3):

@@ -1,0 +1,83 @@
+"""The noise that a window holds, measured beside the tones rather than taken from a data sheet."""
+
+import numpy as np
+
+from magfusion.units import Array, BoolArray
+
+
+def _probe_frequencies(
+    tone: int, frequencies_hz: Array, nuisance_hz: Array, window: float
+) -> Array:
+    """Two probes half-way to the neighbours of a tone, clear of every fitted line."""
+    lines = np.concatenate([[0.0], frequencies_hz, nuisance_hz])
+    apart = np.abs(lines - frequencies_hz[tone])
+    nearest = float(np.min(apart[apart > 0]))
+    shift = min(0.5 * nearest, 2.0 / window)
+    return np.asarray(frequencies_hz[tone] + shift * np.array([-1.0, 1.0]))
+
+
+def noise_beside_tones(
+    frequencies_hz: Array,
+    nuisance_hz: Array,
+    elapsed: Array,
+    weight: BoolArray,
+    design: Array,
+    inverse: Array,
+    turned: Array,
+) -> Array:
+    """Return the covariance per sample of the noise around each tone.
+
+    Probe tones are fitted to what the design leaves of the window; the power in them, divided by
+    what the design left of the probes themselves, is unbiased for white noise.
+
+    Parameters
+    ----------
+    frequencies_hz, nuisance_hz : ndarray
+        Lines in the design (Hz).
+    elapsed : ndarray, shape (n, m)
+        Sample times from the centre of the window (s).
+    weight : bool ndarray, shape (n, m)
+        False where a row is padding.
+    design : ndarray, shape (n, m, k)
+    inverse : ndarray, shape (n, k, k)
+        Inverse of its normal matrix.
+    turned : ndarray, shape (n, m, 3)
+        Samples in the axes of the window's centre (T).
+
+    Returns
+    -------
+    ndarray, shape (n, tones, 3, 3)
+        (T^2)
+    """
+    window = float(np.max(elapsed) - np.min(elapsed))
+    projected = np.swapaxes(design, -1, -2)
+    fitted = inverse @ (projected @ turned)
+    noise = np.empty((len(elapsed), len(frequencies_hz), 3, 3))
+    for tone in range(len(frequencies_hz)):
+        probes = _probe_frequencies(tone, frequencies_hz, nuisance_hz, window)
+        angle = 2.0 * np.pi * elapsed[..., None] * probes
+        probe = np.concatenate([np.cos(angle), np.sin(angle)], axis=-1) * weight[..., None]
+        mixed = projected @ probe
+        left = np.swapaxes(probe, -1, -2) @ probe - np.swapaxes(mixed, -1, -2) @ inverse @ mixed
+        power = np.swapaxes(probe, -1, -2) @ turned - np.swapaxes(mixed, -1, -2) @ fitted
+        degrees = probe.shape[-1]
+        noise[:, tone] = np.swapaxes(power, -1, -2) @ np.linalg.solve(left, power) / degrees
+    return noise
+
+
+def smoothed_over_windows(noise_cov: Array, centre: Array, step: float, windows: int) -> Array:
+    """Average the noise over neighbouring windows, shape (n, tones, 3, 3), never across a gap.
+
+    One window has four degrees of freedom a tone, too few for a weight.
+    """
+    breaks = np.flatnonzero(np.diff(centre) > 1.5 * step) + 1
+    out = np.empty_like(noise_cov)
+    for part in np.split(np.arange(len(centre)), breaks):
+        rows = slice(part[0], part[-1] + 1)
+        total = np.cumsum(noise_cov[rows], axis=0)
+        total = np.concatenate([np.zeros_like(total[:1]), total])
+        n = len(part)
+        width = min(windows, n)
+        first = np.clip(np.arange(n) - width // 2, 0, n - width)
+        out[rows] = (total[first + width] - total[first]) / width
+    return out

@@ -1,0 +1,85 @@
+"""Attitude and motion between samples from the inertial stream, without a loop over samples."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.units import Array
+
+
+def rotation_increments(time: Array, gyro_body: Array) -> Rotation:
+    """Return the rotation from each sample to the next, the rate taken as linear between them.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    gyro_body : ndarray, shape (n, 3)
+        (rad/s)
+
+    Returns
+    -------
+    Rotation
+        n - 1 rotations ``body(k)_from_body(k+1)``; second-order coning included.
+    """
+    before, after = gyro_body[:-1], gyro_body[1:]
+    dt = np.diff(time)[:, None]
+    coning = np.cross(before, after) * dt**2 / 12.0
+    return Rotation.from_rotvec(0.5 * (before + after) * dt + coning)
+
+
+def _prefix_products(rotations: Rotation) -> Rotation:
+    """Products of the first 1, 2, ... rotations, by doubling: log2(n) batched products."""
+    quaternion = rotations.as_quat()
+    reach = 1
+    while reach < len(quaternion):
+        head = Rotation.from_quat(quaternion[:-reach]) * Rotation.from_quat(quaternion[reach:])
+        quaternion = np.concatenate([quaternion[:reach], head.as_quat()])
+        reach *= 2
+    return Rotation.from_quat(quaternion)
+
+
+def attitude_from_gyro(time: Array, gyro_body: Array) -> Rotation:
+    """Return ``body(0)_from_body(k)`` for every sample.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    gyro_body : ndarray, shape (n, 3)
+        (rad/s), bias removed.
+
+    Returns
+    -------
+    Rotation
+        n rotations, the first the identity.
+    """
+    steps = rotation_increments(time, gyro_body)
+    first = Rotation.identity(1)
+    return _prefix_products(Rotation.concatenate([first, steps]))
+
+
+def attitude_at(attitude: Rotation, time: Array, gyro_body: Array, wanted: Array) -> Rotation:
+    """Return the attitude at other times, from the nearest earlier sample and its rate.
+
+    Parameters
+    ----------
+    attitude : Rotation
+        One for each sample, as from `attitude_from_gyro`.
+    time : ndarray, shape (n,)
+    gyro_body : ndarray, shape (n, 3)
+        (rad/s)
+    wanted : ndarray, shape (m,)
+        Times (s); outside the stream the end rate is held.
+
+    Returns
+    -------
+    Rotation
+        m rotations.
+    """
+    index = np.clip(np.searchsorted(time, wanted, side="right") - 1, 0, len(time) - 1)
+    after = np.minimum(index + 1, len(time) - 1)
+    span = np.where(after > index, time[after] - time[index], 1.0)
+    ahead = wanted - time[index]
+    share = np.clip(0.5 * ahead / span, 0.0, 0.5)[:, None]
+    rate = (1.0 - share) * gyro_body[index] + share * gyro_body[after]
+    return attitude[index] * Rotation.from_rotvec(rate * ahead[:, None])
