@@ -1,0 +1,294 @@
+"""Whole logs from a site: a true calibration is drawn, a body moves, the instruments record."""
+
+from dataclasses import dataclass, field, replace
+from datetime import date
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.physics.earth import earth_field_world
+from magfusion.records.samples import FieldSamples, Log
+from magfusion.simulation.field import Drives, phasors_world, synchronised_drives
+from magfusion.simulation.inertial import BiasInstability, simulate_imu
+from magfusion.simulation.motion import (
+    Motion,
+    Rests,
+    random_walk_motion,
+    static_motion,
+    turning_motion,
+)
+from magfusion.simulation.waveform import Mains, simulate_waveform
+from magfusion.site import Beacon, Magnetometer, Site
+from magfusion.trajectory import Trajectory
+from magfusion.units import Array
+
+DRIFT_SIGMA = 2e-5  # relative; ordinary crystal oscillators
+EPOCH_NS = 1_700_000_000_000_000_000
+
+MotionKind = Literal["walk", "turn", "static"]
+
+
+@dataclass(frozen=True, eq=False)
+class SimulationConfig:
+    """What happens in a simulated log.
+
+    Parameters
+    ----------
+    box_world : ndarray, shape (2, 3)
+        Lower and upper corner (m) of where the body moves.
+    duration : float
+        (s)
+    motion : {"walk", "turn", "static"}
+    speed : float
+        Mean speed while moving (m/s), about.
+    rests : Rests
+    imu_rate_hz, magnetometer_rate_hz : float
+        The latter more than 2.5 times the highest tone.
+    time_offset : float, optional
+        True time offset of the IMU (s); that which the site declares where it is None.
+    perturb : bool
+        Whether the true calibration is drawn from the site's prior, or is as declared.
+    noise_scale : float
+        True white noise of all instruments, relative to the declared.
+    mains : Mains, optional
+    quantisation : float, optional
+        Step of the magnetometer (T).
+    instability : BiasInstability, optional
+        Of the IMU, beside its bias walk.
+    """
+
+    box_world: Array
+    duration: float = 60.0
+    motion: MotionKind = "walk"
+    speed: float = 0.5
+    rests: Rests = field(default_factory=Rests)
+    imu_rate_hz: float = 200.0
+    magnetometer_rate_hz: float = 400.0
+    time_offset: float | None = None
+    perturb: bool = True
+    noise_scale: float = 1.0
+    mains: Mains | None = None
+    quantisation: float | None = None
+    instability: BiasInstability | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedLog:
+    """A log and everything that was true while it was recorded.
+
+    Parameters
+    ----------
+    log : Log
+        Its truth is stamped on the log's clock at the IMU's rate.
+    true_site : Site
+        True calibration, noise and time offset of the IMU.
+    drives : Drives
+        True phases and drifts.
+    motion : Motion
+        Exact truth at any time.
+    """
+
+    log: Log
+    true_site: Site
+    drives: Drives
+    motion: Motion
+
+    @property
+    def time_offset(self) -> float:
+        """True time offset of the IMU (s)."""
+        return self.true_site.platform.imu.time_offset
+
+
+def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator) -> SimulatedLog:
+    """Return a simulated log of a body moving among the beacons of a site.
+
+    Calibration, motion, IMU and magnetometer have generators of their own, spawned from ``rng``:
+    a change to one leaves the draws of the others as they were.
+
+    Raises
+    ------
+    InputError
+        If the configuration or the site cannot be simulated.
+    """
+    calibration_rng, motion_rng, imu_rng, magnetometer_rng = rng.spawn(4)
+    declared = _with_earth_field(site)
+    true_site = perturb_site(declared, calibration_rng) if config.perturb else declared
+    true_site = _with_instruments(true_site, config)
+    drives = draw_drives(true_site, calibration_rng)
+    motion = _motion(config, motion_rng)
+    imu = simulate_imu(
+        motion,
+        true_site.platform.imu,
+        true_site.gravity,
+        config.imu_rate_hz,
+        config.duration,
+        imu_rng,
+        true_site.platform.imu.time_offset,
+        config.instability,
+    )
+    waveform = simulate_waveform(
+        motion,
+        true_site,
+        drives,
+        config.magnetometer_rate_hz,
+        config.duration,
+        magnetometer_rng,
+        config.mains,
+        config.quantisation,
+    )
+    stamp = imu.samples.time
+    taken = stamp + true_site.platform.imu.time_offset
+    truth = replace(
+        motion.trajectory(stamp),
+        gyro_bias_body=_interpolate(stamp, taken, imu.gyro_bias_body),
+        accel_bias_body=_interpolate(stamp, taken, imu.accel_bias_body),
+    )
+    log = Log(
+        name=f"simulated_{config.motion}",
+        epoch_ns=EPOCH_NS,
+        source="simulation",
+        imu=imu.samples,
+        waveform=waveform,
+        truth=truth,
+    )
+    return SimulatedLog(log, true_site, drives, motion)
+
+
+def simulate_fields(
+    site: Site,
+    trajectory: Trajectory,
+    sigma: float,
+    rng: np.random.Generator,
+    drives: Drives | None = None,
+    window: float = 0.4,
+) -> FieldSamples:
+    """Return phasors with white noise directly, without a waveform and its receiver.
+
+    Parameters
+    ----------
+    site : Site
+        The true one.
+    trajectory : Trajectory
+        One epoch each (time and pose).
+    sigma : float
+        Standard deviation of each component's real, and imaginary, part (T).
+    rng : Generator
+    drives : Drives, optional
+        As the site declares where there is none.
+    window : float
+        Length that the samples claim (s); the field is that of the instant.
+
+    Returns
+    -------
+    FieldSamples
+    """
+    drives = drives or synchronised_drives(site)
+    time = trajectory.time
+    magnetometer = site.platform.magnetometer
+    point_world = (
+        trajectory.position_world + trajectory.world_from_body @ magnetometer.position_body
+    )
+    world_from_sensor = trajectory.world_from_body @ magnetometer.body_from_sensor
+    drifts = np.repeat(drives.drift, [len(b.tones) for b in site.beacons])
+    frequencies_hz = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
+    phase = drives.phase + 2.0 * np.pi * drifts * frequencies_hz * time[:, None]
+    world = np.concatenate([phasors_world(b, point_world) for b in site.beacons], axis=1)
+    turned = world * np.exp(1j * phase)[..., None]
+    phasor = turned @ world_from_sensor @ magnetometer.matrix.T
+    noise = rng.normal(0.0, sigma, (2, *phasor.shape))
+    return FieldSamples(
+        time=time,
+        window=np.full(len(time), window),
+        channels=site.channels,
+        phasor_sensor=phasor + noise[0] + 1j * noise[1],
+        phasor_cov=np.broadcast_to(sigma**2 * np.eye(3), (*phasor.shape, 3)).copy(),
+    )
+
+
+def perturb_site(site: Site, rng: np.random.Generator) -> Site:
+    """Return a site whose calibration is drawn from the priors that the given one declares.
+
+    Rotations are perturbed on the right, in beacon and in sensor axes; positions in world axes
+    (beacons) and in body axes (magnetometer); moments by the exponential of their logarithm's.
+    """
+    beacons = tuple(_perturb_beacon(beacon, rng) for beacon in site.beacons)
+    magnetometer = _perturb_magnetometer(site.platform.magnetometer, rng)
+    platform = replace(site.platform, magnetometer=magnetometer)
+    return replace(site, beacons=beacons, platform=platform)
+
+
+def draw_drives(site: Site, rng: np.random.Generator) -> Drives:
+    """Return a random phase per tone and drift for every beacon that is not synchronised."""
+    free = np.array([not beacon.synchronised for beacon in site.beacons], dtype=bool)
+    tones = [len(beacon.tones) for beacon in site.beacons]
+    phase = rng.uniform(-np.pi, np.pi, sum(tones)) * np.repeat(free, tones)
+    return Drives(phase, rng.normal(0.0, DRIFT_SIGMA, len(free)) * free)
+
+
+def _perturb_beacon(beacon: Beacon, rng: np.random.Generator) -> Beacon:
+    sigma = beacon.sigma
+    turn = Rotation.from_rotvec(rng.normal(0.0, sigma.rotation_beacon)).as_matrix()
+    factors = np.exp(rng.normal(0.0, sigma.log_moment))
+    return replace(
+        beacon,
+        position_world=beacon.position_world + rng.normal(0.0, sigma.position_world),
+        world_from_beacon=beacon.world_from_beacon @ turn,
+        coils=tuple(
+            replace(coil, moment_beacon=factor * coil.moment_beacon)
+            for coil, factor in zip(beacon.coils, factors, strict=True)
+        ),
+    )
+
+
+def _perturb_magnetometer(magnetometer: Magnetometer, rng: np.random.Generator) -> Magnetometer:
+    sigma = magnetometer.sigma
+    turn = Rotation.from_rotvec(rng.normal(0.0, sigma.rotation_sensor)).as_matrix()
+    return replace(
+        magnetometer,
+        matrix=magnetometer.matrix + rng.normal(0.0, sigma.matrix),
+        offset=magnetometer.offset + rng.normal(0.0, sigma.offset),
+        body_from_sensor=magnetometer.body_from_sensor @ turn,
+        position_body=magnetometer.position_body + rng.normal(0.0, sigma.position_body),
+    )
+
+
+def _with_earth_field(site: Site) -> Site:
+    place = site.location
+    if site.earth_field_world is not None or place is None:
+        return site
+    day = date.fromisoformat(place.date)
+    field_world = earth_field_world(place.latitude_deg, place.longitude_deg, place.height_m, day)
+    return replace(site, earth_field_world=field_world)
+
+
+def _with_instruments(site: Site, config: SimulationConfig) -> Site:
+    imu, magnetometer = site.platform.imu, site.platform.magnetometer
+    declared, scale = imu.time_offset, config.noise_scale
+    imu = replace(
+        imu,
+        gyro_noise=scale * imu.gyro_noise,
+        accel_noise=scale * imu.accel_noise,
+        time_offset=declared if config.time_offset is None else config.time_offset,
+    )
+    magnetometer = replace(magnetometer, noise_density=scale * magnetometer.noise_density)
+    return replace(site, platform=replace(site.platform, imu=imu, magnetometer=magnetometer))
+
+
+def _motion(config: SimulationConfig, rng: np.random.Generator) -> Motion:
+    if config.motion == "static":
+        position = rng.uniform(config.box_world[0], config.box_world[1])
+        heading = Rotation.from_rotvec([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
+        return static_motion(position, heading * Rotation.from_rotvec(rng.normal(0.0, 0.1, 3)))
+    if config.motion == "walk":
+        make = random_walk_motion
+    elif config.motion == "turn":
+        make = turning_motion
+    else:
+        raise InputError(f"motion: found {config.motion!r}; give walk, turn or static")
+    return make(rng, config.duration, config.box_world, config.speed, rests=config.rests)
+
+
+def _interpolate(time: Array, known_time: Array, values: Array) -> Array:
+    return np.column_stack([np.interp(time, known_time, column) for column in values.T])

@@ -1,0 +1,222 @@
+"""True motion as an analytic function of time, so that rate and specific force are exact.
+
+A motion is a geometric path (position and attitude over a path parameter) and the progress along
+it over time.  The path parameter counts seconds of moving; where progress halts, all comes to rest
+at once.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import BPoly, BSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from magfusion.errors import InputError
+from magfusion.trajectory import Trajectory
+from magfusion.units import Array
+
+ATTITUDE_KNOT = 1.0  # s of moving
+LONGEST_RAMP = 1.0  # s from rest to full speed
+_DEGREE = 5
+
+
+@dataclass(frozen=True)
+class Rests:
+    """When a motion stands still (s): first ``start``, then ``pause`` after every ``move``."""
+
+    start: float = 5.0
+    move: float = 20.0
+    pause: float = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A motion, at rest before its start and after its end.
+
+    Parameters
+    ----------
+    position : BSpline
+        World position (m) over the path parameter.
+    attitude : RotationSpline
+        World from body over the path parameter.
+    rate : BPoly
+        Derivative of the path parameter by time, over time (s); twice continuously differentiable.
+    """
+
+    position: BSpline
+    attitude: RotationSpline
+    rate: BPoly
+
+    def _progress(self, time: Array) -> tuple[Array, Array, Array]:
+        inside = np.clip(time, self.rate.x[0], self.rate.x[-1])
+        parameter = self.rate.antiderivative()(inside)
+        return parameter, self.rate(inside)[:, None], self.rate.derivative()(inside)[:, None]
+
+    def world_from_body(self, time: Array) -> Rotation:
+        """Return the attitude at the times, shape (n,)."""
+        return self.attitude(self._progress(time)[0])
+
+    def position_world(self, time: Array) -> Array:
+        """Return the body's position (m), shape (n, 3)."""
+        return np.asarray(self.position(self._progress(time)[0]))
+
+    def velocity_world(self, time: Array) -> Array:
+        """Return the body's velocity (m/s), shape (n, 3)."""
+        parameter, rate, _ = self._progress(time)
+        return np.asarray(self.position(parameter, nu=1) * rate)
+
+    def acceleration_world(self, time: Array) -> Array:
+        """Return the body's acceleration (m/s^2), shape (n, 3)."""
+        parameter, rate, change = self._progress(time)
+        curvature = self.position(parameter, nu=2) * rate**2
+        return np.asarray(curvature + self.position(parameter, nu=1) * change)
+
+    def rate_body(self, time: Array) -> Array:
+        """Return the angular rate (rad/s), shape (n, 3)."""
+        parameter, rate, _ = self._progress(time)
+        return np.asarray(self.attitude(parameter, 1) * rate)
+
+    def specific_force_body(self, time: Array, gravity: float) -> Array:
+        """Return what an ideal accelerometer measures (m/s^2), shape (n, 3)."""
+        force_world = self.acceleration_world(time) + np.array([0.0, 0.0, gravity])
+        return np.asarray(self.world_from_body(time).inv().apply(force_world))
+
+    def trajectory(self, time: Array) -> Trajectory:
+        """Return poses and velocities at the times, shape (n,)."""
+        return Trajectory(
+            time=time,
+            world_from_body=self.world_from_body(time).as_matrix(),
+            position_world=self.position_world(time),
+            velocity_world=self.velocity_world(time),
+        )
+
+
+def random_walk_motion(
+    rng: np.random.Generator,
+    duration: float,
+    box_world: Array,
+    speed: float = 0.5,
+    tilt_rms: float = 0.1,
+    heading_rate_rms: float = 0.3,
+    rests: Rests | None = None,
+) -> Motion:
+    """Return a smooth random walk inside a box, as of a person or a robot that carries the body.
+
+    Parameters
+    ----------
+    rng : Generator
+    duration : float
+        (s)
+    box_world : ndarray, shape (2, 3)
+        Lower and upper corner (m), which the path never leaves.
+    speed : float
+        Mean speed while moving (m/s), about; slower where the box is small, to stay smooth.
+    tilt_rms : float
+        Of the angle between the body's z axis and the vertical (rad), about.
+    heading_rate_rms : float
+        (rad/s), about.
+    rests : Rests, optional
+
+    Raises
+    ------
+    InputError
+        If the box, the duration or the speed cannot be.
+    """
+    rate = _rate(duration, rests or Rests())
+    moving = _moving(rate)
+    knots = _attitude_knots(moving)
+    tilt = rng.normal(0.0, tilt_rms / np.sqrt(2.0), (len(knots), 3)) * [1.0, 1.0, 0.0]
+    steps = rng.normal(0.0, heading_rate_rms * ATTITUDE_KNOT, len(knots))
+    heading = rng.uniform(-np.pi, np.pi) + np.cumsum(steps)
+    attitudes = Rotation.from_euler("z", heading[:, None]) * Rotation.from_rotvec(tilt)
+    path = _path_in_box(rng, box_world, speed, moving)
+    return Motion(path, RotationSpline(knots, attitudes), rate)
+
+
+def turning_motion(
+    rng: np.random.Generator,
+    duration: float,
+    box_world: Array,
+    speed: float = 0.3,
+    rate_rms: float = 0.6,
+    rests: Rests | None = None,
+) -> Motion:
+    """Return a motion that turns about all axes, as of a body turned by hand to calibrate it.
+
+    Parameters
+    ----------
+    rng, duration, box_world, speed, rests
+        As in `random_walk_motion`.
+    rate_rms : float
+        Of the angular rate (rad/s), about.
+
+    Raises
+    ------
+    InputError
+        If the box, the duration or the speed cannot be.
+    """
+    rate = _rate(duration, rests or Rests())
+    moving = _moving(rate)
+    knots = _attitude_knots(moving)
+    attitudes = [Rotation.random(rng=rng)]
+    for step in rng.normal(0.0, rate_rms * ATTITUDE_KNOT / np.sqrt(3.0), (len(knots) - 1, 3)):
+        attitudes.append(attitudes[-1] * Rotation.from_rotvec(step))
+    path = _path_in_box(rng, box_world, speed, moving)
+    return Motion(path, RotationSpline(knots, Rotation.concatenate(attitudes)), rate)
+
+
+def static_motion(position_world: Array, world_from_body: Rotation) -> Motion:
+    """Return a body that stands still for ever."""
+    still = BSpline(np.array([0.0, 1.0]), np.asarray(position_world, dtype=float)[None], 0)
+    attitude = RotationSpline([0.0, 1.0], Rotation.concatenate([world_from_body] * 2))
+    return Motion(still, attitude, BPoly(np.zeros((1, 1)), np.array([0.0, 1.0])))
+
+
+def _rate(duration: float, rests: Rests) -> BPoly:
+    """Return the rate of progress: quintic ramps between 0 (rest) and 1 (full speed)."""
+    if not duration > 0.0:
+        raise InputError(f"duration: found {duration} s; give a positive number of seconds")
+    if rests.start < 0.0 or rests.pause < 0.0 or rests.move <= 0.0:
+        raise InputError(f"rests: found {rests}; give start and pause >= 0 and move > 0 (s)")
+    times, rates = [0.0], [0.0]
+    begin = rests.start
+    while begin < duration:
+        end = min(begin + rests.move, duration)
+        ramp = min(LONGEST_RAMP, (end - begin) / 3.0)
+        times += [begin, begin + ramp, end - ramp, end]
+        rates += [0.0, 1.0, 1.0, 0.0]
+        begin = end + rests.pause
+    times.append(duration)
+    rates.append(0.0)
+    # Where a rest has no length its two ends are one knot.
+    keep = np.append(np.diff(times) > 1e-9, True)
+    keep[0] = keep[0] or not keep[1]
+    knots, values = np.array(times)[keep], np.array(rates)[keep]
+    return BPoly.from_derivatives(knots, [[value, 0.0, 0.0] for value in values])
+
+
+def _moving(rate: BPoly) -> float:
+    """Return the path parameter at the end: the seconds of moving."""
+    return float(rate.integrate(rate.x[0], rate.x[-1]))
+
+
+def _attitude_knots(moving: float) -> Array:
+    return np.arange(np.ceil(moving / ATTITUDE_KNOT) + 2) * ATTITUDE_KNOT
+
+
+def _path_in_box(
+    rng: np.random.Generator, box_world: Array, speed: float, moving: float
+) -> BSpline:
+    """Return a quintic B-spline whose control points, and so all of it, lie in the box."""
+    box = np.asarray(box_world, dtype=float)
+    if box.shape != (2, 3) or np.any(box[0] > box[1]):
+        raise InputError(
+            f"box: found {box.tolist()}; give the lower and the upper corner, three metres each"
+        )
+    if not speed > 0.0:
+        raise InputError(f"speed: found {speed} m/s; give a positive number")
+    # Control points one unit apart, uniform in the box, give a mean speed of 0.17 diagonals a unit.
+    spacing = max(0.17 * float(np.linalg.norm(box[1] - box[0])) / speed, 1.0)
+    count = int(np.ceil(moving / spacing)) + 1 + _DEGREE
+    knots = (np.arange(count + _DEGREE + 1) - _DEGREE) * spacing
+    return BSpline(knots, rng.uniform(box[0], box[1], (count, 3)), _DEGREE)

@@ -1,0 +1,134 @@
+"""The raw magnetometer stream along a true motion."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.records.samples import Waveform
+from magfusion.simulation.field import Drives, phasors_world
+from magfusion.simulation.motion import Motion
+from magfusion.site import Site
+from magfusion.units import Array
+
+LEAST_SAMPLES_PER_CYCLE = 2.5
+
+
+def _vertical() -> Array:
+    return np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Mains:
+    """Hum of the power lines, uniform over the room.
+
+    Parameters
+    ----------
+    amplitude : float
+        Of the fundamental (T).
+    frequency_hz : float
+    harmonics : tuple of float
+        Amplitude of the second, third, ... harmonic relative to the fundamental.
+    direction_world : ndarray, shape (3,)
+    """
+
+    amplitude: float
+    frequency_hz: float = 50.0
+    harmonics: tuple[float, ...] = (0.1, 0.3)
+    direction_world: Array = field(default_factory=_vertical)
+
+
+def simulate_waveform(
+    motion: Motion,
+    site: Site,
+    drives: Drives,
+    rate_hz: float,
+    duration: float,
+    rng: np.random.Generator,
+    mains: Mains | None = None,
+    quantisation: float | None = None,
+) -> Waveform:
+    """Return the field of everything at each sample's own pose, as the magnetometer gives it.
+
+    Parameters
+    ----------
+    motion : Motion
+    site : Site
+        The true one.  Its Earth field is none where it is not declared.
+    drives : Drives
+    rate_hz : float
+        More than 2.5 samples in the fastest cycle.
+    duration : float
+        (s)
+    rng : Generator
+    mains : Mains, optional
+        Its phases are drawn.  Harmonics beyond half the rate alias, as in an instrument that
+        does not filter.
+    quantisation : float, optional
+        Step of the instrument (T).
+
+    Raises
+    ------
+    InputError
+        If the rate is too low for the tones, or coils are driven in time slots, whose schedule
+        no site declares.
+    """
+    _check_tones(site, rate_hz)
+    count = int(np.floor(duration * rate_hz * (1.0 + 1e-12)))
+    if count < 1:
+        raise InputError(
+            f"magnetometer_rate_hz: found {rate_hz} Hz for {duration} s; give at least one sample"
+        )
+    time = np.arange(count) / rate_hz
+    magnetometer = site.platform.magnetometer
+    world_from_body = motion.world_from_body(time)
+    lever_world = world_from_body.apply(magnetometer.position_body)
+    point_world = motion.position_world(time) + lever_world
+    field_world = _beacons_world(site, drives, time, point_world)
+    if site.earth_field_world is not None:
+        field_world += site.earth_field_world
+    if mains is not None:
+        field_world += _mains_world(mains, time, rng)
+    field_sensor = world_from_body.inv().apply(field_world) @ magnetometer.body_from_sensor
+    measured = field_sensor @ magnetometer.matrix.T + magnetometer.offset
+    measured += rng.normal(0.0, magnetometer.noise_density * np.sqrt(rate_hz / 2.0), (count, 3))
+    if quantisation:
+        measured = quantisation * np.round(measured / quantisation)
+    return Waveform(time, measured)
+
+
+def _check_tones(site: Site, rate_hz: float) -> None:
+    for beacon in site.beacons:
+        highest = float(beacon.tone_frequencies_hz.max())
+        if rate_hz < LEAST_SAMPLES_PER_CYCLE * highest:
+            raise InputError(
+                f"magnetometer_rate_hz: found {rate_hz} Hz and a tone of {highest} Hz in beacon "
+                f"{beacon.name}; give at least {LEAST_SAMPLES_PER_CYCLE * highest} Hz"
+            )
+        if any(slot is not None for _, slot in beacon.tones):
+            raise InputError(
+                f"beacons.{beacon.name}: found coils in time slots, of which no waveform can be "
+                "simulated; give each coil a frequency_hz instead"
+            )
+
+
+def _beacons_world(site: Site, drives: Drives, time: Array, point_world: Array) -> Array:
+    field_world = np.zeros((len(time), 3))
+    first = 0
+    for beacon, drift in zip(site.beacons, drives.drift, strict=True):
+        phasors = phasors_world(beacon, point_world)
+        for k, frequency_hz in enumerate(beacon.tone_frequencies_hz):
+            turns = 2.0 * np.pi * frequency_hz * (1.0 + drift) * time
+            carrier = np.exp(1j * (turns + drives.phase[first + k]))
+            field_world += np.real(phasors[:, k] * carrier[:, None])
+        first += len(beacon.tones)
+    return field_world
+
+
+def _mains_world(mains: Mains, time: Array, rng: np.random.Generator) -> Array:
+    amplitudes = mains.amplitude * np.array([1.0, *mains.harmonics])
+    phases = rng.uniform(-np.pi, np.pi, len(amplitudes))
+    orders = 1 + np.arange(len(amplitudes))
+    angles = 2.0 * np.pi * mains.frequency_hz * time[:, None] * orders + phases
+    direction = mains.direction_world / np.linalg.norm(mains.direction_world)
+    return np.asarray((np.cos(angles) @ amplitudes)[:, None] * direction)
