@@ -39,7 +39,7 @@ def coil_field(offset: Array, coil: Coil) -> Array:
     A coil with a radius is a thin loop, one with a length as well a uniform current sheet, one
     with a length alone a line of dipoles, one with neither a dipole.  Loops are integrated by
     Biot and Savart's law at 32 azimuths and sheets at 5 Gauss-Legendre slices: the relative error
-    is below 1e-6 farther than two radii and one length from the centre.
+    is below 1e-5 (a lone loop's below 1e-7) farther than two radii and two lengths away.
 
     Parameters
     ----------

@@ -281,13 +281,12 @@ def _motion(config: SimulationConfig, rng: np.random.Generator) -> Motion:
         position = rng.uniform(config.box_world[0], config.box_world[1])
         heading = Rotation.from_rotvec([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
         return static_motion(position, heading * Rotation.from_rotvec(rng.normal(0.0, 0.1, 3)))
+    path = (rng, config.duration, config.box_world, config.speed)
     if config.motion == "walk":
-        make = random_walk_motion
-    elif config.motion == "turn":
-        make = turning_motion
-    else:
-        raise InputError(f"motion: found {config.motion!r}; give walk, turn or static")
-    return make(rng, config.duration, config.box_world, config.speed, rests=config.rests)
+        return random_walk_motion(*path, rests=config.rests)
+    if config.motion == "turn":
+        return turning_motion(*path, rests=config.rests)
+    raise InputError(f"motion: found {config.motion!r}; give walk, turn or static")
 
 
 def _interpolate(time: Array, known_time: Array, values: Array) -> Array:
