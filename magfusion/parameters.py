@@ -179,7 +179,7 @@ def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) ->
     time_offset = calibration.time_offset
     names = [b.name for b in site.beacons]
     for block in blocks:
-        part = step[block.columns]
+        part = np.array(step[block.columns])  # GTSAM's vectors are read-only
         if block.kind == "time_offset":
             time_offset += float(part[0])
         elif block.owner in ("magnetometer", "sensor") and block.group != "beacons":

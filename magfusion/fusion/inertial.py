@@ -1,0 +1,195 @@
+"""Inertial data between field epochs: preintegration, and the motion inside an interval."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation, Slerp
+
+from magfusion.records.samples import ImuSamples
+from magfusion.site import ImuModel
+from magfusion.strapdown import attitude_at, attitude_from_gyro
+from magfusion.trajectory import Trajectory
+from magfusion.units import Array, BoolArray, IntArray
+
+# What may happen while the IMU is silent: the motion of a person or a vehicle.
+BRIDGE_GYRO_NOISE = 1.0  # rad/s/sqrt(Hz)
+BRIDGE_ACCEL_NOISE = 3.0  # m/s^2/sqrt(Hz)
+GAP_SAMPLES = 5.0  # a gap is this many times the usual sampling interval
+
+
+@dataclass(frozen=True, eq=False)
+class Increments:
+    """Mean rate and specific force over short steps, cut at the epochs.
+
+    Parameters
+    ----------
+    gyro_body, accel_body : ndarray, shape (steps, 3)
+        (rad/s, m/s^2)
+    dt : ndarray, shape (steps,)
+        (s)
+    first : int ndarray, shape (epochs,)
+        First step after each epoch.
+    bridged : bool ndarray, shape (epochs - 1,)
+        Intervals in which the stream has a gap.
+    """
+
+    gyro_body: Array
+    accel_body: Array
+    dt: Array
+    first: IntArray
+    bridged: BoolArray
+
+
+def cut_at_epochs(imu: ImuSamples, time_offset: float, epochs: Array) -> Increments:
+    """Cut the inertial stream into steps that never straddle an epoch.
+
+    Parameters
+    ----------
+    imu : ImuSamples
+    time_offset : float
+        Added to its stamps to bring them to the log's clock (s).
+    epochs : ndarray, shape (n,)
+        (s); where they lie outside the stream its end values are held.
+
+    Returns
+    -------
+    Increments
+    """
+    time = imu.time + time_offset
+    inside = (time > epochs[0]) & (time < epochs[-1])
+    grid = np.union1d(time[inside], epochs)
+    samples = [
+        np.stack([np.interp(grid, time, axis) for axis in stream.T], axis=1)
+        for stream in (imu.gyro_body, imu.accel_body)
+    ]
+    gyro, accel = (0.5 * (s[:-1] + s[1:]) for s in samples)
+    first = np.searchsorted(grid, epochs)
+    usual = float(np.median(np.diff(imu.time)))
+    long = np.flatnonzero(np.diff(grid) > GAP_SAMPLES * usual)
+    bridged = np.zeros(len(epochs) - 1, dtype=bool)
+    bridged[np.searchsorted(first, long, side="right") - 1] = True
+    return Increments(gyro, accel, np.diff(grid), first, bridged)
+
+
+def _parameters(imu: ImuModel, gravity: float, *, bridge: bool) -> gtsam.PreintegrationCombinedParams:
+    parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
+    gyro = max(imu.gyro_noise, BRIDGE_GYRO_NOISE) if bridge else imu.gyro_noise
+    accel = max(imu.accel_noise, BRIDGE_ACCEL_NOISE) if bridge else imu.accel_noise
+    parameters.setGyroscopeCovariance(gyro**2 * np.eye(3))
+    parameters.setAccelerometerCovariance(accel**2 * np.eye(3))
+    parameters.setIntegrationCovariance(1e-12 * np.eye(3))
+    parameters.setBiasOmegaCovariance(imu.gyro_bias_walk**2 * np.eye(3))
+    parameters.setBiasAccCovariance(imu.accel_bias_walk**2 * np.eye(3))
+    return parameters
+
+
+def preintegrate(
+    increments: Increments, imu: ImuModel, gravity: float, accel_bias: Array, gyro_bias: Array
+) -> list[gtsam.PreintegratedCombinedMeasurementsG]:
+    """Preintegrate every interval between two epochs on the Galilean group.
+
+    GTSAM's default class is first-order on the rotation vector and breaks at one full turn.
+
+    Parameters
+    ----------
+    increments : Increments
+    imu : ImuModel
+    gravity : float
+        (m/s^2)
+    accel_bias, gyro_bias : ndarray, shape (epochs, 3)
+        At which to linearise (m/s^2, rad/s).
+
+    Returns
+    -------
+    list
+        One for each interval.
+    """
+    usual = _parameters(imu, gravity, bridge=False)
+    wide = _parameters(imu, gravity, bridge=True)
+    gyro, accel, dt = list(increments.gyro_body), list(increments.accel_body), increments.dt.tolist()
+    out = []
+    for i, (lo, hi) in enumerate(
+        zip(increments.first[:-1].tolist(), increments.first[1:].tolist(), strict=True)
+    ):
+        bias = gtsam.imuBias.ConstantBias(accel_bias[i], gyro_bias[i])
+        measurement = gtsam.PreintegratedCombinedMeasurementsG(
+            wide if increments.bridged[i] else usual, bias
+        )
+        integrate = measurement.integrateMeasurement
+        for a, w, step in zip(accel[lo:hi], gyro[lo:hi], dt[lo:hi], strict=True):
+            integrate(a, w, step)
+        out.append(measurement)
+    return out
+
+
+def motion_at(
+    states: Trajectory, imu: ImuSamples, time_offset: float, gravity: float, wanted: Array
+) -> Trajectory:
+    """Return the motion at any times: the IMU's shape between the states, through the states.
+
+    Parameters
+    ----------
+    states : Trajectory
+        With velocity and biases, at the field epochs.
+    imu : ImuSamples
+    time_offset : float
+        (s)
+    gravity : float
+        (m/s^2)
+    wanted : ndarray, shape (m,)
+        Strictly increasing (s).
+
+    Returns
+    -------
+    Trajectory
+        Pose and velocity at ``wanted``.  The IMU is integrated once over the log; what it then
+        lacks at the states is spread over the intervals, smoothly.
+    """
+    if states.velocity_world is None or states.gyro_bias_body is None:
+        raise ValueError("states must have velocity and biases")
+    assert states.accel_bias_body is not None
+    time = imu.time + time_offset
+    gyro = imu.gyro_body - _held(time, states.time, states.gyro_bias_body)
+    accel = imu.accel_body - _held(time, states.time, states.accel_bias_body)
+    chain = attitude_from_gyro(time, gyro)
+    at_states = attitude_at(chain, time, gyro, states.time)
+    world_from_start = Rotation.from_matrix(states.world_from_body) * at_states.inv()
+    turned = _turn_at(states.time, world_from_start, time) * chain
+    world_accel = turned.apply(accel) - [0.0, 0.0, gravity]
+    step = np.diff(time)[:, None]
+    gained = np.cumsum(0.5 * (world_accel[:-1] + world_accel[1:]) * step, axis=0)
+    velocity = np.concatenate([np.zeros((1, 3)), gained])
+    # Exact for an acceleration that is linear between samples.
+    inner = (2.0 * world_accel[:-1] + world_accel[1:]) * step**2 / 6.0
+    moved = np.cumsum(velocity[:-1] * step + inner, axis=0)
+    position = np.concatenate([np.zeros((1, 3)), moved])
+    path = CubicHermiteSpline(time, position, velocity)
+    lack = CubicHermiteSpline(
+        states.time,
+        states.position_world - path(states.time),
+        states.velocity_world - path.derivative()(states.time),
+    )
+    attitude = _turn_at(states.time, world_from_start, wanted) * attitude_at(
+        chain, time, gyro, wanted
+    )
+    inside = np.clip(wanted, states.time[0], states.time[-1])
+    beyond = (wanted - inside)[:, None]
+    return Trajectory(
+        time=wanted,
+        world_from_body=attitude.as_matrix(),
+        position_world=path(wanted) + lack(inside) + lack.derivative()(inside) * beyond,
+        velocity_world=path.derivative()(wanted) + lack.derivative()(inside),
+    )
+
+
+def _held(time: Array, known: Array, values: Array) -> Array:
+    return np.stack([np.interp(time, known, axis) for axis in values.T], axis=1)
+
+
+def _turn_at(known: Array, rotations: Rotation, wanted: Array) -> Rotation:
+    """Interpolate slowly varying rotations, holding the ends."""
+    if len(known) == 1:
+        return Rotation.concatenate([rotations] * len(wanted))
+    return Slerp(known, rotations)(np.clip(wanted, known[0], known[-1]))

@@ -1,0 +1,176 @@
+"""A start for the smoother: the chain of hypotheses that the motion joins best."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.fixes.fix import Fixes
+from magfusion.parameters import Calibration
+from magfusion.records.samples import ImuSamples
+from magfusion.strapdown import attitude_at, attitude_from_gyro
+from magfusion.trajectory import Trajectory
+from magfusion.units import Array, IntArray
+
+SPEED_SIGMA = 1.0  # m/s; of the platform between two epochs
+POSITION_SIGMA = 0.1  # m; added to the fixes' own, which calibration errors exceed
+ROTATION_SIGMA = 0.1  # rad
+GRAVITY_SIGMA = 1.5  # m/s^2; specific force against gravity, in motion
+AVERAGING = 2.0  # s; over which the specific force is compared with gravity
+LEAP_COST = 100.0  # of a jump between unrelated hypotheses: one bad epoch must not break a chain
+DRIFT_SEARCH = 1e-4  # relative; largest clock error looked for
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """First guess of the states.
+
+    Parameters
+    ----------
+    states : Trajectory
+        With velocity.
+    phase : ndarray, shape (n, channels)
+        Drive phase of the chosen hypotheses (rad).
+    chosen : int ndarray, shape (n,)
+        Hypothesis of each epoch.
+    rival_cost : float
+        How much worse, in units of chi square, the best entirely different chain is.
+    """
+
+    states: Trajectory
+    phase: Array
+    chosen: IntArray
+    rival_cost: float
+
+
+def choose_chain(fixes: Fixes, imu: ImuSamples, time_offset: float, gravity: float) -> Start:
+    """Choose one hypothesis for each epoch so that gyro, gravity and speed agree (Viterbi).
+
+    Parameters
+    ----------
+    fixes : Fixes
+    imu : ImuSamples
+    time_offset : float
+        (s)
+    gravity : float
+        (m/s^2)
+
+    Returns
+    -------
+    Start
+    """
+    time = imu.time + time_offset
+    attitude = attitude_at(
+        attitude_from_gyro(time, imu.gyro_body), time, imu.gyro_body, fixes.time
+    )
+    unary = np.minimum(fixes.cost - np.min(fixes.cost, axis=1, keepdims=True), LEAP_COST)
+    unary = unary + _gravity_cost(fixes, imu, time, gravity)
+    unary = np.where(np.isfinite(fixes.cost), unary, np.inf)
+    link = _link_cost(fixes, attitude)
+    chosen, cost = _viterbi(unary, link)
+    others = unary.copy()
+    others[np.arange(len(fixes)), chosen] = np.inf
+    usable = np.isfinite(others).any(axis=1)
+    rival = np.inf
+    if np.all(usable):
+        rival = _viterbi(others, link)[1] - cost
+    rows = np.arange(len(fixes))
+    position = fixes.position_world[rows, chosen]
+    return Start(
+        states=Trajectory(
+            time=fixes.time,
+            world_from_body=fixes.world_from_body[rows, chosen],
+            position_world=position,
+            velocity_world=_velocity(fixes.time, position),
+        ),
+        phase=fixes.phase[rows, chosen],
+        chosen=chosen,
+        rival_cost=float(rival),
+    )
+
+
+def _gravity_cost(fixes: Fixes, imu: ImuSamples, time: Array, gravity: float) -> Array:
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.accel_body, axis=0)])
+    lo = np.searchsorted(time, fixes.time - AVERAGING / 2)
+    hi = np.maximum(np.searchsorted(time, fixes.time + AVERAGING / 2), lo + 1)
+    hi = np.minimum(hi, len(time))
+    lo = np.minimum(lo, hi - 1)
+    mean_body = (total[hi] - total[lo]) / (hi - lo)[:, None]
+    mean_world = (fixes.world_from_body @ mean_body[:, None, :, None])[..., 0]
+    error = mean_world - [0.0, 0.0, gravity]
+    # The mean is taken in body axes that turn: a weak vote, enough against a mirrored pose.
+    return np.asarray(np.minimum(np.sum(error**2, axis=-1) / GRAVITY_SIGMA**2, LEAP_COST))
+
+
+def _link_cost(fixes: Fixes, attitude: Rotation) -> Array:
+    """Cost of going from hypothesis i to j between neighbouring epochs, shape (n-1, h, h)."""
+    dt = np.diff(fixes.time)
+    turn = (attitude[:-1].inv() * attitude[1:]).as_matrix()
+    expected = fixes.world_from_body[:-1] @ turn[:, None]
+    between = np.swapaxes(expected[:, :, None], -1, -2) @ fixes.world_from_body[1:, None]
+    angle = Rotation.from_matrix(between.reshape(-1, 3, 3)).magnitude().reshape(between.shape[:3])
+    jump = fixes.position_world[1:, None] - fixes.position_world[:-1, :, None]
+    spread = (SPEED_SIGMA * dt) ** 2 + POSITION_SIGMA**2
+    cost = np.sum(jump**2, axis=-1) / spread[:, None, None] + (angle / ROTATION_SIGMA) ** 2
+    return np.asarray(np.minimum(cost, LEAP_COST))
+
+
+def _viterbi(unary: Array, link: Array) -> tuple[IntArray, float]:
+    total = unary[0]
+    back = np.zeros((len(unary), unary.shape[1]), dtype=np.int64)
+    for k in range(1, len(unary)):
+        step = total[:, None] + link[k - 1]
+        back[k] = np.argmin(step, axis=0)
+        total = np.min(step, axis=0) + unary[k]
+    chosen = np.empty(len(unary), dtype=np.int64)
+    chosen[-1] = int(np.argmin(total))
+    for k in range(len(unary) - 1, 0, -1):
+        chosen[k - 1] = back[k, chosen[k]]
+    return chosen, float(np.min(total))
+
+
+def _velocity(time: Array, position: Array) -> Array:
+    if len(time) < 3:
+        return np.zeros_like(position)
+    return np.asarray(np.gradient(position, time, axis=0))
+
+
+def start_phases(calibration: Calibration, time: Array, phase: Array) -> Calibration:
+    """Return the calibration with the drive phase and drift that single-epoch phases suggest.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    time : ndarray, shape (n,)
+    phase : ndarray, shape (n, channels)
+        Beyond the calibration's own (rad).
+
+    Returns
+    -------
+    Calibration
+    """
+    new_phase, drift = calibration.phase.copy(), calibration.drift.copy()
+    elapsed = time - calibration.reference_time
+    start = 0
+    for i, beacon in enumerate(calibration.site.beacons):
+        rows = slice(start, start + len(beacon.tones))
+        start = rows.stop
+        if beacon.synchronised:
+            continue
+        frequency = float(beacon.tone_frequencies_hz[0])
+        drift[i] += _dominant_drift(elapsed, phase[:, rows.start], frequency)
+        rate = 2.0 * np.pi * beacon.tone_frequencies_hz * (drift[i] - calibration.drift[i])
+        left = np.exp(1j * (phase[:, rows] - elapsed[:, None] * rate))
+        new_phase[rows] += np.angle(np.sum(left, axis=0))
+    return Calibration(
+        calibration.site, new_phase, drift, calibration.time_offset, calibration.reference_time
+    )
+
+
+def _dominant_drift(elapsed: Array, phase: Array, frequency_hz: float) -> float:
+    """Clock error that lines the phases up best."""
+    reach = max(float(np.ptp(elapsed)), 1e-3)
+    number = int(np.clip(16.0 * DRIFT_SEARCH * frequency_hz * reach, 3, 20_000)) | 1
+    rates = np.linspace(-DRIFT_SEARCH, DRIFT_SEARCH, number) * 2.0 * np.pi * frequency_hz
+    score = [abs(np.sum(np.exp(1j * (phase - rate * elapsed)))) for rate in rates]
+    return float(rates[int(np.argmax(score))] / (2.0 * np.pi * frequency_hz))
