@@ -166,3 +166,17 @@ def test_pooled_nees_catches_sigmas_that_are_ten_percent_wrong() -> None:
     assert low < pooled_nees(errors, covs, epochs) < high
     assert pooled_nees(1.15 * errors, covs, epochs) > high
     assert pooled_nees(0.85 * errors, covs, epochs) < low
+
+
+def test_position_sigma_is_turned_from_body_to_world() -> None:
+    estimate, truth = _pair(10)
+    cov = np.tile(np.diag([1e-4, 4e-4, 9e-4, 0.01, 0.04, 0.09]), (POSES, 1, 1))
+    quarter = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
+    turned = Trajectory(
+        estimate.time, np.tile(quarter, (POSES, 1, 1)), estimate.position_world, pose_cov=cov
+    )
+    errors = trajectory_errors(turned, truth)
+    assert errors.position_sigma_world is not None
+    assert errors.attitude_sigma_body is not None
+    np.testing.assert_allclose(errors.position_sigma_world[7], [0.2, 0.1, 0.3], rtol=1e-9)  # m
+    np.testing.assert_allclose(errors.attitude_sigma_body[7], [0.01, 0.02, 0.03], rtol=1e-9)  # rad

@@ -12,11 +12,12 @@ PACKAGE = ROOT / "magfusion"
 # The floors of the house, from the ground; what stands on one floor does not see its neighbours.
 FLOORS = (
     {"units", "errors"},
-    {"physics", "strapdown"},
+    {"physics", "strapdown", "files"},
     {"site", "trajectory"},
-    {"site_file"},
+    {"site_file", "shapes"},
     {"records", "observation", "view"},
-    {"parameters"},
+    {"parameters", "weights"},
+    {"refinement"},
     {"receiver", "simulation", "calibration", "fusion", "fixes", "evaluation"},
     {"pipeline"},
     {"cli"},

@@ -63,6 +63,8 @@ class TrajectoryErrors:
         After the one constant world rotation that fits the attitudes best (rad).
     relative : RelativeErrors
         Over consecutive pairs of compared epochs.
+    world_from_body : ndarray, shape (n, 3, 3)
+        Of the estimate.
     pose_cov : ndarray, shape (n, 6, 6), optional
         Of the estimate, where it has one.
     nees : ndarray, shape (n,), optional
@@ -77,6 +79,7 @@ class TrajectoryErrors:
     aligned_position_world: Array
     aligned_attitude: Array
     relative: RelativeErrors
+    world_from_body: Array
     pose_cov: Array | None = None
     nees: Array | None = None
 
@@ -99,6 +102,26 @@ class TrajectoryErrors:
     def aligned_attitude_rmse_deg(self) -> float:
         """Root mean square of the attitude error after one constant world rotation (deg)."""
         return float(np.rad2deg(_rms(self.aligned_attitude)))
+
+    @property
+    def attitude_body(self) -> Array:
+        """Rotation vector of the attitude error in body axes (rad), shape (n, 3)."""
+        return self.pose_body[:, :3]
+
+    @property
+    def attitude_sigma_body(self) -> Array | None:
+        """Standard deviation of `attitude_body` (rad), shape (n, 3)."""
+        if self.pose_cov is None:
+            return None
+        return np.asarray(np.sqrt(np.diagonal(self.pose_cov, axis1=1, axis2=2)[:, :3]))
+
+    @property
+    def position_sigma_world(self) -> Array | None:
+        """Standard deviation of `position_world` (m), shape (n, 3)."""
+        if self.pose_cov is None:
+            return None
+        turn, cov_body = self.world_from_body, self.pose_cov[:, 3:, 3:]
+        return np.asarray(np.sqrt(np.einsum("nij,njk,nik->ni", turn, cov_body, turn)))
 
     @property
     def inside_3_sigma(self) -> float | None:
@@ -151,6 +174,7 @@ def trajectory_errors(
         aligned_position_world=_align(position, true.position_world) - true.position_world,
         aligned_attitude=_aligned_attitude(rotation, true.world_from_body),
         relative=relative_errors(rotation, position, true, frame_pairs(len(true), delta_frames)),
+        world_from_body=rotation,
         pose_cov=cov,
         nees=None if cov is None else _nees(pose_body, cov),
     )
