@@ -1,0 +1,261 @@
+"""A site as one YAML file: `load_site` believes nothing unchecked, `save_site` loses nothing."""
+
+import datetime
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.files import read_yaml, write_yaml
+from magfusion.physics.earth import earth_field_world
+from magfusion.site import (
+    Beacon,
+    BeaconSigma,
+    Coil,
+    ImuModel,
+    Location,
+    Magnetometer,
+    MagnetometerSigma,
+    Platform,
+    Site,
+)
+from magfusion.site_schema import (
+    BeaconEntry,
+    CoilEntry,
+    ImuEntry,
+    MagnetometerEntry,
+    SiteEntry,
+    WorldEntry,
+)
+from magfusion.units import DEGREE, Array
+
+
+def load_site(path: Path) -> Site:
+    """Read a site from its YAML file.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    Site
+        With ``earth_field_world`` by the IGRF, axes east, north, up, where the file gives a
+        location.
+
+    Raises
+    ------
+    InputError
+        Where the file is no YAML mapping, or a key is unknown, missing, of the wrong type or out
+        of range; the sentence names the file, the key's path, what was found and the remedy.
+    """
+    entry = read_yaml(path, SiteEntry)
+    location = _location(entry.world)
+    return Site(
+        gravity=entry.world.gravity_m_s2,
+        model_error=entry.world.model_error,
+        beacons=tuple(_beacon(b) for b in entry.beacons),
+        platform=Platform(_imu(entry.platform.imu), _magnetometer(entry.platform.magnetometer)),
+        earth_field_world=_reference_field(location, path)
+        if location
+        else entry.world.earth_field_t,
+        location=location,
+        calibration=entry.calibration,
+    )
+
+
+def save_site(site: Site, path: Path) -> None:
+    """Write a site as YAML that `load_site` reads back to float precision.
+
+    Parameters
+    ----------
+    site : Site
+    path : Path
+        Replaced as a whole, or left as it was if anything fails.
+    """
+    content = {
+        "magfusion_site": 1,
+        "world": _world_entry(site),
+        "beacons": [_beacon_entry(b) for b in site.beacons],
+        "platform": {
+            "imu": _imu_entry(site.platform.imu),
+            "magnetometer": _magnetometer_entry(site.platform.magnetometer),
+        },
+    }
+    if site.calibration is not None:
+        content["calibration"] = _plain(site.calibration)
+    write_yaml(content, path)
+
+
+def _matrix(rpy_deg: Array) -> Array:
+    return np.asarray(Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix())
+
+
+def _location(world: WorldEntry) -> Location | None:
+    return None if world.location is None else Location(**world.location.model_dump())
+
+
+def _reference_field(location: Location, path: Path) -> Array:
+    day = datetime.date.fromisoformat(location.date)
+    place = (location.latitude_deg, location.longitude_deg, location.height_m)
+    try:
+        return earth_field_world(*place, day)
+    except InputError as error:
+        raise InputError(f"{path}: world.{error}") from error
+
+
+def _beacon(entry: BeaconEntry) -> Beacon:
+    sigma = entry.sigma
+    return Beacon(
+        name=entry.name,
+        position_world=entry.position_m,
+        world_from_beacon=_matrix(entry.rpy_deg),
+        frequency_hz=entry.frequency_hz,
+        coils=tuple(_coil(c) for c in entry.coils),
+        synchronised=entry.synchronised,
+        sigma=BeaconSigma(
+            position_world=sigma.position_m,
+            rotation_beacon=sigma.rotation_deg * DEGREE,
+            log_moment=np.broadcast_to(sigma.log_moment, len(entry.coils)).copy(),
+        ),
+    )
+
+
+def _coil(entry: CoilEntry) -> Coil:
+    return Coil(
+        moment_beacon=entry.moment_a_m2,
+        phase=entry.phase_deg * DEGREE,
+        centre_beacon=entry.centre_m,
+        radius=entry.radius_m,
+        length=entry.length_m,
+        frequency_hz=entry.frequency_hz,
+        slot=entry.slot,
+    )
+
+
+def _imu(entry: ImuEntry) -> ImuModel:
+    values = entry.model_dump(exclude={"time_offset_s", "time_offset_sigma_s"})
+    return ImuModel(
+        **values, time_offset=entry.time_offset_s, time_offset_sigma=entry.time_offset_sigma_s
+    )
+
+
+def _magnetometer(entry: MagnetometerEntry) -> Magnetometer:
+    sigma = entry.sigma
+    return Magnetometer(
+        position_body=entry.body_from_sensor.position_m,
+        body_from_sensor=_matrix(entry.body_from_sensor.rpy_deg),
+        noise_density=entry.noise_density_t_rthz,
+        matrix=entry.matrix,
+        offset=entry.offset_t,
+        sigma=MagnetometerSigma(
+            matrix=sigma.matrix,
+            offset=sigma.offset_t,
+            rotation_sensor=sigma.rotation_deg * DEGREE,
+            position_body=sigma.position_m,
+        ),
+    )
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return value
+
+
+def _degrees(angle: Array | float) -> Any:
+    # 1e-12 deg is what arithmetic leaves of an angle: 2.0000000000000004 is written as 2.0.
+    return _plain(np.round(np.asarray(angle) / DEGREE, 12) + 0.0)
+
+
+def _rpy_deg(matrix: Array) -> Any:
+    """Return roll, pitch, yaw; Rotation.as_euler loses 1e-7 rad where the pitch is near 90 deg."""
+    yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
+    pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[0, 0], matrix[1, 0]))
+    rest = Rotation.from_euler("ZY", [yaw, pitch]).inv() * Rotation.from_matrix(matrix)
+    return _degrees(np.array([rest.as_rotvec()[0], pitch, yaw]))
+
+
+def _sigma_entry(sigma: Array) -> Any:
+    return _plain(sigma.flat[0] if np.all(sigma == sigma.flat[0]) else sigma)
+
+
+def _degree_sigma_entry(sigma: Array) -> Any:
+    # Relative here, where _degrees rounds absolutely: a sigma may be small.
+    return _sigma_entry(np.vectorize(lambda s: float(f"{s / DEGREE:.15g}"))(sigma))
+
+
+def _world_entry(site: Site) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "gravity_m_s2": float(site.gravity),
+        "model_error": float(site.model_error),
+    }
+    if site.location is not None:
+        day = datetime.date.fromisoformat(site.location.date)
+        entry["location"] = vars(site.location) | {"date": day}
+    elif site.earth_field_world is not None:
+        entry["earth_field_t"] = _plain(site.earth_field_world)
+    return entry
+
+
+def _beacon_entry(beacon: Beacon) -> dict[str, Any]:
+    return {
+        "name": beacon.name,
+        "position_m": _plain(beacon.position_world),
+        "rpy_deg": _rpy_deg(beacon.world_from_beacon),
+        "frequency_hz": float(beacon.frequency_hz),
+        "coils": [_coil_entry(c) for c in beacon.coils],
+        "synchronised": bool(beacon.synchronised),
+        "sigma": {
+            "position_m": _sigma_entry(beacon.sigma.position_world),
+            "rotation_deg": _degree_sigma_entry(beacon.sigma.rotation_beacon),
+            "log_moment": _sigma_entry(beacon.sigma.log_moment),
+        },
+    }
+
+
+def _coil_entry(coil: Coil) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "moment_a_m2": _plain(coil.moment_beacon),
+        "phase_deg": _degrees(coil.phase),
+    }
+    if coil.centre_beacon.any():
+        entry["centre_m"] = _plain(coil.centre_beacon)
+    options = {
+        "radius_m": coil.radius,
+        "length_m": coil.length,
+        "frequency_hz": coil.frequency_hz,
+        "slot": coil.slot,
+    }
+    return entry | {k: _plain(v) for k, v in options.items() if v is not None}
+
+
+def _imu_entry(imu: ImuModel) -> dict[str, Any]:
+    renamed = {"time_offset": "time_offset_s", "time_offset_sigma": "time_offset_sigma_s"}
+    return {renamed.get(k, k): float(v) for k, v in vars(imu).items()}
+
+
+def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
+    sigma = magnetometer.sigma
+    return {
+        "body_from_sensor": {
+            "position_m": _plain(magnetometer.position_body),
+            "rpy_deg": _rpy_deg(magnetometer.body_from_sensor),
+        },
+        "noise_density_t_rthz": float(magnetometer.noise_density),
+        "matrix": _plain(magnetometer.matrix),
+        "offset_t": _plain(magnetometer.offset),
+        "sigma": {
+            "matrix": _sigma_entry(sigma.matrix),
+            "offset_t": _sigma_entry(sigma.offset),
+            "rotation_deg": _degree_sigma_entry(sigma.rotation_sensor),
+            "position_m": _sigma_entry(sigma.position_body),
+        },
+    }
