@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
-from magfusion.units import Array
+from magfusion.units import Array, BoolArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,3 +52,52 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.time)
+
+
+def interpolate(
+    trajectory: Trajectory, time: Array, max_gap: float
+) -> tuple[Trajectory, BoolArray]:
+    """Return the poses at those of ``time`` that lie on a sample or in a short enough step.
+
+    Positions are joined by straight lines, attitudes by the shortest turn (slerp); the parts of
+    the trajectory beside its poses are left out.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    time : ndarray, shape (n,)
+        Strictly increasing (s).
+    max_gap : float
+        Longest step of the trajectory to interpolate across (s).
+
+    Returns
+    -------
+    poses : Trajectory
+        At the m times that exist.
+    exists : ndarray of bool, shape (n,)
+        Which of ``time`` they are.
+    """
+    known = trajectory.time
+    if len(known) == 0:
+        exists = np.zeros(len(time), dtype=bool)
+        return Trajectory(time[exists], np.empty((0, 3, 3)), np.empty((0, 3))), exists
+    after = np.clip(np.searchsorted(known, time), 0, len(known) - 1)
+    before = np.where(known[after] == time, after, np.maximum(after - 1, 0))
+    step = known[after] - known[before]
+    exists = (known[before] <= time) & (time <= known[after]) & (step <= max_gap)
+    wanted, left, right = time[exists], before[exists], after[exists]
+    # On a sample both neighbours are that sample, and the step is zero.
+    share = (wanted - known[left]) / np.where(left == right, 1.0, step[exists])
+    position = trajectory.position_world
+    turn = _slerp(known, trajectory.world_from_body, wanted)
+    moved = position[left] + share[:, None] * (position[right] - position[left])
+    return Trajectory(wanted, turn, moved), exists
+
+
+def _slerp(known: Array, world_from_body: Array, wanted: Array) -> Array:
+    if len(wanted) == 0:
+        return np.empty((0, 3, 3))
+    if len(known) == 1:
+        return world_from_body.copy()
+    turns = Slerp(known, Rotation.from_matrix(world_from_body))(wanted)
+    return np.asarray(turns.as_matrix())

@@ -90,7 +90,7 @@ class FieldSamples:
     @property
     def valid(self) -> BoolArray:
         """Which channels each row holds, shape (n, channels)."""
-        return np.isfinite(self.phasor_sensor).all(axis=2)
+        return np.asarray(np.isfinite(self.phasor_sensor).all(axis=2))
 
 
 @dataclass(frozen=True, eq=False)

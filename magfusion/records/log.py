@@ -1,0 +1,172 @@
+"""A log: a directory of tables and a header."""
+
+import shutil
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from magfusion.errors import InputError
+from magfusion.files import StrictModel, read_yaml, write_yaml
+from magfusion.records.atomic import whole_directory
+from magfusion.records.fields import read_fields, write_fields
+from magfusion.records.plausible import check_field, check_imu
+from magfusion.records.samples import FieldSamples, ImuSamples, Log, Waveform
+from magfusion.records.table import (
+    LARGEST_TIME_NS,
+    TIME,
+    Layout,
+    Span,
+    find_table,
+    read_table,
+    write_table,
+)
+from magfusion.records.trajectory_table import read_trajectory, write_trajectory
+from magfusion.trajectory import Trajectory
+
+HEADER = "log.yaml"
+STREAMS = ("imu", "magnetometer", "fields", "truth")
+_GYRO = ("gyro_x", "gyro_y", "gyro_z")
+_ACCEL = ("accel_x", "accel_y", "accel_z")
+_FIELD = ("field_x", "field_y", "field_z")
+
+
+class LogHeader(StrictModel):
+    """What ``log.yaml`` holds."""
+
+    magfusion_log: Literal[1]
+    name: str
+    epoch_ns: int = Field(ge=-LARGEST_TIME_NS, le=LARGEST_TIME_NS)
+    source: str
+
+
+def is_log(path: Path) -> bool:
+    """Tell whether a directory has the header of a magfusion log."""
+    return (path / HEADER).is_file()
+
+
+def read_log(path: Path, start: float | None = None, end: float | None = None) -> Log:
+    """Read and check a log, or the part of it with start <= time < end.
+
+    Parameters
+    ----------
+    path : Path
+        A directory with ``log.yaml`` and a table per stream, Parquet or CSV.
+    start, end : float, optional
+        Seconds since the log's epoch. Rows outside are neither decoded nor checked.
+
+    Returns
+    -------
+    Log
+        Streams without a row in the span are None.
+
+    Raises
+    ------
+    InputError
+        Where a file is missing, cannot be read or holds what no instrument gives, or where the
+        span holds no inertial samples or no field.
+    """
+    if not path.is_dir():
+        found = "is a file" if path.exists() else "there is no such directory"
+        raise InputError(f"{path}: {found}; give the path of a log's directory.")
+    if not is_log(path):
+        raise InputError(f"{path}: holds no {HEADER}; give the path of a log's directory.")
+    header = read_yaml(path / HEADER, LogHeader)
+    span = Span(header.epoch_ns, start, end)
+    tables = {stem: find_table(path, stem) for stem in STREAMS}
+    if tables["imu"] is None:
+        raise InputError(f"{path}: holds no imu.parquet or imu.csv; add the inertial samples.")
+    if tables["magnetometer"] is None and tables["fields"] is None:
+        raise InputError(
+            f"{path}: holds no magnetometer.parquet and no fields.parquet (nor .csv); add one."
+        )
+    log = Log(
+        name=header.name,
+        epoch_ns=header.epoch_ns,
+        source=header.source,
+        imu=_read_imu(tables["imu"], span),
+        waveform=_read_waveform(tables["magnetometer"], span),
+        fields=_read_fields(tables["fields"], span),
+        truth=_read_truth(tables["truth"], span),
+    )
+    if log.waveform is None and log.fields is None:
+        raise InputError(f"{path}: holds no field {span}; choose a span that the log covers.")
+    return log
+
+
+def write_log(log: Log, path: Path) -> None:
+    """Write a log as a directory of Parquet files; a log that is there is replaced.
+
+    Files of other names that lie in the former log are kept.
+
+    Raises
+    ------
+    InputError
+        Where something that is no log is at ``path``, or nothing can be written there.
+    """
+    with whole_directory(path, replaces=is_log) as unfinished:
+        if path.is_dir():
+            _keep_others(path, unfinished)
+        header = {"magfusion_log": 1, "name": log.name, "epoch_ns": log.epoch_ns}
+        write_yaml(header | {"source": log.source}, unfinished / HEADER)
+        _write_samples(log, unfinished)
+        if log.fields is not None:
+            write_fields(log.fields, unfinished / "fields.parquet", log.epoch_ns)
+        if log.truth is not None:
+            write_trajectory(log.truth, unfinished / "truth.parquet", log.epoch_ns)
+
+
+def _write_samples(log: Log, directory: Path) -> None:
+    span = Span(log.epoch_ns)
+    columns: dict[str, object] = {TIME: span.stamps(log.imu.time)}
+    columns |= dict(zip(_GYRO, log.imu.gyro_body.T, strict=True))
+    columns |= dict(zip(_ACCEL, log.imu.accel_body.T, strict=True))
+    write_table(columns, directory / "imu.parquet")
+    if log.waveform is not None:
+        columns = {TIME: span.stamps(log.waveform.time)}
+        columns |= dict(zip(_FIELD, log.waveform.measured_sensor.T, strict=True))
+        write_table(columns, directory / "magnetometer.parquet")
+
+
+def _keep_others(former: Path, directory: Path) -> None:
+    ours = {HEADER, *(f"{stem}{s}" for stem in STREAMS for s in (".parquet", ".csv"))}
+    for entry in former.iterdir():
+        if entry.is_dir():
+            shutil.copytree(entry, directory / entry.name)
+        elif entry.name not in ours:
+            shutil.copy2(entry, directory / entry.name)
+
+
+def _read_imu(path: Path, span: Span) -> ImuSamples:
+    table = read_table(path, Layout(numbers=(*_GYRO, *_ACCEL)), span)
+    if not len(table):
+        raise InputError(f"{path}: holds no row {span}; choose a span that the log covers.")
+    imu = ImuSamples(table.time, table.numbers(_GYRO), table.numbers(_ACCEL))
+    check_imu(imu, str(path))
+    return imu
+
+
+def _read_waveform(path: Path | None, span: Span) -> Waveform | None:
+    if path is None:
+        return None
+    table = read_table(path, Layout(numbers=_FIELD), span)
+    if not len(table):
+        return None
+    waveform = Waveform(table.time, table.numbers(_FIELD))
+    check_field(np.linalg.norm(waveform.measured_sensor, axis=1), str(path))
+    return waveform
+
+
+def _read_fields(path: Path | None, span: Span) -> FieldSamples | None:
+    if path is None:
+        return None
+    fields = read_fields(path, span)
+    return fields if len(fields) else None
+
+
+def _read_truth(path: Path | None, span: Span) -> Trajectory | None:
+    if path is None:
+        return None
+    truth = read_trajectory(path, span.epoch_ns, span.start, span.end)
+    return truth if len(truth) else None
