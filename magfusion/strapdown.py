@@ -3,7 +3,10 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.units import Array
+from magfusion.units import Array, BoolArray
+
+REST_GYRO = 0.03  # rad/s; scatter of a still MEMS gyro, well below that of any motion
+REST_ACCEL = 0.25  # m/s^2
 
 
 def rotation_increments(time: Array, gyro_body: Array) -> Rotation:
@@ -83,3 +86,36 @@ def attitude_at(attitude: Rotation, time: Array, gyro_body: Array, wanted: Array
     share = np.clip(0.5 * ahead / span, 0.0, 0.5)[:, None]
     rate = (1.0 - share) * gyro_body[index] + share * gyro_body[after]
     return attitude[index] * Rotation.from_rotvec(rate * ahead[:, None])
+
+
+def resting(time: Array, gyro_body: Array, accel_body: Array, span: float = 1.0) -> BoolArray:
+    """Return at which samples the platform stands still.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    gyro_body, accel_body : ndarray, shape (n, 3)
+        (rad/s, m/s^2)
+    span : float
+        Length of the stretch around each sample that must be quiet (s).
+
+    Returns
+    -------
+    bool ndarray, shape (n,)
+        Where rate and specific force scatter less than `REST_GYRO` and `REST_ACCEL` about their
+        means over the stretch.
+    """
+    lo = np.searchsorted(time, time - span / 2)
+    hi = np.searchsorted(time, time + span / 2, side="right")
+    quiet = np.ones(len(time), dtype=bool)
+    for stream, limit in ((gyro_body, REST_GYRO), (accel_body, REST_ACCEL)):
+        centred = stream - np.mean(stream, axis=0)
+        total = np.concatenate([np.zeros((1, 3)), np.cumsum(centred, axis=0)])
+        square = np.concatenate([np.zeros((1, 3)), np.cumsum(centred**2, axis=0)])
+        count = (hi - lo)[:, None]
+        mean = (total[hi] - total[lo]) / count
+        variance = (square[hi] - square[lo]) / count - mean**2
+        quiet &= np.sum(variance, axis=1) < limit**2
+    inside = (time - span / 2 >= time[0]) & (time + span / 2 <= time[-1])
+    return np.asarray(quiet & inside)

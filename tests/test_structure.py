@@ -13,7 +13,7 @@ PACKAGE = ROOT / "magfusion"
 FLOORS = (
     {"units", "errors"},
     {"physics", "strapdown", "files"},
-    {"site", "trajectory"},
+    {"site", "trajectory", "site_schema"},
     {"site_file", "shapes"},
     {"records", "observation", "view"},
     {"parameters", "weights"},
