@@ -12,12 +12,13 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import EstimationError
 from magfusion.fixes.candidates import attitudes, positions
 from magfusion.fixes.fix import Fixes
-from magfusion.observation import model_error_cov, skew
+from magfusion.observation import skew
 from magfusion.parameters import Block, Calibration, linearize_channels
 from magfusion.records.samples import FieldSamples
 from magfusion.site import Site
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array, BoolArray
+from magfusion.weights import measurement_cov, paired_whitening, stacked
 
 CHUNK = 500  # epochs solved at once
 CANDIDATES = 10  # positions that get an attitude
@@ -53,91 +54,6 @@ class _Problem:
     phase_blocks: tuple[Block, ...]
     gravity: Gravity | None
     prior: Trajectory | None
-
-
-def calibration_error(site: Site, distance: Array) -> Array:
-    """Return the relative error of each beacon's field that its survey's sigmas cause.
-
-    Parameters
-    ----------
-    site : Site
-    distance : ndarray, shape (n, beacons)
-        (m)
-
-    Returns
-    -------
-    ndarray, shape (n, beacons)
-        To first order: the field falls with the cube of the distance.
-    """
-    sensor = site.platform.magnetometer.sigma
-    common = np.mean(sensor.matrix**2) * 3.0 + np.mean(sensor.rotation_sensor**2) * 2.0
-    own = np.array(
-        [
-            np.mean(b.sigma.log_moment**2) + 2 * np.mean(b.sigma.rotation_beacon**2)
-            for b in site.beacons
-        ]
-    )
-    place = np.array([np.mean(b.sigma.position_world**2) for b in site.beacons])
-    lever = np.mean(sensor.position_body**2)
-    return np.sqrt(common + own + 9.0 * (place + lever) / distance**2)
-
-
-def _distances(site: Site, samples: FieldSamples) -> Array:
-    """Range of each beacon from the strength of its field alone, within a sixth."""
-    out, start = [], 0
-    for beacon in site.beacons:
-        rows = slice(start, start + len(beacon.tones))
-        drive = beacon.moments_beacon.T @ beacon.excitation
-        power = np.sum(np.abs(samples.phasor_sensor[:, rows]) ** 2, axis=(1, 2))
-        out.append(np.cbrt(1e-7 * np.sqrt(2.0 * np.sum(np.abs(drive) ** 2) / power)))
-        start = rows.stop
-    return np.stack(out, axis=1)
-
-
-def measurement_cov(site: Site, samples: FieldSamples, *, survey_error: bool = False) -> Array:
-    """Return the covariance of each phasor component: noise and model error.
-
-    Parameters
-    ----------
-    site : Site
-    samples : FieldSamples
-    survey_error : bool
-        Add what the sigmas of the site's calibration cause, for a solver that does not estimate it.
-
-    Returns
-    -------
-    ndarray, shape (n, channels, 3, 3)
-        (T^2), measured axes.
-    """
-    total = samples.phasor_cov + model_error_cov(samples.phasor_sensor, site.model_error)
-    if survey_error:
-        owner = [i for i, b in enumerate(site.beacons) for _ in b.tones]
-        relative = calibration_error(site, _distances(site, samples))[:, owner]
-        power = 0.5 * np.sum(np.abs(samples.phasor_sensor) ** 2, axis=-1)
-        total = total + (relative**2 * power / 3.0)[..., None, None] * np.eye(3)
-    return np.asarray(total)
-
-
-def whitening(cov: Array, valid: BoolArray) -> Array:
-    """Return ``W`` with ``W^T W = cov^-1``, shape (..., 3, 3); zero where a channel is missing."""
-    safe = np.where(valid[..., None, None], cov, np.eye(3))
-    scale = np.sqrt(np.trace(safe, axis1=-2, axis2=-1) / 3.0)[..., None, None]
-    root = np.linalg.inv(np.linalg.cholesky(safe / scale**2)) / scale
-    return np.where(valid[..., None, None], root, 0.0)
-
-
-def paired_whitening(cov: Array, valid: BoolArray) -> Array:
-    """Return the whitening of real and imaginary part together, shape (..., 6, 6)."""
-    single = whitening(cov, valid)
-    root = np.zeros((*single.shape[:-2], 6, 6))
-    root[..., :3, :3] = single
-    root[..., 3:, 3:] = single
-    return root
-
-
-def stacked(phasor: Array) -> Array:
-    """Return complex vectors as real part, then imaginary part; zero where they are NaN."""
-    return np.nan_to_num(np.concatenate([phasor.real, phasor.imag], axis=-1))
 
 
 def _phase_blocks(site: Site) -> tuple[Block, ...]:

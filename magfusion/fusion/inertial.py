@@ -73,7 +73,9 @@ def cut_at_epochs(imu: ImuSamples, time_offset: float, epochs: Array) -> Increme
     return Increments(gyro, accel, np.diff(grid), first, bridged)
 
 
-def _parameters(imu: ImuModel, gravity: float, *, bridge: bool) -> gtsam.PreintegrationCombinedParams:
+def _parameters(
+    imu: ImuModel, gravity: float, *, bridge: bool
+) -> gtsam.PreintegrationCombinedParams:
     parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
     gyro = max(imu.gyro_noise, BRIDGE_GYRO_NOISE) if bridge else imu.gyro_noise
     accel = max(imu.accel_noise, BRIDGE_ACCEL_NOISE) if bridge else imu.accel_noise
@@ -108,7 +110,11 @@ def preintegrate(
     """
     usual = _parameters(imu, gravity, bridge=False)
     wide = _parameters(imu, gravity, bridge=True)
-    gyro, accel, dt = list(increments.gyro_body), list(increments.accel_body), increments.dt.tolist()
+    gyro, accel, dt = (
+        list(increments.gyro_body),
+        list(increments.accel_body),
+        increments.dt.tolist(),
+    )
     out = []
     for i, (lo, hi) in enumerate(
         zip(increments.first[:-1].tolist(), increments.first[1:].tolist(), strict=True)

@@ -129,14 +129,10 @@ def inertial_graph(
     bias_noise = gtsam.noiseModel.Diagonal.Sigmas(np.maximum(sigmas, 1e-9))
     zero_bias = gtsam.imuBias.ConstantBias(np.zeros(3), np.zeros(3))
     graph.addPriorConstantBias(B(0), zero_bias, bias_noise)
-    graph.addPriorVector(
-        V(0), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, VELOCITY_SIGMA)
-    )
+    graph.addPriorVector(V(0), np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, VELOCITY_SIGMA))
     for i, measurement in enumerate(preintegrated):
         j = i + 1
-        graph.add(
-            gtsam.GalileanCombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), measurement)
-        )
+        graph.add(gtsam.GalileanCombinedImuFactor(X(i), V(i), X(j), V(j), B(i), B(j), measurement))
     return graph
 
 

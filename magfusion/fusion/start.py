@@ -60,9 +60,7 @@ def choose_chain(fixes: Fixes, imu: ImuSamples, time_offset: float, gravity: flo
     Start
     """
     time = imu.time + time_offset
-    attitude = attitude_at(
-        attitude_from_gyro(time, imu.gyro_body), time, imu.gyro_body, fixes.time
-    )
+    attitude = attitude_at(attitude_from_gyro(time, imu.gyro_body), time, imu.gyro_body, fixes.time)
     unary = np.minimum(fixes.cost - np.min(fixes.cost, axis=1, keepdims=True), LEAP_COST)
     unary = unary + _gravity_cost(fixes, imu, time, gravity)
     unary = np.where(np.isfinite(fixes.cost), unary, np.inf)

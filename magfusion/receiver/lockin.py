@@ -39,7 +39,7 @@ class LockinSettings:
     window: float
     step: float
     mains_hz: float = 50.0
-    noise_windows: int = 15
+    noise_windows: int = 9
 
 
 @dataclass(frozen=True, eq=False)

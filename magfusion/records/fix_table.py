@@ -1,0 +1,55 @@
+"""Hypotheses of single-epoch fixes as a table, several rows a time, best first."""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.records.table import TIME, Span, write_table
+from magfusion.units import Array, BoolArray
+
+
+def write_hypotheses(
+    path: Path,
+    epoch_ns: int,
+    time: Array,
+    world_from_body: Array,
+    position_world: Array,
+    cost: Array,
+    probability: Array,
+    determined: BoolArray,
+) -> None:
+    """Write the hypotheses of every epoch as Parquet.
+
+    Parameters
+    ----------
+    path : Path
+    epoch_ns : int
+    time : ndarray, shape (n,)
+        (s)
+    world_from_body : ndarray, shape (n, hypotheses, 3, 3)
+    position_world : ndarray, shape (n, hypotheses, 3)
+        (m)
+    cost, probability : ndarray, shape (n, hypotheses)
+        Chi square, infinite where there is no such hypothesis; share of the posterior.
+    determined : bool ndarray, shape (n, hypotheses)
+        False where a direction of the pose is open.
+    """
+    epoch, rank = np.nonzero(np.isfinite(cost))
+    rotation = Rotation.from_matrix(world_from_body[epoch, rank])
+    columns: dict[str, object] = {
+        TIME: Span(epoch_ns).stamps(time[epoch]),
+        "hypothesis": rank,
+    }
+    columns |= dict(
+        zip(("position_x", "position_y", "position_z"), position_world[epoch, rank].T, strict=True)
+    )
+    columns |= dict(
+        zip(("qw", "qx", "qy", "qz"), rotation.as_quat(scalar_first=True).T, strict=True)
+    )
+    columns |= {
+        "chi_square": cost[epoch, rank],
+        "probability": probability[epoch, rank],
+        "determined": determined[epoch, rank],
+    }
+    write_table(columns, path)

@@ -1,0 +1,101 @@
+"""The flat object of figures that every job writes and prints."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from magfusion.evaluation.errors import TrajectoryErrors
+from magfusion.fixes.fix import Fixes
+from magfusion.fusion.batch import Smoothed
+from magfusion.refinement import findings
+from magfusion.units import Array
+
+Figures = dict[str, float | int | str | bool | list[str] | None]
+
+
+def error_figures(errors: TrajectoryErrors, prefix: str = "") -> Figures:
+    """Return the errors against the truth: absolute, aligned, relative, and their consistency."""
+    figures: Figures = {
+        "ate_m": errors.ate,
+        "attitude_rmse_deg": errors.attitude_rmse_deg,
+        "aligned_ate_m": errors.aligned_ate,
+        "aligned_attitude_rmse_deg": errors.aligned_attitude_rmse_deg,
+        "rpe_translation_m": errors.relative.translation_rmse,
+        "rpe_rotation_deg": errors.relative.rotation_rmse_deg,
+        "compared_epochs": len(errors.time),
+    }
+    if errors.nees is not None and errors.pose_cov is not None:
+        sigma = np.sqrt(np.diagonal(errors.pose_cov, axis1=1, axis2=2))
+        ratio = np.abs(errors.pose_body) / sigma
+        figures |= {
+            "nees_mean": float(np.mean(errors.nees)),
+            "nees_median": float(np.median(errors.nees)),
+            "inside_3_sigma": errors.inside_3_sigma,
+            "position_inside_3_sigma": float(np.mean(ratio[:, 3:] <= 3.0)),
+            "attitude_inside_3_sigma": float(np.mean(ratio[:, :3] <= 3.0)),
+        }
+    return {prefix + key: value for key, value in figures.items()}
+
+
+def dropped_figures(dropped: Mapping[str, int]) -> Figures:
+    """Return how many windows were dropped, in all and for each reason."""
+    figures: Figures = {"windows_dropped": sum(dropped.values())}
+    for reason, count in dropped.items():
+        figures["windows_dropped_" + reason.replace(" ", "_")] = count
+    return figures
+
+
+def residual_figures(residual: Array, channels: tuple[tuple[str, int], ...]) -> Figures:
+    """Return the whitened residual of each beacon: one where noise and model are as declared."""
+    figures: Figures = {}
+    for name in dict.fromkeys(beacon for beacon, _ in channels):
+        own = residual[:, [beacon == name for beacon, _ in channels]]
+        if np.any(np.isfinite(own)):
+            figures[f"residual_rms_{name}"] = float(np.sqrt(np.nanmean(own**2)))
+    return figures
+
+
+def smoothed_figures(result: Smoothed) -> Figures:
+    """Return the figures of a smoothed log."""
+    told = findings(result.declared, result.calibration, result.blocks, result.calibration_cov)
+    chosen = result.start.chosen
+    figures: Figures = {
+        "epochs": len(result.states),
+        "duration_s": float(result.states.time[-1] - result.states.time[0]),
+        "window_s": float(np.median(result.fields.window)),
+        "passes": result.passes,
+        "iterations": result.iterations,
+        "converged": result.converged,
+        "cost": result.cost,
+        "intervals_bridged": result.bridged,
+        "start_epochs_not_first_hypothesis": int(np.sum(chosen > 0)),
+        "start_rival_chi_square": result.start.rival_cost
+        if np.isfinite(result.start.rival_cost)
+        else None,
+        "time_offset_s": result.calibration.time_offset,
+    }
+    figures |= dropped_figures(result.dropped)
+    figures |= residual_figures(result.residual, result.fields.channels)
+    if result.states.pose_cov is not None:
+        sigma = np.sqrt(np.diagonal(result.states.pose_cov, axis1=1, axis2=2))
+        figures["position_sigma_median_m"] = float(np.median(sigma[:, 3:]))
+        figures["attitude_sigma_median_deg"] = float(np.rad2deg(np.median(sigma[:, :3])))
+    for found in told:
+        figures[found.name] = found.change
+        figures[f"{found.name}_sigma"] = found.sigma
+        figures[f"{found.name}_prior_sigma"] = found.prior_sigma
+    figures["determined"] = [f.name for f in told if f.determined]
+    figures["undetermined"] = [f.name for f in told if not f.determined]
+    return figures
+
+
+def fix_figures(fixes: Fixes) -> Figures:
+    """Return the figures of single-epoch fixes, ambiguities included."""
+    share = fixes.probability
+    second = share[:, 1] if share.shape[1] > 1 else np.zeros(len(fixes))
+    return {
+        "epochs": len(fixes),
+        "ambiguous_epochs": int(np.sum(second > 0.05)),
+        "undetermined_epochs": int(np.sum(~fixes.determined[:, 0])),
+        "residual_rms_median": float(np.median(fixes.residual_rms[:, 0])),
+    }
