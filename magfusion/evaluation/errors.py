@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.trajectory import Trajectory
+from magfusion.trajectory import Trajectory, interpolate
 from magfusion.units import Array, BoolArray, IntArray
 
 
@@ -155,7 +155,7 @@ def trajectory_errors(
     InputError
         Where fewer than three epochs of the estimate have a truth.
     """
-    true, compared = _interpolate(truth, estimate.time, max_gap)
+    true, compared = interpolate(truth, estimate.time, max_gap)
     if len(true) < 3:
         raise InputError(
             f"The truth covers {len(true)} of the estimate's {len(estimate)} epochs within"
@@ -267,27 +267,3 @@ def _nees(error: Array, cov: Array) -> Array:
 
 def _rms(value: Array) -> float:
     return float(np.sqrt(np.mean(value**2)))
-
-
-def _interpolate(
-    trajectory: Trajectory, time: Array, max_gap: float
-) -> tuple[Trajectory, BoolArray]:
-    """Return the poses at those of ``time`` that no step longer than ``max_gap`` leaves open."""
-    known = trajectory.time
-    after = np.clip(np.searchsorted(known, time), 1, len(known) - 1)
-    before = after - 1
-    inside = (time >= known[0]) & (time <= known[-1])
-    exact = (time == known[before]) | (time == known[after])
-    exists = inside & (exact | (known[after] - known[before] <= max_gap))
-    wanted, left, right = time[exists], before[exists], after[exists]
-    weight = ((wanted - known[left]) / (known[right] - known[left]))[:, None]
-    position = trajectory.position_world
-    rotation = Slerp(known, Rotation.from_matrix(trajectory.world_from_body))(wanted)
-    return (
-        Trajectory(
-            time=wanted,
-            world_from_body=rotation.as_matrix(),
-            position_world=(1.0 - weight) * position[left] + weight * position[right],
-        ),
-        exists,
-    )

@@ -1,35 +1,24 @@
 """A log: a directory of tables and a header."""
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
-import numpy as np
 from pydantic import Field
 
 from magfusion.errors import InputError
 from magfusion.files import StrictModel, read_yaml, write_yaml
 from magfusion.records.atomic import whole_directory
 from magfusion.records.fields import read_fields, write_fields
-from magfusion.records.plausible import check_field, check_imu
-from magfusion.records.samples import FieldSamples, ImuSamples, Log, Waveform
-from magfusion.records.table import (
-    LARGEST_TIME_NS,
-    TIME,
-    Layout,
-    Span,
-    find_table,
-    read_table,
-    write_table,
-)
+from magfusion.records.samples import FieldSamples, Log, Waveform
+from magfusion.records.streams import read_imu, read_waveform, write_imu, write_waveform
+from magfusion.records.table import LARGEST_TIME_NS, Span, find_table
 from magfusion.records.trajectory_table import read_trajectory, write_trajectory
 from magfusion.trajectory import Trajectory
 
 HEADER = "log.yaml"
 STREAMS = ("imu", "magnetometer", "fields", "truth")
-_GYRO = ("gyro_x", "gyro_y", "gyro_z")
-_ACCEL = ("accel_x", "accel_y", "accel_z")
-_FIELD = ("field_x", "field_y", "field_z")
 
 
 class LogHeader(StrictModel):
@@ -85,10 +74,10 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
         name=header.name,
         epoch_ns=header.epoch_ns,
         source=header.source,
-        imu=_read_imu(tables["imu"], span),
-        waveform=_read_waveform(tables["magnetometer"], span),
-        fields=_read_fields(tables["fields"], span),
-        truth=_read_truth(tables["truth"], span),
+        imu=read_imu(tables["imu"], span),
+        waveform=_read_if_there(tables["magnetometer"], read_waveform, span),
+        fields=_read_if_there(tables["fields"], read_fields, span),
+        truth=_read_if_there(tables["truth"], _read_truth, span),
     )
     if log.waveform is None and log.fields is None:
         raise InputError(f"{path}: holds no field {span}; choose a span that the log covers.")
@@ -110,23 +99,13 @@ def write_log(log: Log, path: Path) -> None:
             _keep_others(path, unfinished)
         header = {"magfusion_log": 1, "name": log.name, "epoch_ns": log.epoch_ns}
         write_yaml(header | {"source": log.source}, unfinished / HEADER)
-        _write_samples(log, unfinished)
+        write_imu(log.imu, unfinished / "imu.parquet", log.epoch_ns)
+        if log.waveform is not None:
+            write_waveform(log.waveform, unfinished / "magnetometer.parquet", log.epoch_ns)
         if log.fields is not None:
             write_fields(log.fields, unfinished / "fields.parquet", log.epoch_ns)
         if log.truth is not None:
             write_trajectory(log.truth, unfinished / "truth.parquet", log.epoch_ns)
-
-
-def _write_samples(log: Log, directory: Path) -> None:
-    span = Span(log.epoch_ns)
-    columns: dict[str, object] = {TIME: span.stamps(log.imu.time)}
-    columns |= dict(zip(_GYRO, log.imu.gyro_body.T, strict=True))
-    columns |= dict(zip(_ACCEL, log.imu.accel_body.T, strict=True))
-    write_table(columns, directory / "imu.parquet")
-    if log.waveform is not None:
-        columns = {TIME: span.stamps(log.waveform.time)}
-        columns |= dict(zip(_FIELD, log.waveform.measured_sensor.T, strict=True))
-        write_table(columns, directory / "magnetometer.parquet")
 
 
 def _keep_others(former: Path, directory: Path) -> None:
@@ -138,35 +117,15 @@ def _keep_others(former: Path, directory: Path) -> None:
             shutil.copy2(entry, directory / entry.name)
 
 
-def _read_imu(path: Path, span: Span) -> ImuSamples:
-    table = read_table(path, Layout(numbers=(*_GYRO, *_ACCEL)), span)
-    if not len(table):
-        raise InputError(f"{path}: holds no row {span}; choose a span that the log covers.")
-    imu = ImuSamples(table.time, table.numbers(_GYRO), table.numbers(_ACCEL))
-    check_imu(imu, str(path))
-    return imu
+_Stream = TypeVar("_Stream", Waveform, FieldSamples, Trajectory)
 
 
-def _read_waveform(path: Path | None, span: Span) -> Waveform | None:
-    if path is None:
-        return None
-    table = read_table(path, Layout(numbers=_FIELD), span)
-    if not len(table):
-        return None
-    waveform = Waveform(table.time, table.numbers(_FIELD))
-    check_field(np.linalg.norm(waveform.measured_sensor, axis=1), str(path))
-    return waveform
+def _read_if_there(
+    path: Path | None, read: Callable[[Path, Span], _Stream], span: Span
+) -> _Stream | None:
+    stream = None if path is None else read(path, span)
+    return stream if stream is not None and len(stream) else None
 
 
-def _read_fields(path: Path | None, span: Span) -> FieldSamples | None:
-    if path is None:
-        return None
-    fields = read_fields(path, span)
-    return fields if len(fields) else None
-
-
-def _read_truth(path: Path | None, span: Span) -> Trajectory | None:
-    if path is None:
-        return None
-    truth = read_trajectory(path, span.epoch_ns, span.start, span.end)
-    return truth if len(truth) else None
+def _read_truth(path: Path, span: Span) -> Trajectory:
+    return read_trajectory(path, span.epoch_ns, span.start, span.end)

@@ -48,9 +48,9 @@ def check_field(size: Array, place: str) -> None:
     InputError
         Naming ``place``, what was found and the likely factor.
     """
-    field = float(np.median(size))
+    field = float(np.median(size)) if len(size) else 0.0
     if field > LARGEST_FIELD:
         raise InputError(
-            f"{place}: the field is {field:.3g} T (median), so it is probably in nT;"
-            " divide it by 1e9 (by 1e6 if it is in microtesla)."
+            f"{place}: the field is {field:.3g} T (median), so it is probably in another unit;"
+            " divide nanotesla by 1e9, microtesla by 1e6, gauss by 1e4."
         )

@@ -193,10 +193,18 @@ def find_table(directory: Path, stem: str) -> Path | None:
     return paths[0] if paths else None
 
 
-def read_table(path: Path, layout: Layout, span: Span) -> Table:
+def read_table(path: Path, layout: Layout, span: Span, names: tuple[str, ...] = ()) -> Table:
     """Read the columns of a layout and the rows of a span.
 
     A Parquet file is mapped, and only the row groups that the span needs are decoded.
+
+    Parameters
+    ----------
+    path : Path
+    layout : Layout
+    span : Span
+    names : tuple of str
+        Names of the first columns of a CSV whose own header uses others.
 
     Raises
     ------
@@ -207,8 +215,10 @@ def read_table(path: Path, layout: Layout, span: Span) -> Table:
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; give the path of a table.")
     try:
-        read = _read_csv if path.suffix == ".csv" else _read_parquet
-        data, first_row = read(path, layout, span)
+        if path.suffix == ".csv":
+            data, first_row = _read_csv(path, layout, names), 0
+        else:
+            data, first_row = _read_parquet(path, layout, span)
     except InputError:
         raise
     except (pa.ArrowException, OSError, ValueError) as error:
@@ -255,10 +265,10 @@ def _groups_within(file: pa.parquet.ParquetFile, span: Span) -> range:
     return range(within[0], within[-1] + 1) if within else range(0)
 
 
-def _read_csv(path: Path, layout: Layout, _span: Span) -> tuple[pa.Table, int]:
+def _read_csv(path: Path, layout: Layout, renamed: tuple[str, ...]) -> pa.Table:
     with path.open(newline="", encoding="utf-8-sig") as stream:
         header = next(csv.reader(stream), [])
-    found = [name.strip() for name in header]
+    found = [*renamed[: len(header)], *(name.strip() for name in header[len(renamed) :])]
     names = layout.chosen(found, path)
     data = pa.csv.read_csv(
         path,
@@ -268,7 +278,7 @@ def _read_csv(path: Path, layout: Layout, _span: Span) -> tuple[pa.Table, int]:
         ),
     )
     _refuse_empty(data.num_rows, path)
-    return data, 0
+    return data
 
 
 def _check_times(whole: Table, time_ns: IntArray, layout: Layout, span: Span) -> None:
