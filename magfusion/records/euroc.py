@@ -5,19 +5,24 @@ their place: the headers' wording differs between the data sets that share the f
 """
 
 import csv
+from functools import partial
 from pathlib import Path
 
 from magfusion.errors import InputError
 from magfusion.records.samples import Log
-from magfusion.records.streams import read_imu, read_waveform
-from magfusion.records.table import TIME, Span
+from magfusion.records.streams import read_if_there, read_imu, read_waveform
+from magfusion.records.table import TIME, Span, find_table
 from magfusion.records.trajectory_table import read_trajectory
+from magfusion.trajectory import Trajectory
 
-_GYRO_ACCEL = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
-_FIELD = ("field_x", "field_y", "field_z")
-_POSE = ("position_x", "position_y", "position_z", "qw", "qx", "qy", "qz")
-_MOTION = ("velocity_x", "velocity_y", "velocity_z")
-_BIASES = tuple(f"{sensor}_bias_{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
+_IMU = (TIME, "gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
+_FIELD = (TIME, "field_x", "field_y", "field_z")
+_TRUTH = (
+    *(TIME, "position_x", "position_y", "position_z", "qw", "qx", "qy", "qz"),
+    *("velocity_x", "velocity_y", "velocity_z"),
+    *("gyro_bias_x", "gyro_bias_y", "gyro_bias_z"),
+    *("accel_bias_x", "accel_bias_y", "accel_bias_z"),
+)
 
 
 def is_euroc(path: Path) -> bool:
@@ -44,18 +49,21 @@ def read_euroc(path: Path, start: float | None = None, end: float | None = None)
     """
     streams = path / "mav0"
     imu = streams / "imu0" / "data.csv"
-    field = streams / "mag0" / "data.csv"
-    truth = streams / "state_groundtruth_estimate0" / "data.csv"
+    field = find_table(streams / "mag0", "data")
+    truth = find_table(streams / "state_groundtruth_estimate0", "data")
     span = Span(_first_stamp(imu), start, end)
-    poses = (TIME, *_POSE, *_MOTION, *_BIASES)
     return Log(
         name=path.resolve().name,
         epoch_ns=span.epoch_ns,
         source="EuRoC folder",
-        imu=read_imu(imu, span, (TIME, *_GYRO_ACCEL)),
-        waveform=read_waveform(field, span, (TIME, *_FIELD)) if field.is_file() else None,
-        truth=read_trajectory(truth, span.epoch_ns, start, end, poses) if truth.is_file() else None,
+        imu=read_imu(imu, span, _IMU),
+        waveform=read_if_there(field, partial(read_waveform, names=_FIELD), span),
+        truth=read_if_there(truth, _read_truth, span),
     )
+
+
+def _read_truth(path: Path, span: Span) -> Trajectory:
+    return read_trajectory(path, span.epoch_ns, span.start, span.end, _TRUTH)
 
 
 def _first_stamp(path: Path) -> int:

@@ -1,9 +1,8 @@
 """A log: a directory of tables and a header."""
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 from pydantic import Field
 
@@ -11,8 +10,14 @@ from magfusion.errors import InputError
 from magfusion.files import StrictModel, read_yaml, write_yaml
 from magfusion.records.atomic import whole_directory
 from magfusion.records.fields import read_fields, write_fields
-from magfusion.records.samples import FieldSamples, Log, Waveform
-from magfusion.records.streams import read_imu, read_waveform, write_imu, write_waveform
+from magfusion.records.samples import Log
+from magfusion.records.streams import (
+    read_if_there,
+    read_imu,
+    read_waveform,
+    write_imu,
+    write_waveform,
+)
 from magfusion.records.table import LARGEST_TIME_NS, Span, find_table
 from magfusion.records.trajectory_table import read_trajectory, write_trajectory
 from magfusion.trajectory import Trajectory
@@ -75,9 +80,9 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
         epoch_ns=header.epoch_ns,
         source=header.source,
         imu=read_imu(tables["imu"], span),
-        waveform=_read_if_there(tables["magnetometer"], read_waveform, span),
-        fields=_read_if_there(tables["fields"], read_fields, span),
-        truth=_read_if_there(tables["truth"], _read_truth, span),
+        waveform=read_if_there(tables["magnetometer"], read_waveform, span),
+        fields=read_if_there(tables["fields"], read_fields, span),
+        truth=read_if_there(tables["truth"], _read_truth, span),
     )
     if log.waveform is None and log.fields is None:
         raise InputError(f"{path}: holds no field {span}; choose a span that the log covers.")
@@ -115,16 +120,6 @@ def _keep_others(former: Path, directory: Path) -> None:
             shutil.copytree(entry, directory / entry.name)
         elif entry.name not in ours:
             shutil.copy2(entry, directory / entry.name)
-
-
-_Stream = TypeVar("_Stream", Waveform, FieldSamples, Trajectory)
-
-
-def _read_if_there(
-    path: Path | None, read: Callable[[Path, Span], _Stream], span: Span
-) -> _Stream | None:
-    stream = None if path is None else read(path, span)
-    return stream if stream is not None and len(stream) else None
 
 
 def _read_truth(path: Path, span: Span) -> Trajectory:

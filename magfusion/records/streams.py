@@ -1,13 +1,18 @@
 """Tables of inertial and magnetometer samples."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.records.plausible import check_field, check_imu
-from magfusion.records.samples import ImuSamples, Waveform
+from magfusion.records.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.records.table import TIME, Layout, Span, read_table, write_table
+from magfusion.trajectory import Trajectory
+
+Stream = TypeVar("Stream", Waveform, FieldSamples, Trajectory)
 
 _GYRO = ("gyro_x", "gyro_y", "gyro_z")
 _ACCEL = ("accel_x", "accel_y", "accel_z")
@@ -59,3 +64,11 @@ def write_waveform(waveform: Waveform, path: Path, epoch_ns: int) -> None:
     columns: dict[str, object] = {TIME: Span(epoch_ns).stamps(waveform.time)}
     columns |= dict(zip(_FIELD, waveform.measured_sensor.T, strict=True))
     write_table(columns, path)
+
+
+def read_if_there(
+    path: Path | None, read: Callable[[Path, Span], Stream], span: Span
+) -> Stream | None:
+    """Return what a reader finds, or None where there is no file or no row within the span."""
+    stream = None if path is None else read(path, span)
+    return stream if stream is not None and len(stream) else None
