@@ -1,0 +1,182 @@
+"""Files appear whole or not at all, and YAML is checked against a model before it is believed."""
+
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from magfusion.errors import InputError
+
+LARGEST_YAML = 1 << 20  # bytes
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class StrictModel(BaseModel):
+    """Refuses unknown keys, converts nothing, and takes finite numbers only."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary name beside ``path`` that takes its place only if nothing fails."""
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        yield unfinished
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def read_yaml(path: Path, model: type[Model]) -> Model:
+    """Read a YAML file and check it against a model.
+
+    Raises
+    ------
+    InputError
+        Where the file cannot be read, is larger than a file written by hand can be, is not one
+        YAML mapping of plain values, repeats a key, or does not fit the model.
+    """
+    content = _parse(_text(path), path)
+    if not isinstance(content, dict):
+        keys = ", ".join(model.model_fields)
+        raise InputError(
+            f"{path}: found {_shortened(content)} at the top; write a mapping with the keys {keys}."
+        )
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise InputError(f"{path}: {_sentence(error, model)}") from None
+
+
+def write_yaml(content: dict[str, Any], path: Path) -> None:
+    """Write plain values as YAML, keys in their order, innermost collections on one line."""
+    text = yaml.dump(
+        content,
+        Dumper=_Dumper,
+        sort_keys=False,
+        default_flow_style=None,
+        allow_unicode=True,
+        width=100,
+    )
+    with whole_file(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+
+
+class _Dumper(yaml.SafeDumper):
+    def ignore_aliases(self, data: Any) -> bool:  # noqa: ARG002 - the base class's signature
+        return True
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe loading that reads ``1e-5`` as a number; no repeated keys, aliases or tags."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            self._refuse("aliases are not accepted")
+        if getattr(self.current_event, "tag", None) is not None:
+            self._refuse("tags are not accepted")
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                continue
+            if key.value in seen:
+                problem = f"key {_shortened(key.value)} is repeated"
+                raise yaml.MarkedYAMLError(problem=problem, problem_mark=key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+    def _refuse(self, problem: str) -> None:
+        mark = self.current_event.start_mark
+        raise yaml.MarkedYAMLError(problem=problem, problem_mark=mark)
+
+
+# YAML 1.1, which PyYAML follows, takes 1e-5 for text; YAML 1.2 and every engineer for a number.
+for _end in (_Loader, _Dumper):
+    _end.add_implicit_resolver(
+        "tag:yaml.org,2002:float",
+        re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+\Z", re.ASCII),
+        list("-+.0123456789"),
+    )
+
+
+def _text(path: Path) -> str:
+    if not path.is_file():
+        found = "is a directory" if path.is_dir() else "there is no such file"
+        raise InputError(f"{path}: {found}; give the path of a YAML file.")
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(LARGEST_YAML + 1)
+        text = content.decode("utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); allow it.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: byte {error.start} is not UTF-8; save the file as UTF-8 text."
+        ) from error
+    if len(content) > LARGEST_YAML:
+        raise InputError(
+            f"{path}: is larger than {LARGEST_YAML} bytes; give a YAML file written for magfusion."
+        )
+    return text
+
+
+def _parse(text: str, path: Path) -> object:
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        line = f"line {mark.line + 1}: " if mark else ""
+        raise InputError(f"{path}: {line}{error.problem}; correct the YAML.") from error
+    except yaml.YAMLError as error:
+        raise InputError(f"{path}: {str(error).splitlines()[0]}; correct the YAML.") from error
+    except (ValueError, OverflowError) as error:  # matches the pattern of a date or number
+        reason = str(error).split(";")[0]
+        raise InputError(f"{path}: {reason}; correct the value.") from error
+    except RecursionError as error:
+        raise InputError(f"{path}: is nested too deeply; write the keys plainly.") from error
+
+
+def _sentence(error: ValidationError, model: type[BaseModel]) -> str:
+    first, others = error.errors(include_url=False)[0], error.error_count() - 1
+    place = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in first["loc"]).lstrip(".")
+    if first["type"] == "missing":
+        what = "is missing; add it"
+    elif first["type"] == "extra_forbidden":
+        accepted = ", ".join(_keys(model, first["loc"]))
+        what = f"is not a known key; remove it or write one of {accepted}"
+    elif first["type"] == "model_type":
+        accepted = ", ".join(_keys(model, (*first["loc"], "")))
+        what = f"found {_shortened(first['input'])}; write a mapping with the keys {accepted}"
+    else:
+        remedy = re.sub(r"^(Input|String|List) should", "it should", first["msg"])
+        what = f"found {_shortened(first['input'])}; {remedy}"
+    more = f" (and {others} more in this file)" if others else ""
+    return f"{place}: {what}{more}." if place else f"{what}{more}."
+
+
+def _keys(model: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:
+    for part in place[:-1]:
+        if isinstance(part, str):
+            model = _model_in(model.model_fields[part].annotation) or model
+    return list(model.model_fields)
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    if isinstance(annotation, type):
+        return annotation if issubclass(annotation, BaseModel) else None
+    return next(filter(None, map(_model_in, get_args(annotation))), None)
+
+
+def _shortened(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
