@@ -6,16 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import ReaderError
-from rosbags.typesys import Stores, TypesysError, get_typestore
+from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.records.plausible import check_field, check_imu
 from magfusion.records.samples import ImuSamples, Log, Waveform
-from magfusion.records.table import LARGEST_TIME_NS, Span
+from magfusion.records.table import LARGEST_NUMBER, LARGEST_TIME_NS, Span
 from magfusion.records.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array, IntArray
@@ -89,7 +88,9 @@ def read_bag(
             field = _read(reader, path, chosen.magnetometer, "magnetometer", {_FIELD: _field_row})
             poses: dict[str, _Row] = {_ODOMETRY: _odometry_row, _POSE: _pose_row}
             truth = _read(reader, path, chosen.truth, "truth", poses)
-    except (AnyReaderError, ReaderError, TypesysError, OSError) as error:
+    except InputError:
+        raise
+    except Exception as error:  # a damaged bag makes the library fail in any way whatever
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{path}: cannot be read ({reason}); record the bag again.") from error
     if imu is None:
@@ -154,7 +155,7 @@ def _sorted(place: str, msgtype: str, stamps: IntArray, values: Array) -> _Strea
     # A bag keeps the order of arrival, which the network may have changed.
     order = np.argsort(stamps, kind="stable")
     stamps, values = stamps[order], values[order]
-    bad = ~np.isfinite(values).all(axis=1)
+    bad = ~(np.abs(values) < LARGEST_NUMBER).all(axis=1)
     repeated = np.diff(stamps, prepend=-LARGEST_TIME_NS) == 0
     for wrong, remedy in (
         (bad, "holds a number that is not finite; remove the message"),

@@ -16,8 +16,9 @@ from magfusion.units import NANOSECOND, AnyArray, Array, IntArray
 
 TIME = "time_ns"
 ROWS_PER_GROUP = 1 << 17  # a slice reads whole groups
-# Larger than any clock's reading, and its square distance from the ends of int64 is safe.
+# Larger than any clock's reading, and far enough from the ends of int64 to subtract.
 LARGEST_TIME_NS = 1 << 62
+LARGEST_NUMBER = 1e100  # whose square is still finite
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,8 @@ class Table:
             if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
                 raise InputError(f"{self.path}: column {name} holds {column.type}; write numbers.")
             values[:, k] = column.to_numpy()
-            self.refuse(~np.isfinite(values[:, k]), name, values[:, k], "write a finite number")
+            bad = ~(np.abs(values[:, k]) < LARGEST_NUMBER)  # NaN too
+            self.refuse(bad, name, values[:, k], "write a finite number")
         return values
 
     def integers(self, name: str) -> IntArray:
@@ -237,12 +239,16 @@ def write_table(columns: dict[str, object], path: Path) -> None:
     """Write columns as one Parquet file with zstd compression."""
     with whole_file(path) as unfinished:
         pa.parquet.write_table(
-            pa.table(columns), unfinished, compression="zstd", row_group_size=ROWS_PER_GROUP
+            pa.table(columns),
+            unfinished,
+            compression="zstd",
+            row_group_size=ROWS_PER_GROUP,
+            write_page_checksum=True,
         )
 
 
 def _read_parquet(path: Path, layout: Layout, span: Span) -> tuple[pa.Table, int]:
-    with pa.parquet.ParquetFile(path, memory_map=True) as file:
+    with pa.parquet.ParquetFile(path, memory_map=True, page_checksum_verification=True) as file:
         _refuse_empty(file.metadata.num_rows, path)
         names = layout.chosen(file.schema_arrow.names, path)
         _integer_type(file.schema_arrow.field(TIME).type, TIME, path)

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files import whole_file
-from magfusion.records.table import LARGEST_TIME_NS, Span
+from magfusion.records.table import LARGEST_NUMBER, LARGEST_TIME_NS, Span
 from magfusion.records.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.trajectory import Trajectory
 
@@ -71,7 +71,7 @@ def _numbers(path: Path, number: int, text: str) -> list[float]:
         values = [float(part) for part in text.split()]
     except ValueError:
         values = []
-    if len(values) != 8 or not np.isfinite(values).all():
+    if len(values) != 8 or not (np.abs(values) < LARGEST_NUMBER).all():
         _refuse(path, number, repr(text[:60]), f"eight finite numbers: {_COLUMNS}")
     return values[1:]
 
