@@ -199,7 +199,7 @@ def _world_entry(site: Site) -> dict[str, Any]:
     }
     if site.location is not None:
         day = datetime.date.fromisoformat(site.location.date)
-        entry["location"] = vars(site.location) | {"date": day}
+        entry["location"] = _plain(vars(site.location) | {"date": day})
     elif site.earth_field_world is not None:
         entry["earth_field_t"] = _plain(site.earth_field_world)
     return entry
