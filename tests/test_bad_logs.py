@@ -1,0 +1,234 @@
+"""What is wrong with a log is said in one sentence: file, place, what was found, remedy."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+from example_log import EPOCH_NS, example_log
+
+from magfusion.errors import InputError
+from magfusion.records.log import read_log, write_log
+
+
+def _rewrite(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change a table's columns, as lists, in place."""
+    columns = pa.parquet.read_table(path).to_pydict()
+    change(columns)
+    pa.parquet.write_table(pa.table(columns), path)
+
+
+def _set(column: str, row: int, value: object) -> Callable[[dict[str, Any]], object]:
+    def change(columns: dict[str, Any]) -> None:
+        columns[column][row] = value
+
+    return change
+
+
+def _scale(names: Sequence[str], factor: float) -> Callable[[dict[str, Any]], object]:
+    def change(columns: dict[str, Any]) -> None:
+        for name in names:
+            columns[name] = [factor * value for value in columns[name]]
+
+    return change
+
+
+def _twice(row: int) -> Callable[[dict[str, Any]], object]:
+    def change(columns: dict[str, Any]) -> None:
+        for values in columns.values():
+            values.insert(row, values[row])
+
+    return change
+
+
+def _microseconds(columns: dict[str, Any]) -> None:
+    columns["time_ns"] = [EPOCH_NS + (t - EPOCH_NS) // 1000 for t in columns["time_ns"]]
+
+
+def _axes(stem: str) -> list[str]:
+    return [f"{stem}_{axis}" for axis in "xyz"]
+
+
+BAD_TABLES = [
+    ("imu", lambda c: c.pop("gyro_y"), r"column gyro_y is missing \(found time_ns, gyro_x, "),
+    ("imu", lambda c: (c.pop("gyro_y"), c.pop("accel_x")), "columns gyro_y, accel_x are missing"),
+    ("imu", lambda c: c.pop("time_ns"), "column time_ns is missing"),
+    ("imu", lambda c: c.update(gyro_x=["a"] * 400), "column gyro_x holds string; write numbers"),
+    ("imu", lambda c: c.update(time_ns=[t * 1e-9 for t in c["time_ns"]]), "time_ns holds double"),
+    ("imu", _set("accel_z", 17, float("nan")), r"column accel_z, row 17 .*: found nan"),
+    ("imu", _set("gyro_x", 399, float("inf")), r"column gyro_x, row 399 .*: found inf"),
+    ("imu", _set("gyro_x", 3, None), r"column gyro_x, row 3 .*: found no value"),
+    ("imu", _set("time_ns", 3, None), r"column time_ns, row 3 .*: found no value"),
+    ("imu", _set("time_ns", 40, EPOCH_NS), r"column time_ns, row 40 .*sort the rows"),
+    ("imu", _set("time_ns", 399, 2**63 - 1), r"column time_ns, row 399 .*write nanoseconds"),
+    ("imu", _twice(7), r"column time_ns, row 8 .*remove one"),
+    ("imu", lambda c: [v.clear() for v in c.values()], "holds no rows"),
+    ("imu", _scale(_axes("accel"), 1 / 9.80665), "probably in g"),
+    ("imu", _scale(_axes("gyro"), 180 / np.pi), "probably in deg/s"),
+    ("imu", _microseconds, "not in nanoseconds"),
+    ("magnetometer", lambda c: c.pop("field_z"), "column field_z is missing"),
+    ("magnetometer", _scale(_axes("field"), 1e9), "divide nanotesla by 1e9"),
+    ("magnetometer", _scale(_axes("field"), 1e4), "gauss by 1e4"),
+    ("magnetometer", _twice(0), r"column time_ns, row 1 .*remove one"),
+    ("fields", lambda c: c.pop("sigma"), "column sigma is missing"),
+    ("fields", lambda c: c.pop("cov_yz"), "column cov_yz is missing"),
+    ("fields", lambda c: c.update(beacon=[1] * len(c["tone"])), "beacon holds int64; write text"),
+    ("fields", lambda c: c.update(tone=[0.5] * len(c["tone"])), "tone holds double; write int"),
+    ("fields", _set("tone", 2, -1), r"column tone, row 2 .*found -1"),
+    ("fields", _set("sigma", 4, 0.0), r"column sigma, row 4 .*positive"),
+    ("fields", _set("window", 4, -0.4), r"column window, row 4 .*positive"),
+    ("fields", _set("window", 1, 0.3), r"column window, row 1 .*same in all rows"),
+    ("fields", _set("cov_xx", 5, -1e-18), r"cov_xx to cov_zz, row 5 .*eigenvalues"),
+    ("fields", _set("beacon", 5, None), r"column beacon, row 5 .*found no value"),
+    ("fields", _twice(1), r"row 2 .*the channel has two rows"),
+    ("fields", _scale([*_axes("re"), *_axes("im")], 1e9), "divide nanotesla by 1e9"),
+    ("truth", _scale(["qw", "qx", "qy", "qz"], 1.002), r"qw to qz, row 0 .*found 1.002"),
+    ("truth", lambda c: c.pop("qw"), "column qw is missing"),
+    ("truth", lambda c: c.pop("velocity_y"), "column velocity_y is missing"),
+    ("truth", _set("position_x", 9, float("nan")), r"column position_x, row 9"),
+]
+
+
+@pytest.mark.parametrize(("stem", "change", "sentence"), BAD_TABLES)
+def test_a_bad_table_is_refused_by_name_and_place(
+    tmp_path: Path, stem: str, change: Callable[[dict[str, Any]], object], sentence: str
+) -> None:
+    write_log(example_log(), tmp_path / "walk")
+    _rewrite(tmp_path / "walk" / f"{stem}.parquet", change)
+    with pytest.raises(InputError, match=rf"walk.{stem}\.parquet: .*{sentence}") as caught:
+        read_log(tmp_path / "walk")
+    assert str(caught.value).count("\n") == 0
+
+
+def _header(**change: object) -> Callable[[Path], object]:
+    header = {"magfusion_log": 1, "name": "walk", "epoch_ns": 5, "source": "test"} | change
+    text = "\n".join(f"{key}: {value}" for key, value in header.items() if value is not None)
+    return lambda log: (log / "log.yaml").write_text(text)
+
+
+def _truncated(log: Path) -> None:
+    content = (log / "imu.parquet").read_bytes()
+    (log / "imu.parquet").write_bytes(content[: len(content) // 2])
+
+
+def _flipped(log: Path) -> None:
+    content = bytearray((log / "imu.parquet").read_bytes())
+    content[len(content) // 2] ^= 0x10
+    (log / "imu.parquet").write_bytes(content)
+
+
+def _csv(text: str) -> Callable[[Path], None]:
+    def write(log: Path) -> None:
+        (log / "imu.parquet").unlink()
+        (log / "imu.csv").write_text(text)
+
+    return write
+
+
+def _no_field(log: Path) -> None:
+    (log / "magnetometer.parquet").unlink()
+    (log / "fields.parquet").unlink()
+
+
+IMU = "time_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
+
+BAD_DIRECTORIES: list[tuple[Callable[[Path], object], str]] = [
+    (lambda log: (log / "log.yaml").unlink(), "holds no log.yaml"),
+    (lambda log: (log / "imu.parquet").unlink(), "holds no imu.parquet or imu.csv"),
+    (_no_field, "holds no magnetometer.parquet and no fields.parquet"),
+    (lambda log: (log / "imu.csv").write_text(IMU), "holds imu.parquet and imu.csv; keep one"),
+    (_header(magfusion_log=2), r"log.yaml: magfusion_log: found 2"),
+    (_header(magfusion_log=None), r"log.yaml: magfusion_log: is missing"),
+    (_header(colour="red"), r"log.yaml: colour: is not a known key"),
+    (_header(epoch_ns=1.5), r"log.yaml: epoch_ns: found 1.5"),
+    (_header(epoch_ns=2**63), r"log.yaml: epoch_ns: found 9223372036854775808"),
+    (_csv(f"{IMU}\n1,2,3,4,5,6,9\n2,2,3,4,5,6,9"), r"imu.csv: .*row 1 .*set epoch_ns near"),
+    (lambda log: (log / "log.yaml").write_text("a: ["), r"log.yaml: line 1"),
+    (_truncated, r"imu.parquet: cannot be read"),
+    (_flipped, r"imu.parquet: cannot be read .*CRC"),
+    (lambda log: (log / "imu.parquet").write_bytes(b""), r"imu.parquet: cannot be read"),
+    (_csv(""), r"imu.csv: .*missing"),
+    (_csv(IMU), r"imu.csv: .*(holds no rows|cannot be read)"),
+    (_csv(f"{IMU}\n1,2,3,4,5,6,abc"), r"imu.csv: cannot be read .*abc"),
+    (_csv(f"{IMU}\n1.5,2,3,4,5,6,7"), r"imu.csv: cannot be read .*1\.5"),
+    (_csv(f"{IMU}\n1,2,3,4"), r"imu.csv: cannot be read .*Expected 7 columns, got 4"),
+    (
+        _csv(f"{IMU}\n0,2,3,4,5,6,9\n5000000,2,,4,5,6,9"),
+        r"imu.csv: column gyro_y, row 1 .*no value",
+    ),
+    (_csv(f"{IMU},gyro_x\n1,2,3,4,5,6,9,8"), r"imu.csv: column gyro_x is repeated"),
+    (_csv("\xff\xfe\x00"), r"imu.csv: "),
+]
+
+
+@pytest.mark.parametrize(("spoil", "sentence"), BAD_DIRECTORIES)
+def test_a_bad_directory_is_refused_by_name(
+    tmp_path: Path, spoil: Callable[[Path], object], sentence: str
+) -> None:
+    write_log(example_log(), tmp_path / "walk")
+    spoil(tmp_path / "walk")
+    with pytest.raises(InputError, match=rf"walk.*{sentence}") as caught:
+        read_log(tmp_path / "walk")
+    assert str(caught.value).count("\n") == 0
+
+
+def test_a_path_that_is_no_directory_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nowhere: there is no such directory"):
+        read_log(tmp_path / "nowhere")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="file: is a file"):
+        read_log(tmp_path / "file")
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "sentence"),
+    [
+        (5.0, 5.0, "start: found 5.0 s, which is not before end"),
+        (float("nan"), None, "start: found nan"),
+        (None, float("inf"), "end: found inf"),
+        (100.0, None, r"imu.parquet: holds no row from 100.0 s to the end"),
+        (None, -1e30, r"imu.parquet: holds no row from the start to -1e\+30 s"),
+    ],
+)
+def test_a_span_without_samples_is_refused(
+    tmp_path: Path, start: float | None, end: float | None, sentence: str
+) -> None:
+    write_log(example_log(), tmp_path / "walk")
+    with pytest.raises(InputError, match=sentence):
+        read_log(tmp_path / "walk", start, end)
+
+
+def test_a_span_without_a_field_is_refused(tmp_path: Path) -> None:
+    log = example_log()
+    write_log(log, tmp_path / "walk")
+    assert log.waveform is not None
+    late = float(log.imu.time[-1])
+    for stem in ("magnetometer", "fields"):
+        path = tmp_path / "walk" / f"{stem}.parquet"
+        pa.parquet.write_table(pa.parquet.read_table(path).slice(0, 5), path)
+    with pytest.raises(InputError, match="walk: holds no field from"):
+        read_log(tmp_path / "walk", start=late)
+
+
+def test_any_damage_to_a_table_is_noticed(tmp_path: Path) -> None:
+    rng = np.random.default_rng(11)
+    write_log(example_log(), tmp_path / "walk")
+    path = tmp_path / "walk" / "imu.parquet"
+    content, expected = path.read_bytes(), read_log(tmp_path / "walk").imu
+    refused = 0
+    for place in rng.integers(len(content), size=60):
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        try:
+            found = read_log(tmp_path / "walk").imu
+        except InputError:
+            refused += 1
+        else:
+            np.testing.assert_array_equal(found.time, expected.time)
+            np.testing.assert_array_equal(found.gyro_body, expected.gyro_body)
+            np.testing.assert_array_equal(found.accel_body, expected.accel_body)
+    assert refused > 30
