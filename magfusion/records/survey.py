@@ -1,6 +1,5 @@
 """A fingerprint survey: what a magnetometer measured at points with a known pose."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pyarrow.parquet
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.files import whole_file
 from magfusion.units import Array, ComplexArray, IntArray
 
 _POSITION = ("position_x", "position_y", "position_z")
@@ -80,13 +80,12 @@ def write_survey(survey: Survey, path: Path) -> None:
         parts = np.hstack([phasor.real, phasor.imag]).T
         data |= dict(zip(_PHASOR, parts, strict=True))
     data["sigma"] = survey.sigma[rows, columns]
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
     table = pa.table(data)
-    if path.suffix == ".csv":
-        pa.csv.write_csv(table, unfinished)
-    else:
-        pa.parquet.write_table(table, unfinished)
-    unfinished.replace(path)
+    with whole_file(path) as unfinished:
+        if path.suffix == ".csv":
+            pa.csv.write_csv(table, unfinished)
+        else:
+            pa.parquet.write_table(table, unfinished)
 
 
 def read_survey(path: Path) -> Survey:
