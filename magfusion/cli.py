@@ -28,7 +28,7 @@ from magfusion.pipeline import (
     run_simulate,
     run_smooth,
 )
-from magfusion.receiver.lockin import LockinSettings, default_settings
+from magfusion.receiver.windows import LockinSettings, default_settings
 from magfusion.report import Figures
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig

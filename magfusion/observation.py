@@ -165,6 +165,10 @@ def observe(
     by_matrix = np.zeros((*in_sensor.shape, 3, 3), dtype=np.complex128)
     for row in range(3):
         by_matrix[..., row, row, :] = in_sensor
+    by_time_offset: ComplexArray | None = None
+    if twist_body is not None:
+        twist = twist_body.astype(np.complex128)[..., None, :, None]
+        by_time_offset = -(platform_pose @ twist)[..., 0]
     return Observation(
         phasor_sensor=phasor,
         platform_pose=platform_pose,
@@ -173,9 +177,7 @@ def observe(
         phase=1j * phasor,
         matrix=by_matrix.reshape(*in_sensor.shape, 9),
         body_from_sensor=np.concatenate([matrix @ skew(in_sensor), by_body @ mounting], axis=-1),
-        time_offset=None
-        if twist_body is None
-        else -(platform_pose @ twist_body[..., None, :, None])[..., 0],
+        time_offset=by_time_offset,
     )
 
 

@@ -6,7 +6,7 @@ and drift, magnetometer matrix, the sensor's rotation in sensor axes and its pos
 and the IMU's time offset.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -22,7 +22,8 @@ GROUPS = ("beacons", "moments", "phase", "magnetometer", "extrinsics", "time-off
 PHASE_SIGMA = 1e2  # rad; wide enough to be no information
 DRIFT_SIGMA = 2e-5  # relative; ordinary crystal oscillators
 
-# A survey this good moves a fix by less than the noise of one window: it is held.
+# A survey this good is held at its declared values; what it may still be wrong by is considered in
+# the covariance of the result.
 NEGLIGIBLE = {
     "position": 2e-3,  # m
     "rotation": 1.75e-3,  # rad
@@ -124,14 +125,33 @@ def choose_blocks(site: Site, groups: Iterable[str] | None = None) -> tuple[Bloc
     wanted = None if groups is None else set(groups)
     if wanted is not None and not wanted <= set(GROUPS):
         raise ValueError(f"groups must be among {GROUPS}; got {sorted(wanted - set(GROUPS))}")
+
+    def chosen(group: str, kind: str, sigma: float) -> bool:
+        return sigma > NEGLIGIBLE[kind] if wanted is None else group in wanted
+
+    return _blocks(site, chosen)
+
+
+def held_blocks(site: Site, estimated: tuple[Block, ...]) -> tuple[Block, ...]:
+    """Return the parameters that are uncertain but not among those estimated."""
+    names = {block.name for block in estimated}
+    free = [b for b in _blocks(site, lambda _group, _kind, _sigma: True) if b.name not in names]
+    start, out = 0, []
+    for block in free:
+        out.append(block._replace(columns=slice(start, start + len(block.sigma))))
+        start += len(block.sigma)
+    return tuple(out)
+
+
+def _blocks(site: Site, chosen: Callable[[str, str, float], bool]) -> tuple[Block, ...]:
     blocks: list[Block] = []
     start = 0
     for group, owner, kind, sigma in _candidates(site):
-        chosen = np.max(sigma) > (NEGLIGIBLE[kind] if wanted is None else 0.0)
-        if chosen and (wanted is None or group in wanted):
+        largest = float(np.max(sigma))
+        if largest > 0.0 and chosen(group, kind, largest):
             columns = slice(start, start + len(sigma))
-            floor = 1e-6 * np.max(sigma)  # one known axis in an unknown block
-            blocks.append(Block(group, owner, kind, columns, np.maximum(sigma, floor)))
+            # One known axis in an unknown block.
+            blocks.append(Block(group, owner, kind, columns, np.maximum(sigma, 1e-6 * largest)))
             start += len(sigma)
     return tuple(blocks)
 
@@ -319,20 +339,9 @@ def _stacked(block: ComplexArray) -> Array:
 def _block_jacobian(
     beacon: Beacon, site: Site, block: Block, seen: Observation, elapsed: Array
 ) -> ComplexArray | None:
-    """Columns of one block, shape (n, tones, 3, columns); None where it has no bearing."""
-    if block.group in ("beacons", "moments", "phase") and block.owner != beacon.name:
-        return None
-    if block.group == "beacons":
-        if block.kind == "rotation":
-            return seen.beacon_pose[..., :3]
-        return np.asarray(seen.beacon_pose[..., 3:] @ beacon.world_from_beacon.T)
-    if block.kind == "log_moment":
-        return seen.log_moments
-    if block.kind == "phase":
-        return np.asarray(seen.phase[..., None] * np.eye(len(beacon.tones))[:, None, :])
-    if block.kind == "drift":
-        rate = 2.0 * np.pi * beacon.tone_frequencies_hz[:, None] * elapsed[:, None, None]
-        return np.asarray((seen.phase * rate)[..., None])
+    """Return the columns of a block, shape (n, tones, 3, columns); None where it has no bearing."""
+    if block.group in ("beacons", "moments", "phase"):
+        return None if block.owner != beacon.name else _own(beacon, block, seen, elapsed)
     if block.kind == "matrix":
         return seen.matrix
     if block.kind == "time_offset":
@@ -343,3 +352,16 @@ def _block_jacobian(
         return seen.body_from_sensor[..., :3]
     mounting = site.platform.magnetometer.body_from_sensor
     return np.asarray(seen.body_from_sensor[..., 3:] @ mounting.T)
+
+
+def _own(beacon: Beacon, block: Block, seen: Observation, elapsed: Array) -> ComplexArray:
+    if block.kind == "rotation":
+        return seen.beacon_pose[..., :3]
+    if block.kind == "position":
+        return np.asarray(seen.beacon_pose[..., 3:] @ beacon.world_from_beacon.T)
+    if block.kind == "log_moment":
+        return seen.log_moments
+    if block.kind == "phase":
+        return np.asarray(seen.phase[..., None] * np.eye(len(beacon.tones))[:, None, :])
+    rate = 2.0 * np.pi * beacon.tone_frequencies_hz[:, None] * elapsed[:, None, None]
+    return np.asarray((seen.phase * rate)[..., None])

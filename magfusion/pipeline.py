@@ -12,12 +12,13 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.evaluation.errors import TrajectoryErrors, trajectory_errors
 from magfusion.fixes.fix import Fixes
-from magfusion.fusion.batch import Smoothed, SmootherSettings, first_fixes, phasors, smooth
+from magfusion.fusion.batch import Smoothed, SmootherSettings, smooth
 from magfusion.fusion.inertial import motion_at
+from magfusion.fusion.source import first_fixes, phasors
 from magfusion.parameters import initial_calibration
-from magfusion.receiver.lockin import LockinSettings
-from magfusion.records.fields import order_channels
+from magfusion.receiver.windows import LockinSettings
 from magfusion.records.atomic import whole_directory
+from magfusion.records.fields import order_channels
 from magfusion.records.fix_table import write_hypotheses
 from magfusion.records.log import write_log
 from magfusion.records.open import open_log

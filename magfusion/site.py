@@ -90,7 +90,9 @@ class Beacon:
     @cached_property
     def tones(self) -> tuple[tuple[float, int | None], ...]:
         """Distinct (frequency in Hz, slot) pairs in the order in which the coils name them."""
-        return tuple(dict.fromkeys((c.frequency_hz or self.frequency_hz, c.slot) for c in self.coils))
+        return tuple(
+            dict.fromkeys((c.frequency_hz or self.frequency_hz, c.slot) for c in self.coils)
+        )
 
     @cached_property
     def tone_frequencies_hz(self) -> Array:

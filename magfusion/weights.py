@@ -32,7 +32,7 @@ def calibration_error(site: Site, distance: Array) -> Array:
     )
     place = np.array([np.mean(b.sigma.position_world**2) for b in site.beacons])
     lever = np.mean(sensor.position_body**2)
-    return np.sqrt(common + own + 9.0 * (place + lever) / distance**2)
+    return np.asarray(np.sqrt(common + own + 9.0 * (place + lever) / distance**2))
 
 
 def _distances(site: Site, samples: FieldSamples) -> Array:
@@ -76,7 +76,7 @@ def whitening(cov: Array, valid: BoolArray) -> Array:
     safe = np.where(valid[..., None, None], cov, np.eye(3))
     scale = np.sqrt(np.trace(safe, axis1=-2, axis2=-1) / 3.0)[..., None, None]
     root = np.linalg.inv(np.linalg.cholesky(safe / scale**2)) / scale
-    return np.where(valid[..., None, None], root, 0.0)
+    return np.asarray(np.where(valid[..., None, None], root, 0.0))
 
 
 def paired_whitening(cov: Array, valid: BoolArray) -> Array:
@@ -90,4 +90,4 @@ def paired_whitening(cov: Array, valid: BoolArray) -> Array:
 
 def stacked(phasor: ComplexArray) -> Array:
     """Return complex vectors as real part, then imaginary part; zero where they are NaN."""
-    return np.nan_to_num(np.concatenate([phasor.real, phasor.imag], axis=-1))
+    return np.asarray(np.nan_to_num(np.concatenate([phasor.real, phasor.imag], axis=-1)))

@@ -19,7 +19,9 @@ FLOORS = (
     {"parameters", "weights"},
     {"refinement"},
     {"receiver", "simulation", "calibration", "fusion", "fixes", "evaluation"},
+    {"report"},
     {"pipeline"},
+    {"demo"},
     {"cli"},
 )
 DRAWN = {("fusion", "fixes"), ("fusion", "receiver")}

@@ -56,7 +56,10 @@ def beacon_directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Arra
 
 
 def _planar_directions(beacon: Beacon, power: Array, axes: Array, left: Array) -> Array:
-    """Two-axis beacon: Gram eigenvalues ``(K/r^3)^2 {1, 1 + 3 s^2}``, s the sine from the normal."""
+    """Return the directions that a two-axis beacon's Gram matrix leaves.
+
+    Its eigenvalues are ``(K/r^3)^2 {1, 1 + 3 s^2}``, s the sine of the angle from the normal.
+    """
     sine_square = np.clip((power[:, 1] / np.maximum(power[:, 0], _TINY) - 1.0) / 3.0, 0.0, 1.0)
     sine, cosine = np.sqrt(sine_square)[:, None, None], np.sqrt(1.0 - sine_square)[:, None, None]
     if beacon.synchronised:
@@ -109,7 +112,7 @@ def positions(calibration: Calibration, phasor: ComplexArray, weight: Array, kee
         found.append(spot)
         start = rows.stop
     candidates = np.concatenate(found, axis=1)
-    usable = np.isfinite(candidates).all(axis=2)
+    usable = np.asarray(np.isfinite(candidates).all(axis=2))
     spots = np.where(usable[..., None], candidates, 1e3)
     score = np.where(usable, _invariant_cost(calibration, spots, phasor, weight), np.inf)
     order = np.argsort(score, axis=1)[:, :keep]
@@ -131,7 +134,7 @@ def _invariant_cost(
     variance = 1.0 / np.maximum(weight, _TINY)[:, None] * 4.0 * (theirs[..., 0] + _TINY)
     floor = 0.05**2 * theirs[..., 0] ** 2  # candidates are coarse
     relative = np.sum((ours - theirs) ** 2, axis=-1) / (floor + variance)
-    return np.sum(np.where(weight[:, None] > 0, np.log1p(relative), 0.0), axis=-1)
+    return np.asarray(np.sum(np.where(weight[:, None] > 0, np.log1p(relative), 0.0), axis=-1))
 
 
 def _predicted_at(calibration: Calibration, sensor_world: Array) -> ComplexArray:

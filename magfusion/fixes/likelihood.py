@@ -17,7 +17,7 @@ from magfusion.parameters import Block, Calibration, linearize_channels
 from magfusion.records.samples import FieldSamples
 from magfusion.site import Site
 from magfusion.trajectory import Trajectory
-from magfusion.units import Array, BoolArray
+from magfusion.units import Array, BoolArray, IntArray
 from magfusion.weights import measurement_cov, paired_whitening, stacked
 
 CHUNK = 500  # epochs solved at once
@@ -183,12 +183,12 @@ def _starts(problem: _Problem) -> tuple[Array, Array, Array]:
 class _Flat:
     """The problem with every epoch repeated for each of its hypotheses."""
 
-    def __init__(self, problem: _Problem, count: int, rows: Array | None = None) -> None:
+    def __init__(self, problem: _Problem, count: int, rows: IntArray | None = None) -> None:
         self.problem, self.count = problem, count
         index = np.repeat(np.arange(len(problem.time)), count)
         self.epoch = index if rows is None else rows
 
-    def subset(self, keep: Array) -> "_Flat":
+    def subset(self, keep: IntArray) -> "_Flat":
         return _Flat(self.problem, self.count, self.epoch[keep])
 
 
@@ -237,7 +237,7 @@ def _pose_difference(rotation0: Array, position0: Array, rotation: Array, positi
 
 
 def _moved(
-    rotation: Array, position: Array, phase: Array, step: Array, free: Array
+    rotation: Array, position: Array, phase: Array, step: Array, free: IntArray
 ) -> tuple[Array, Array, Array]:
     turned = rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
     shifted = position + (rotation @ step[:, 3:6, None])[..., 0]
@@ -246,7 +246,7 @@ def _moved(
     return turned, shifted, lag
 
 
-def _free_channels(problem: _Problem) -> Array:
+def _free_channels(problem: _Problem) -> IntArray:
     owners = {b.owner for b in problem.phase_blocks}
     names = [name for name, _ in problem.calibration.site.channels]
     return np.flatnonzero([name in owners for name in names])

@@ -7,7 +7,6 @@ import numpy as np
 
 from magfusion.errors import EstimationError
 from magfusion.fixes.fix import Fixes
-from magfusion.fixes.likelihood import Gravity, fix_epochs
 from magfusion.fusion.factors import FieldFactors, FieldMeasurements, read_poses
 from magfusion.fusion.inertial import cut_at_epochs, preintegrate
 from magfusion.fusion.smoother import (
@@ -20,17 +19,11 @@ from magfusion.fusion.smoother import (
     optimise,
     read_states,
 )
+from magfusion.fusion.source import Source, first_fixes, open_source
 from magfusion.fusion.start import Start, choose_chain, start_phases
-from magfusion.fusion.wave import LockinError, lockin_error
-from magfusion.parameters import Block, Calibration, choose_blocks, initial_calibration
-from magfusion.receiver.lockin import (
-    Demodulated,
-    LockinSettings,
-    Windows,
-    choose_windows,
-    default_settings,
-    demodulate,
-)
+from magfusion.fusion.wave import WaveFields
+from magfusion.parameters import Block, Calibration, choose_blocks, held_blocks, initial_calibration
+from magfusion.receiver.windows import LockinSettings
 from magfusion.records.samples import FieldSamples, ImuSamples, Log
 from magfusion.site import Site
 from magfusion.strapdown import resting
@@ -38,7 +31,6 @@ from magfusion.trajectory import Trajectory
 from magfusion.units import Array
 from magfusion.weights import measurement_cov, paired_whitening, stacked
 
-REST_EPOCH = 0.5  # s; over which the specific force at rest is averaged
 OFFSET_CONVERGED = 2e-5  # s; change of the time offset at which the passes end
 POSITION_CONVERGED = 5e-5  # m; rms change of the positions at which the passes end
 
@@ -117,98 +109,6 @@ class Smoothed:
     converged: bool
 
 
-@dataclass(frozen=True, eq=False)
-class _Source:
-    """Where the phasors come from: a waveform that can be demodulated anew, or a table."""
-
-    log: Log
-    settings: LockinSettings | None
-    windows: Windows | None
-
-    def demodulated(
-        self, calibration: Calibration, states: Trajectory | None
-    ) -> Demodulated | None:
-        if self.settings is None or self.windows is None or self.log.waveform is None:
-            return None
-        bias = None
-        if states is not None and states.gyro_bias_body is not None:
-            bias = _at(self.log.imu.time + calibration.time_offset, states)
-        return demodulate(
-            self.log.waveform,
-            self.log.imu,
-            calibration.site,
-            self.settings,
-            self.windows,
-            gyro_bias_body=bias,
-            time_offset=calibration.time_offset,
-        )
-
-
-def _at(time: Array, states: Trajectory) -> Array:
-    assert states.gyro_bias_body is not None
-    return np.stack([np.interp(time, states.time, b) for b in states.gyro_bias_body.T], axis=1)
-
-
-def _source(log: Log, site: Site, settings: LockinSettings | None) -> _Source:
-    if log.waveform is None:
-        return _Source(log, None, None)
-    chosen = default_settings(site) if settings is None else settings
-    return _Source(log, chosen, choose_windows(log.waveform, log.imu, site, chosen))
-
-
-def phasors(
-    log: Log, site: Site, settings: LockinSettings | None = None
-) -> tuple[FieldSamples, Mapping[str, int]]:
-    """Return the phasors of a log, demodulated where it has a waveform, and the windows dropped.
-
-    Raises
-    ------
-    InputError
-        Where no window is usable.
-    """
-    source = _source(log, site, settings)
-    found = source.demodulated(initial_calibration(site, 0.0), None)
-    if found is not None and source.windows is not None:
-        return found.fields, source.windows.dropped
-    if log.fields is None:
-        raise EstimationError(f"log {log.name} has neither waveform nor phasors")
-    return log.fields, {}
-
-
-def gravity_at_rest(imu: ImuSamples, site: Site, time: Array) -> Gravity | None:
-    """Return the direction of gravity at the epochs where the platform rests; None if it never does.
-
-    Parameters
-    ----------
-    imu : ImuSamples
-    site : Site
-        Its accelerometer bias limits how well the direction is known.
-    time : ndarray, shape (n,)
-        Epochs (s).
-    """
-    stamps = imu.time + site.platform.imu.time_offset
-    still = resting(stamps, imu.gyro_body, imu.accel_body)
-    if not np.any(still):
-        return None
-    nearest = np.clip(np.searchsorted(stamps, time), 0, len(stamps) - 1)
-    total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.accel_body, axis=0)])
-    lo = np.searchsorted(stamps, time - REST_EPOCH / 2)
-    hi = np.minimum(np.searchsorted(stamps, time + REST_EPOCH / 2) + 1, len(stamps))
-    lo = np.minimum(lo, hi - 1)
-    mean = (total[hi] - total[lo]) / (hi - lo)[:, None]
-    size = np.linalg.norm(mean, axis=1, keepdims=True)
-    noise = site.platform.imu.accel_noise / np.sqrt(REST_EPOCH)
-    sigma = np.hypot(site.platform.imu.accel_bias_sigma, noise) / site.gravity
-    near = np.abs(stamps[nearest] - time) < REST_EPOCH
-    return Gravity(mean / size, np.where(still[nearest] & near, sigma, np.inf))
-
-
-def first_fixes(samples: FieldSamples, log: Log, calibration: Calibration) -> Fixes:
-    """Return the fix of every epoch, with gravity where the platform rests."""
-    gravity = gravity_at_rest(log.imu, calibration.site, samples.time)
-    return fix_epochs(samples, calibration, gravity=gravity)
-
-
 def smooth(
     log: Log, site: Site, settings: SmootherSettings | None = None, report: Report = _silent
 ) -> Smoothed:
@@ -236,13 +136,9 @@ def smooth(
     """
     settings = SmootherSettings() if settings is None else settings
     total = settings.passes + 3
-    source = _source(log, site, settings.lockin)
+    source = open_source(log, site, settings.lockin)
     report("demodulating", 0, total)
-    calibration = initial_calibration(site, 0.0)
-    demodulated = source.demodulated(calibration, None)
-    samples = log.fields if demodulated is None else demodulated.fields
-    if samples is None:
-        raise EstimationError(f"log {log.name} has neither waveform nor phasors")
+    samples = source.first(initial_calibration(site, 0.0))
     if len(samples) < 2:
         raise EstimationError(
             f"log {log.name} has {len(samples)} field epoch; at least 2 are needed"
@@ -259,9 +155,7 @@ def smooth(
     states = _with_rest_bias(start.states, log.imu, calibration.time_offset)
     if settings.coupling == "loose":
         return _loose(log, samples, fixes, start, states, declared, source, settings, report)
-    return _tight(
-        log, samples, start, states, declared, calibration, demodulated, source, settings, report
-    )
+    return _tight(log, samples, start, states, declared, calibration, source, settings, report)
 
 
 def _with_rest_bias(states: Trajectory, imu: ImuSamples, time_offset: float) -> Trajectory:
@@ -281,26 +175,21 @@ def _tight(
     states: Trajectory,
     declared: Calibration,
     calibration: Calibration,
-    demodulated: Demodulated | None,
-    source: _Source,
+    source: Source,
     settings: SmootherSettings,
     report: Report,
 ) -> Smoothed:
     site = declared.site
     blocks = choose_blocks(site, settings.estimate)
     total, iterations, done = settings.passes + 3, 0, 0
-    passes = 1 if demodulated is None else settings.passes
+    passes = 1 if log.waveform is None else settings.passes
     settled = False
     while True:
         report(f"pass {done + 1}", done + 2, total)
-        error = None
-        if done > 0 and demodulated is not None:
-            demodulated = source.demodulated(calibration, states)
-            assert demodulated is not None
-            samples = demodulated.fields
-            error = lockin_error(demodulated.operator, states, log.imu, calibration)
+        wave = source.about(calibration, states) if done > 0 else None
+        samples = samples if wave is None else wave.fields
         problem, bridged = _problem(
-            log, samples, states, calibration, declared, blocks, error, settings
+            log, samples, states, calibration, declared, blocks, wave, settings
         )
         found = optimise(problem, initial_estimate(states, calibration))
         previous, offset = states, calibration.time_offset
@@ -319,7 +208,7 @@ def _tight(
         result,
         declared=declared,
         start=start,
-        dropped={} if source.windows is None else source.windows.dropped,
+        dropped=source.dropped,
         bridged=bridged,
         passes=done,
         iterations=iterations,
@@ -334,7 +223,7 @@ def _problem(
     calibration: Calibration,
     declared: Calibration,
     blocks: tuple[Block, ...],
-    error: LockinError | None,
+    wave: WaveFields | None,
     settings: SmootherSettings,
 ) -> tuple[Problem, int]:
     site, model = declared.site, declared.site.platform.imu
@@ -346,17 +235,15 @@ def _problem(
     )
     stamps = log.imu.time + calibration.time_offset
     rate = np.stack([np.interp(samples.time, stamps, w) for w in log.imu.gyro_body.T], axis=1)
-    phasor = samples.phasor_sensor
+    shape = (*samples.phasor_sensor.shape[:2], 6)
     cov = measurement_cov(calibration.site, samples) * overlap(samples)
-    measured = phasor if error is None else phasor - error.phasor_sensor
-    slope = np.zeros((*phasor.shape[:2], 6)) if error is None else stacked(error.by_time_offset)
     measurements = FieldMeasurements(
         time=samples.time,
-        measured=stacked(measured),
+        measured=stacked(samples.phasor_sensor),
         root=paired_whitening(cov, samples.valid),
         rate_body=rate - states.gyro_bias_body,
         applied_offset=calibration.time_offset,
-        by_time_offset=slope,
+        by_time_offset=np.zeros(shape) if wave is None else stacked(wave.by_time_offset),
     )
     problem = Problem(
         native=inertial_graph(preintegrated, model),
@@ -376,7 +263,8 @@ def overlap(samples: FieldSamples) -> float:
 def _posterior(
     problem: Problem, found: Optimised, states: Trajectory, samples: FieldSamples
 ) -> Smoothed:
-    pose_cov, calibration_cov = marginals(problem, found.estimate)
+    held = held_blocks(problem.declared.site, problem.blocks)
+    pose_cov, calibration_cov = marginals(problem, found.estimate, held)
     residual = np.full((*samples.phasor_sensor.shape[:2], 6), np.nan)
     if problem.fields is not None:
         poses = read_poses(found.estimate.values)
@@ -407,7 +295,7 @@ def _loose(
     start: Start,
     states: Trajectory,
     declared: Calibration,
-    source: _Source,
+    source: Source,
     settings: SmootherSettings,
     report: Report,
 ) -> Smoothed:
@@ -435,6 +323,6 @@ def _loose(
     return replace(
         result,
         start=start,
-        dropped={} if source.windows is None else source.windows.dropped,
+        dropped=source.dropped,
         bridged=int(np.sum(increments.bridged)),
     )

@@ -114,16 +114,38 @@ class FieldFactors:
         zero, by_pose = np.zeros(rows), np.zeros((rows, 6))
         by_calibration = np.zeros((rows, self.columns))
         for i in range(n):
-            terms = (X(i), by_pose)
             if self.columns:
-                terms += (CALIBRATION_KEY, by_calibration)
-            factor = gtsam.JacobianFactor(*terms, zero, unit)
+                factor = gtsam.JacobianFactor(
+                    X(i), by_pose, CALIBRATION_KEY, by_calibration, zero, unit
+                )
+            else:
+                factor = gtsam.JacobianFactor(X(i), by_pose, zero, unit)
             self.graph.push_back(factor)
             self._jacobians.append(factor.getA())
             self._errors.append(factor.getb())
 
     def residual(self, poses: Poses, calibration: Calibration) -> tuple[Array, Array, Array]:
         """Return whitened residual (n, channels, 6) and its Jacobians by pose and calibration."""
+        data = self.measurements
+        value, by_pose, by_calibration = self._predicted(poses, calibration, self.blocks)
+        error = (data.root @ (value - data.measured)[..., None])[..., 0]
+        return error, data.root @ by_pose, data.root @ by_calibration
+
+    def sensitivity(
+        self, poses: Poses, calibration: Calibration, blocks: tuple[Block, ...]
+    ) -> Array:
+        """Return the whitened Jacobian by other parameters, shape (n, channels, 6, dimension)."""
+        by_other = self._predicted(poses, calibration, blocks)[2]
+        return np.asarray(self.measurements.root @ by_other)
+
+    def set_right_hand_side(self, right: Array) -> None:
+        """Write other right-hand sides, shape (n, channels, 6), into the factors."""
+        for view, values in zip(self._errors, right.reshape(len(right), -1), strict=True):
+            view[...] = values
+
+    def _predicted(
+        self, poses: Poses, calibration: Calibration, blocks: tuple[Block, ...]
+    ) -> tuple[Array, Array, Array]:
         data = self.measurements
         velocity_body = (
             np.swapaxes(poses.world_from_body, 1, 2) @ poses.velocity_world[..., None]
@@ -133,18 +155,17 @@ class FieldFactors:
         turn = Rotation.from_rotvec(-lag * data.rate_body).as_matrix()
         value, by_pose, by_calibration = linearize_channels(
             calibration,
-            self.blocks,
+            blocks,
             data.time,
             poses.world_from_body @ turn,
             poses.position_world - lag * poses.velocity_world,
             np.concatenate([data.rate_body, velocity_body], axis=1),
         )
         value += lag * data.by_time_offset
-        for block in self.blocks:
+        for block in blocks:
             if block.kind == "time_offset":
                 by_calibration[..., block.columns.start] += data.by_time_offset
-        error = (data.root @ (value - data.measured)[..., None])[..., 0]
-        return error, data.root @ by_pose, data.root @ by_calibration
+        return value, by_pose, by_calibration
 
     def linearize(self, values: gtsam.Values, calibration: Calibration) -> float:
         """Rewrite the factors at a new estimate; return the cost (half the squared residual)."""
@@ -155,9 +176,7 @@ class FieldFactors:
         block = np.concatenate([by_pose, by_calibration], axis=-1) * share[..., None]
         block = block.reshape(n, -1, 6 + self.columns)
         right = -(error * share).reshape(n, -1)
-        for jacobian, error_view, a, b in zip(
-            self._jacobians, self._errors, block, right, strict=True
-        ):
-            jacobian[...] = a
-            error_view[...] = b
+        for view, rows in zip(self._jacobians, block, strict=True):
+            view[...] = rows
+        self.set_right_hand_side(right)
         return 0.5 * float(np.sum(rho))

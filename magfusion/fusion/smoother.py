@@ -10,9 +10,8 @@ from gtsam.symbol_shorthand import B, V, X
 from magfusion.errors import EstimationError
 from magfusion.fusion.factors import (
     CALIBRATION_KEY,
+    ROBUST_WIDTH,
     FieldFactors,
-    FieldMeasurements,
-    Poses,
     read_poses,
     robust_weight,
 )
@@ -140,20 +139,19 @@ def add_pose_fixes(graph: gtsam.NonlinearFactorGraph, fixes: Trajectory, loss: s
     """Add a fix as a measurement of the pose at each epoch (loose coupling)."""
     assert fixes.pose_cov is not None
     for i in range(len(fixes)):
-        noise = gtsam.noiseModel.Gaussian.Covariance(fixes.pose_cov[i])
-        if loss is not None:
-            estimators = gtsam.noiseModel.mEstimator
-            kind = {"huber": estimators.Huber, "cauchy": estimators.Cauchy}[loss]
-            noise = gtsam.noiseModel.Robust.Create(kind.Create(3.0), noise)
+        noise = _robust(gtsam.noiseModel.Gaussian.Covariance(fixes.pose_cov[i]), loss)
         pose = gtsam.Pose3(gtsam.Rot3(fixes.world_from_body[i]), fixes.position_world[i])
         graph.add(gtsam.PriorFactorPose3(X(i), pose, noise))
 
 
-def field_factors(
-    measurements: FieldMeasurements, blocks: tuple[Block, ...], loss: str | None
-) -> FieldFactors:
-    """Return the field factors of a log (tight coupling)."""
-    return FieldFactors(measurements, blocks, loss)
+def _robust(noise: gtsam.noiseModel.Gaussian, loss: str | None) -> gtsam.noiseModel.Base:
+    if loss is None:
+        return noise
+    width = ROBUST_WIDTH[loss] * np.sqrt(6.0)
+    estimators = gtsam.noiseModel.mEstimator
+    if loss == "huber":
+        return gtsam.noiseModel.Robust.Create(estimators.Huber.Create(width), noise)
+    return gtsam.noiseModel.Robust.Create(estimators.Cauchy.Create(width), noise)
 
 
 def _prior_factor(problem: Problem, calibration: Calibration) -> gtsam.JacobianFactor:
@@ -278,8 +276,18 @@ def optimise(
     return Optimised(estimate, cost, done, converged=False)
 
 
-def marginals(problem: Problem, estimate: Estimate) -> tuple[Array, Array]:
+def marginals(
+    problem: Problem, estimate: Estimate, held: tuple[Block, ...] = ()
+) -> tuple[Array, Array]:
     """Return the posterior covariance of every pose and of the calibration.
+
+    Parameters
+    ----------
+    problem : Problem
+    estimate : Estimate
+    held : tuple of Block
+        Uncertain parameters that were not estimated: what their errors do to the estimate is added
+        (a consider covariance).
 
     Returns
     -------
@@ -289,25 +297,40 @@ def marginals(problem: Problem, estimate: Estimate) -> tuple[Array, Array]:
     """
     calibrated = bool(problem.blocks)
     ordering = nested_dissection(problem.epochs, CALIBRATION_KEY if calibrated else None)
-    tree = _eliminate(linearized(problem, estimate), ordering)
+    graph = linearized(problem, estimate)
+    tree = _eliminate(graph, ordering)
     poses = np.array([tree.marginalCovariance(X(i)) for i in range(problem.epochs)])
-    if not calibrated:
-        return poses, np.zeros((0, 0))
-    return poses, np.asarray(tree.marginalCovariance(CALIBRATION_KEY))
+    calibration = np.zeros((0, 0))
+    if calibrated:
+        calibration = np.array(tree.marginalCovariance(CALIBRATION_KEY))
+    if held and problem.fields is not None:
+        by_pose, by_calibration = _responses(problem, estimate, graph, ordering, held)
+        poses += np.einsum("hni,hnj->nij", by_pose, by_pose)
+        calibration += by_calibration.T @ by_calibration
+    return poses, calibration
 
 
-__all__ = [
-    "Estimate",
-    "Optimised",
-    "Poses",
-    "Problem",
-    "add_pose_fixes",
-    "cost_of",
-    "field_factors",
-    "inertial_graph",
-    "initial_estimate",
-    "linearized",
-    "marginals",
-    "optimise",
-    "read_states",
-]
+def _responses(
+    problem: Problem,
+    estimate: Estimate,
+    graph: gtsam.GaussianFactorGraph,
+    ordering: gtsam.Ordering,
+    held: tuple[Block, ...],
+) -> tuple[Array, Array]:
+    """Return the steps that one sigma of each held parameter causes.
+
+    Of the poses, shape (held, n, 6), and of the calibration, shape (held, dimension).
+    """
+    assert problem.fields is not None
+    for i in range(graph.size()):
+        factor = graph.at(i)
+        assert isinstance(factor, gtsam.JacobianFactor)
+        factor.getb()[...] = 0.0
+    columns = problem.fields.sensitivity(read_poses(estimate.values), estimate.calibration, held)
+    by_pose, by_calibration = [], []
+    for column in np.moveaxis(columns * prior_sigma(held), -1, 0):
+        problem.fields.set_right_hand_side(-column)
+        step = _eliminate(graph, ordering).optimize()
+        by_pose.append([step.at(X(i)) for i in range(problem.epochs)])
+        by_calibration.append(step.at(CALIBRATION_KEY) if problem.blocks else np.zeros(0))
+    return np.array(by_pose), np.array(by_calibration)

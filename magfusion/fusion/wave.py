@@ -1,13 +1,13 @@
 """What the lock-in makes of motion inside its window, predicted and taken off."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from magfusion.fusion.inertial import motion_at
 from magfusion.parameters import Calibration, predict_channels
-from magfusion.receiver.lockin import WindowOperator
-from magfusion.records.samples import ImuSamples
+from magfusion.receiver.lockin import WindowOperator, demodulate
+from magfusion.records.samples import FieldSamples, ImuSamples
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array, ComplexArray
 
@@ -46,32 +46,37 @@ def predicted_waveform(
 
 
 @dataclass(frozen=True, eq=False)
-class LockinError:
-    """By how much the lock-in's phasors differ from those at the centre of the window.
+class WaveFields:
+    """Phasors at the centres of the windows, freed of what motion inside the window does.
 
     Parameters
     ----------
-    phasor_sensor : complex ndarray, shape (n, channels, 3)
-        (T), to be subtracted from measured phasors.
+    fields : FieldSamples
     by_time_offset : complex ndarray, shape (n, channels, 3)
-        Its derivative by the IMU's time offset, the states held (T/s).
+        Derivative of what was taken off by the IMU's time offset, the states held (T/s).
     """
 
-    phasor_sensor: ComplexArray
+    fields: FieldSamples
     by_time_offset: ComplexArray
 
 
-def lockin_error(
-    operator: WindowOperator, states: Trajectory, imu: ImuSamples, calibration: Calibration
-) -> LockinError:
-    """Predict what the lock-in makes of the motion inside its windows.
+def demodulate_about(
+    operator: WindowOperator,
+    measured_sensor: Array,
+    states: Trajectory,
+    imu: ImuSamples,
+    calibration: Calibration,
+) -> WaveFields:
+    """Demodulate what a prediction of the waveform leaves, and add the phasors at the centres.
 
     The raw samples of each window are predicted from the state and from the IMU's motion inside
-    the window, and pass through the same lock-in as the measured ones.
+    the window; only what they differ by from the measured ones passes through the lock-in.
 
     Parameters
     ----------
     operator : WindowOperator
+    measured_sensor : ndarray, shape (samples, 3)
+        (T)
     states : Trajectory
         At the centres of the windows.
     imu : ImuSamples
@@ -79,18 +84,22 @@ def lockin_error(
 
     Returns
     -------
-    LockinError
+    WaveFields
     """
     site = calibration.site
     earth = np.zeros(3) if site.earth_field_world is None else site.earth_field_world
 
-    def seen(time_offset: float) -> ComplexArray:
+    def predicted(time_offset: float) -> Array:
         motion = motion_at(states, imu, time_offset, site.gravity, operator.time)
-        return operator.apply(predicted_waveform(motion, calibration, earth))
+        return predicted_waveform(motion, calibration, earth)
 
-    now = seen(calibration.time_offset)
-    later = seen(calibration.time_offset + OFFSET_STEP)
+    now = predicted(calibration.time_offset)
+    later = predicted(calibration.time_offset + OFFSET_STEP)
+    rest = demodulate(operator, measured_sensor - now)
     at_centre = predict_channels(
         calibration, states.time, states.world_from_body, states.position_world
     )
-    return LockinError(now - at_centre, (later - now) / OFFSET_STEP)
+    return WaveFields(
+        fields=replace(rest, phasor_sensor=rest.phasor_sensor + at_centre),
+        by_time_offset=operator.apply((later - now) / OFFSET_STEP),
+    )

@@ -5,76 +5,24 @@ beacons into each tone.  Each sample is therefore first turned by the gyro into 
 window's centre, and the design holds a linear ramp for each tone.
 """
 
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.errors import InputError
 from magfusion.receiver.noise import noise_beside_tones, smoothed_over_windows
+from magfusion.receiver.windows import (
+    LockinSettings,
+    Windows,
+    channel_frequencies_hz,
+    sample_rate_hz,
+)
 from magfusion.records.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.site import Magnetometer, Site
 from magfusion.strapdown import attitude_at, attitude_from_gyro
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 CHUNK = 1000  # windows demodulated at once
-SATURATED_RUN = 3  # consecutive samples at the extreme of the range
-
-
-@dataclass(frozen=True)
-class LockinSettings:
-    """How a waveform is demodulated.
-
-    Parameters
-    ----------
-    window, step : float
-        Length of a window and distance between two (s).
-    mains_hz : float
-        Mains frequency; 0 for none.  Harmonics below the Nyquist frequency are fitted too.
-    noise_windows : int
-        Windows over which the noise beside the tones is averaged.
-    """
-
-    window: float
-    step: float
-    mains_hz: float = 50.0
-    noise_windows: int = 9
-
-
-@dataclass(frozen=True, eq=False)
-class Windows:
-    """Which stretches of a waveform are demodulated.
-
-    Parameters
-    ----------
-    centre : ndarray, shape (n,)
-        (s)
-    first, count : int ndarray, shape (n,)
-        Samples of each window.
-    dropped : mapping
-        Reason to number of windows.
-    """
-
-    centre: Array
-    first: IntArray
-    count: IntArray
-    dropped: Mapping[str, int]
-
-
-@dataclass(frozen=True, eq=False)
-class Demodulated:
-    """Phasors, and the linear map that made them.
-
-    Parameters
-    ----------
-    fields : FieldSamples
-    operator : WindowOperator
-        The map that made them.
-    """
-
-    fields: FieldSamples
-    operator: "WindowOperator"
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +32,7 @@ class WindowOperator:
     Parameters
     ----------
     settings : LockinSettings
+    channels : tuple of (str, int)
     frequencies_hz, nuisance_hz : ndarray
         Tones, and lines that are fitted beside them (Hz).
     time : ndarray, shape (samples,)
@@ -95,6 +44,7 @@ class WindowOperator:
     """
 
     settings: LockinSettings
+    channels: tuple[tuple[str, int], ...]
     frequencies_hz: Array
     nuisance_hz: Array
     time: Array
@@ -137,49 +87,6 @@ def chunks(n: int) -> list[slice]:
     return [slice(i, min(i + CHUNK, n)) for i in range(0, n, CHUNK)]
 
 
-def default_settings(site: Site, mains_hz: float = 50.0) -> LockinSettings:
-    """Choose window and step from the spacing of the tones.
-
-    Two periods of the closest pair (of tones, of a tone and the mains, of a tone and zero)
-    separate them even with a ramp in each; windows follow each other by half their length.
-
-    Raises
-    ------
-    InputError
-        Where two beacons share a frequency, or a beacon is driven in time slots.
-    """
-    frequencies = channel_frequencies_hz(site)
-    lines = np.sort(np.concatenate([[0.0], frequencies]))
-    gaps = np.diff(lines)
-    spacing = float(np.min(gaps))
-    if mains_hz > 0:
-        order = np.maximum(np.round(frequencies / mains_hz), 1.0)
-        to_mains = np.abs(frequencies - order * mains_hz)
-        spacing = min(spacing, float(np.min(to_mains[to_mains > 0.5], initial=np.inf)))
-    window = float(np.clip(2.0 / spacing, 0.02, 4.0))
-    return LockinSettings(window=window, step=window / 2.0, mains_hz=mains_hz)
-
-
-def channel_frequencies_hz(site: Site) -> Array:
-    """Return the frequency of each channel (Hz), refusing tones that cannot be told apart."""
-    for beacon in site.beacons:
-        if any(slot is not None for _, slot in beacon.tones):
-            raise InputError(
-                f"beacon {beacon.name} is driven in time slots, which the lock-in cannot separate; "
-                "give its demodulated fields.parquet instead of the waveform"
-            )
-    frequencies = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
-    order = np.argsort(frequencies)
-    close = np.flatnonzero(np.diff(frequencies[order]) < 0.1)
-    if len(close):
-        a, b = (site.channels[order[close[0] + i]][0] for i in (0, 1))
-        raise InputError(
-            f"beacons {a} and {b} both transmit at {frequencies[order[close[0]]]:g} Hz; "
-            "tones must differ by at least 0.1 Hz to be told apart"
-        )
-    return frequencies
-
-
 def _nuisances_hz(settings: LockinSettings, frequencies: Array, nyquist_hz: float) -> Array:
     if settings.mains_hz <= 0:
         return np.zeros(0)
@@ -188,7 +95,7 @@ def _nuisances_hz(settings: LockinSettings, frequencies: Array, nyquist_hz: floa
     return np.asarray(lines[apart > 0.8])
 
 
-def demodulate(
+def window_operator(
     waveform: Waveform,
     imu: ImuSamples,
     site: Site,
@@ -197,8 +104,8 @@ def demodulate(
     *,
     gyro_bias_body: Array | None = None,
     time_offset: float | None = None,
-) -> Demodulated:
-    """Turn a raw waveform into phasors with covariance.
+) -> WindowOperator:
+    """Return the map from a waveform to phasors, with the gyro's turn of each sample.
 
     Parameters
     ----------
@@ -217,35 +124,47 @@ def demodulate(
 
     Returns
     -------
-    Demodulated
+    WindowOperator
     """
     offset = site.platform.imu.time_offset if time_offset is None else time_offset
     imu_time = imu.time + offset
     gyro = imu.gyro_body - (0.0 if gyro_bias_body is None else gyro_bias_body)
     frequencies = channel_frequencies_hz(site)
-    operator = WindowOperator(
+    return WindowOperator(
         settings=settings,
+        channels=site.channels,
         frequencies_hz=frequencies,
         nuisance_hz=_nuisances_hz(settings, frequencies, sample_rate_hz(waveform) / 2.0),
         time=waveform.time,
         windows=windows,
         turn=_turner(waveform.time, imu_time, gyro, site.platform.magnetometer),
     )
-    phasor, unit, noise = _fit_all(operator, waveform.measured_sensor)
-    smooth = smoothed_over_windows(noise, windows.centre, settings.step, settings.noise_windows)
-    fields = FieldSamples(
-        time=windows.centre,
-        window=np.full(len(windows.centre), settings.window),
-        channels=site.channels,
+
+
+def demodulate(operator: WindowOperator, measured_sensor: Array) -> FieldSamples:
+    """Turn raw samples into phasors with covariance.
+
+    Parameters
+    ----------
+    operator : WindowOperator
+    measured_sensor : ndarray, shape (samples, 3)
+        At the operator's times (T).  Where a prediction has been taken off, the noise is measured
+        without what motion leaks beside the tones.
+
+    Returns
+    -------
+    FieldSamples
+    """
+    phasor, unit, noise = _fit_all(operator, measured_sensor)
+    centre, settings = operator.windows.centre, operator.settings
+    smooth = smoothed_over_windows(noise, centre, settings.step, settings.noise_windows)
+    return FieldSamples(
+        time=centre,
+        window=np.full(len(centre), settings.window),
+        channels=operator.channels,
         phasor_sensor=phasor,
         phasor_cov=unit[..., None, None] * smooth,
     )
-    return Demodulated(fields=fields, operator=operator)
-
-
-def sample_rate_hz(waveform: Waveform) -> float:
-    """Return the usual sampling rate (Hz)."""
-    return 1.0 / float(np.median(np.diff(waveform.time)))
 
 
 def _turner(
@@ -305,7 +224,8 @@ def fit_windows(operator: WindowOperator, rows: slice, measured_sensor: Array) -
     phasor = (cosine - 1j * sine) * reference[..., None]
     diagonal = np.einsum("nii->ni", inverse)
     unit = 0.5 * (diagonal[:, 2 : 2 + n] + diagonal[:, 2 + n : 2 + 2 * n])
-    return _Fit(phasor, unit, elapsed, weight, design, inverse, turned)
+    real = [np.asarray(part, dtype=np.float64) for part in (unit, elapsed, design, inverse, turned)]
+    return _Fit(phasor, real[0], real[1], weight, *real[2:])
 
 
 def _design(elapsed: Array, window: float, frequencies: Array, nuisances: Array) -> Array:
@@ -315,90 +235,9 @@ def _design(elapsed: Array, window: float, frequencies: Array, nuisances: Array)
     cosine, sine = np.cos(angle), np.sin(angle)
     mains = 2.0 * np.pi * elapsed[..., None] * nuisances
     return np.concatenate(
-        [np.ones_like(ramp), ramp, cosine, sine, ramp * cosine, ramp * sine]
-        + [np.cos(mains), np.sin(mains)],
+        [
+            *(np.ones_like(ramp), ramp, cosine, sine, ramp * cosine, ramp * sine),
+            *(np.cos(mains), np.sin(mains)),
+        ],
         axis=-1,
     )
-
-
-def choose_windows(
-    waveform: Waveform, imu: ImuSamples, site: Site, settings: LockinSettings
-) -> Windows:
-    """Lay windows over a waveform, dropping those that a gap or saturation spoils.
-
-    Parameters
-    ----------
-    waveform : Waveform
-    imu : ImuSamples
-    site : Site
-    settings : LockinSettings
-
-    Returns
-    -------
-    Windows
-
-    Raises
-    ------
-    InputError
-        Where the sampling rate is too low for the tones, or no window is usable.
-    """
-    rate, highest = sample_rate_hz(waveform), float(np.max(channel_frequencies_hz(site)))
-    if highest > 0.45 * rate:
-        raise InputError(
-            f"magnetometer: sampled at {rate:.4g} Hz, too slow for the tone at {highest:g} Hz; "
-            f"at least {highest / 0.45:.4g} Hz are needed"
-        )
-    imu_time = imu.time + site.platform.imu.time_offset
-    time, half = waveform.time, settings.window / 2.0
-    # The last sample stands for the interval up to the next one, as every sample does.
-    number = int(np.floor((time[-1] + 1.0 / rate - time[0] - settings.window) / settings.step)) + 1
-    centre = time[0] - 0.5 / rate + half + settings.step * np.arange(max(number, 0))
-    first = np.searchsorted(time, centre - half)
-    last = np.searchsorted(time, centre + half)
-    reasons = Counter[str]()
-    usable = np.ones(len(centre), dtype=bool)
-
-    def drop(reason: str, spoilt: BoolArray) -> None:
-        reasons[reason] += int(np.sum(usable & spoilt))
-        usable[spoilt] = False
-
-    gaps = time[:-1][np.diff(time) > 1.5 / rate]
-    drop("gap in the magnetometer stream", _holds(gaps, centre - half, centre + half))
-    drop("too few samples", last - first < 0.9 * settings.window * rate)
-    drop("magnetometer saturated", _holds(_saturated(waveform), centre - half, centre + half))
-    step = float(np.median(np.diff(imu_time)))
-    margin = 2.0 * step + 3.0 * site.platform.imu.time_offset_sigma
-    inside = (centre - half >= imu_time[0] - margin) & (centre + half <= imu_time[-1] + margin)
-    drop("no inertial data", ~inside)
-    missing = np.zeros(len(centre), dtype=bool)
-    for i in np.flatnonzero(np.diff(imu_time) > 3.0 * step):
-        missing |= (centre + half > imu_time[i]) & (centre - half < imu_time[i + 1])
-    drop("gap in the inertial stream", missing)
-    if not np.any(usable):
-        told = "; ".join(f"{k}: {v}" for k, v in reasons.items() if v) or "the log is too short"
-        raise InputError(
-            f"magnetometer: no window of {settings.window:g} s is usable ({told}); "
-            "record longer, or choose a shorter window"
-        )
-    return Windows(
-        centre=centre[usable],
-        first=first[usable],
-        count=(last - first)[usable],
-        dropped={k: v for k, v in reasons.items() if v},
-    )
-
-
-def _holds(instants: Array, start: Array, end: Array) -> BoolArray:
-    """Which intervals hold at least one of the sorted instants."""
-    return np.asarray(np.searchsorted(instants, end) > np.searchsorted(instants, start))
-
-
-def _saturated(waveform: Waveform) -> Array:
-    """Times at which an axis stays at the extreme of all its values: a clipped converter."""
-    hit = np.zeros(len(waveform), dtype=bool)
-    for axis in waveform.measured_sensor.T:
-        for extreme in (np.min(axis), np.max(axis)):
-            at = axis == extreme
-            run = np.convolve(at, np.ones(SATURATED_RUN), mode="same") >= SATURATED_RUN
-            hit |= run
-    return np.asarray(waveform.time[hit])

@@ -1,0 +1,185 @@
+"""Which stretches of a waveform are demodulated, and how."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.records.samples import ImuSamples, Waveform
+from magfusion.site import Site
+from magfusion.units import Array, BoolArray, IntArray
+
+SATURATED_RUN = 3  # consecutive samples at the extreme of the range
+
+
+@dataclass(frozen=True)
+class LockinSettings:
+    """How a waveform is demodulated.
+
+    Parameters
+    ----------
+    window, step : float
+        Length of a window and distance between two (s).
+    mains_hz : float
+        Mains frequency; 0 for none.  Harmonics below the Nyquist frequency are fitted too.
+    noise_windows : int
+        Windows over which the noise beside the tones is averaged.
+    """
+
+    window: float
+    step: float
+    mains_hz: float = 50.0
+    noise_windows: int = 9
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Which stretches of a waveform are demodulated.
+
+    Parameters
+    ----------
+    centre : ndarray, shape (n,)
+        (s)
+    first, count : int ndarray, shape (n,)
+        Samples of each window.
+    dropped : mapping
+        Reason to number of windows.
+    """
+
+    centre: Array
+    first: IntArray
+    count: IntArray
+    dropped: Mapping[str, int]
+
+
+def default_settings(site: Site, mains_hz: float = 50.0) -> LockinSettings:
+    """Choose window and step from the spacing of the tones.
+
+    Two periods of the closest pair (of tones, of a tone and the mains, of a tone and zero)
+    separate them even with a ramp in each; windows follow each other by half their length.
+
+    Raises
+    ------
+    InputError
+        Where two beacons share a frequency, or a beacon is driven in time slots.
+    """
+    frequencies = channel_frequencies_hz(site)
+    lines = np.sort(np.concatenate([[0.0], frequencies]))
+    gaps = np.diff(lines)
+    spacing = float(np.min(gaps))
+    if mains_hz > 0:
+        order = np.maximum(np.round(frequencies / mains_hz), 1.0)
+        to_mains = np.abs(frequencies - order * mains_hz)
+        spacing = min(spacing, float(np.min(to_mains[to_mains > 0.5], initial=np.inf)))
+    window = float(np.clip(2.0 / spacing, 0.02, 4.0))
+    return LockinSettings(window=window, step=window / 2.0, mains_hz=mains_hz)
+
+
+def channel_frequencies_hz(site: Site) -> Array:
+    """Return the frequency of each channel (Hz), refusing tones that cannot be told apart."""
+    for beacon in site.beacons:
+        if any(slot is not None for _, slot in beacon.tones):
+            raise InputError(
+                f"beacon {beacon.name} is driven in time slots, which the lock-in cannot separate; "
+                "give its demodulated fields.parquet instead of the waveform"
+            )
+    frequencies = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
+    order = np.argsort(frequencies)
+    close = np.flatnonzero(np.diff(frequencies[order]) < 0.1)
+    if len(close):
+        a, b = (site.channels[order[close[0] + i]][0] for i in (0, 1))
+        raise InputError(
+            f"beacons {a} and {b} both transmit at {frequencies[order[close[0]]]:g} Hz; "
+            "tones must differ by at least 0.1 Hz to be told apart"
+        )
+    return frequencies
+
+
+def sample_rate_hz(waveform: Waveform) -> float:
+    """Return the usual sampling rate (Hz)."""
+    return 1.0 / float(np.median(np.diff(waveform.time)))
+
+
+def choose_windows(
+    waveform: Waveform, imu: ImuSamples, site: Site, settings: LockinSettings
+) -> Windows:
+    """Lay windows over a waveform, dropping those that a gap or saturation spoils.
+
+    Parameters
+    ----------
+    waveform : Waveform
+    imu : ImuSamples
+    site : Site
+    settings : LockinSettings
+
+    Returns
+    -------
+    Windows
+
+    Raises
+    ------
+    InputError
+        Where the sampling rate is too low for the tones, or no window is usable.
+    """
+    rate, highest = sample_rate_hz(waveform), float(np.max(channel_frequencies_hz(site)))
+    if highest > 0.45 * rate:
+        raise InputError(
+            f"magnetometer: sampled at {rate:.4g} Hz, too slow for the tone at {highest:g} Hz; "
+            f"at least {highest / 0.45:.4g} Hz are needed"
+        )
+    imu_time = imu.time + site.platform.imu.time_offset
+    time, half = waveform.time, settings.window / 2.0
+    # The last sample stands for the interval up to the next one, as every sample does.
+    number = int(np.floor((time[-1] + 1.0 / rate - time[0] - settings.window) / settings.step)) + 1
+    centre = time[0] - 0.5 / rate + half + settings.step * np.arange(max(number, 0))
+    first = np.searchsorted(time, centre - half)
+    last = np.searchsorted(time, centre + half)
+    reasons = Counter[str]()
+    usable = np.ones(len(centre), dtype=bool)
+
+    def drop(reason: str, spoilt: BoolArray) -> None:
+        reasons[reason] += int(np.sum(usable & spoilt))
+        usable[spoilt] = False
+
+    gaps = time[:-1][np.diff(time) > 1.5 / rate]
+    drop("gap in the magnetometer stream", _holds(gaps, centre - half, centre + half))
+    drop("too few samples", last - first < 0.9 * settings.window * rate)
+    drop("magnetometer saturated", _holds(_saturated(waveform), centre - half, centre + half))
+    step = float(np.median(np.diff(imu_time)))
+    margin = 2.0 * step + 3.0 * site.platform.imu.time_offset_sigma
+    inside = (centre - half >= imu_time[0] - margin) & (centre + half <= imu_time[-1] + margin)
+    drop("no inertial data", ~inside)
+    missing = np.zeros(len(centre), dtype=bool)
+    for i in np.flatnonzero(np.diff(imu_time) > 3.0 * step):
+        missing |= (centre + half > imu_time[i]) & (centre - half < imu_time[i + 1])
+    drop("gap in the inertial stream", missing)
+    if not np.any(usable):
+        told = "; ".join(f"{k}: {v}" for k, v in reasons.items() if v) or "the log is too short"
+        raise InputError(
+            f"magnetometer: no window of {settings.window:g} s is usable ({told}); "
+            "record longer, or choose a shorter window"
+        )
+    return Windows(
+        centre=centre[usable],
+        first=first[usable],
+        count=(last - first)[usable],
+        dropped={k: v for k, v in reasons.items() if v},
+    )
+
+
+def _holds(instants: Array, start: Array, end: Array) -> BoolArray:
+    """Tell which intervals hold at least one of the sorted instants."""
+    return np.asarray(np.searchsorted(instants, end) > np.searchsorted(instants, start))
+
+
+def _saturated(waveform: Waveform) -> Array:
+    """Return the times at which an axis stays at the extreme of all its values, as if clipped."""
+    hit = np.zeros(len(waveform), dtype=bool)
+    for axis in waveform.measured_sensor.T:
+        for extreme in (np.min(axis), np.max(axis)):
+            at = axis == extreme
+            run = np.convolve(at, np.ones(SATURATED_RUN), mode="same") >= SATURATED_RUN
+            hit |= run
+    return np.asarray(waveform.time[hit])
