@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 
 from magfusion.errors import EstimationError
@@ -64,6 +65,10 @@ class SmootherSettings:
     estimate: tuple[str, ...] | None = None
     passes: int = 8
     lockin: LockinSettings | None = None
+
+    def __post_init__(self) -> None:
+        if self.passes < 1:
+            raise ValueError(f"passes must be at least 1; got {self.passes}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,31 +140,56 @@ def smooth(
         Where the graph cannot be solved.
     """
     settings = SmootherSettings() if settings is None else settings
-    total = settings.passes + 3
+    job = _prepared(log, site, settings, report)
+    return _loose(job) if settings.coupling == "loose" else _tight(job)
+
+
+@dataclass(frozen=True, eq=False)
+class _Job:
+    """A log with its start found."""
+
+    log: Log
+    settings: SmootherSettings
+    source: Source
+    samples: FieldSamples
+    fixes: Fixes
+    start: Start
+    states: Trajectory
+    declared: Calibration
+    report: Report
+
+    def told(self, stage: str, done: int) -> None:
+        self.report(stage, done, self.settings.passes + 3)
+
+
+def _prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) -> _Job:
+    report("demodulating", 0, settings.passes + 3)
     source = open_source(log, site, settings.lockin)
-    report("demodulating", 0, total)
     samples = source.first(initial_calibration(site, 0.0))
     if len(samples) < 2:
         raise EstimationError(
             f"log {log.name} has {len(samples)} field epoch; at least 2 are needed"
         )
+    report("finding a start", 1, settings.passes + 3)
     calibration = initial_calibration(site, float(np.mean(samples.time)))
-    report("finding a start", 1, total)
     fixes = first_fixes(samples, log, calibration)
     start = choose_chain(fixes, log.imu, calibration.time_offset, site.gravity)
-    calibration = start_phases(calibration, samples.time, start.phase)
-    # Unsynchronised drives have no declared phase: the prior is centred on the start.
-    declared = replace(
-        initial_calibration(site, calibration.reference_time), phase=calibration.phase
+    return _Job(
+        log=log,
+        settings=settings,
+        source=source,
+        samples=samples,
+        fixes=fixes,
+        start=start,
+        states=_with_rest_bias(start.states, log.imu, calibration.time_offset),
+        # Unsynchronised drives have no declared phase: their prior is centred on the start.
+        declared=start_phases(calibration, samples.time, start.phase),
+        report=report,
     )
-    states = _with_rest_bias(start.states, log.imu, calibration.time_offset)
-    if settings.coupling == "loose":
-        return _loose(log, samples, fixes, start, states, declared, source, settings, report)
-    return _tight(log, samples, start, states, declared, calibration, source, settings, report)
 
 
 def _with_rest_bias(states: Trajectory, imu: ImuSamples, time_offset: float) -> Trajectory:
-    """Gyro bias from the first rest, where there is one."""
+    """Gyro bias from the rests, where there are any."""
     still = resting(imu.time + time_offset, imu.gyro_body, imu.accel_body)
     bias = np.mean(imu.gyro_body[still], axis=0) if np.any(still) else np.zeros(3)
     shape = (len(states), 3)
@@ -168,73 +198,64 @@ def _with_rest_bias(states: Trajectory, imu: ImuSamples, time_offset: float) -> 
     )
 
 
-def _tight(
-    log: Log,
-    samples: FieldSamples,
-    start: Start,
-    states: Trajectory,
-    declared: Calibration,
-    calibration: Calibration,
-    source: Source,
-    settings: SmootherSettings,
-    report: Report,
-) -> Smoothed:
-    site = declared.site
-    blocks = choose_blocks(site, settings.estimate)
-    total, iterations, done = settings.passes + 3, 0, 0
-    passes = 1 if log.waveform is None else settings.passes
-    settled = False
-    while True:
-        report(f"pass {done + 1}", done + 2, total)
-        wave = source.about(calibration, states) if done > 0 else None
-        samples = samples if wave is None else wave.fields
-        problem, bridged = _problem(
-            log, samples, states, calibration, declared, blocks, wave, settings
-        )
+def _tight(job: _Job) -> Smoothed:
+    states, calibration, wave = job.states, job.declared, None
+    iterations, done, settled = 0, 0, False
+    while done < job.settings.passes and not settled:
+        job.told(f"pass {done + 1}", done + 2)
+        if done > 0 and job.log.waveform is not None:
+            wave = job.source.about(calibration, states)
+        samples = job.samples if wave is None else wave.fields
+        problem, bridged = _problem(job, samples, states, calibration, wave)
         found = optimise(problem, initial_estimate(states, calibration))
-        previous, offset = states, calibration.time_offset
-        states = read_states(found.estimate.values, samples.time)
-        calibration = found.estimate.calibration
+        moved = read_states(found.estimate.values, samples.time)
+        settled = done > 0 and _settled(states, moved, calibration, found.estimate.calibration)
+        states, calibration = moved, found.estimate.calibration
         iterations, done = iterations + found.iterations, done + 1
-        moved = np.sqrt(np.mean((states.position_world - previous.position_world) ** 2))
-        shifted = abs(calibration.time_offset - offset)
-        settled = bool(moved < POSITION_CONVERGED and shifted < OFFSET_CONVERGED)
-        if done >= passes or settled:
-            break
-    report("posterior", total - 1, total)
-    result = _posterior(problem, found, states, samples)
-    report("done", total, total)
+    job.told("posterior", job.settings.passes + 2)
+    result = _posterior(job, problem, found, samples, bridged)
     return replace(
-        result,
-        declared=declared,
-        start=start,
-        dropped=source.dropped,
-        bridged=bridged,
-        passes=done,
-        iterations=iterations,
-        converged=found.converged and (settled or passes == 1),
+        result, passes=done, iterations=iterations, converged=found.converged and settled
     )
+
+
+def _settled(before: Trajectory, after: Trajectory, old: Calibration, new: Calibration) -> bool:
+    moved = np.sqrt(np.mean((after.position_world - before.position_world) ** 2))
+    shifted = abs(new.time_offset - old.time_offset)
+    return bool(moved < POSITION_CONVERGED and shifted < OFFSET_CONVERGED)
+
+
+def _inertial(
+    job: _Job, time: Array, states: Trajectory, time_offset: float
+) -> tuple[gtsam.NonlinearFactorGraph, int]:
+    """Inertial graph between the epochs, and the number of intervals bridged."""
+    site = job.declared.site
+    assert states.accel_bias_body is not None
+    assert states.gyro_bias_body is not None
+    increments = cut_at_epochs(job.log.imu, time_offset, time)
+    preintegrated = preintegrate(
+        increments,
+        site.platform.imu,
+        site.gravity,
+        states.accel_bias_body,
+        states.gyro_bias_body,
+    )
+    graph = inertial_graph(preintegrated, site.platform.imu)
+    return graph, int(np.sum(increments.bridged))
 
 
 def _problem(
-    log: Log,
+    job: _Job,
     samples: FieldSamples,
     states: Trajectory,
     calibration: Calibration,
-    declared: Calibration,
-    blocks: tuple[Block, ...],
     wave: WaveFields | None,
-    settings: SmootherSettings,
 ) -> tuple[Problem, int]:
-    site, model = declared.site, declared.site.platform.imu
-    assert states.accel_bias_body is not None
+    graph, bridged = _inertial(job, samples.time, states, calibration.time_offset)
+    imu = job.log.imu
+    stamps = imu.time + calibration.time_offset
+    rate = np.stack([np.interp(samples.time, stamps, w) for w in imu.gyro_body.T], axis=1)
     assert states.gyro_bias_body is not None
-    increments = cut_at_epochs(log.imu, calibration.time_offset, samples.time)
-    preintegrated = preintegrate(
-        increments, model, site.gravity, states.accel_bias_body, states.gyro_bias_body
-    )
-    stamps = log.imu.time + calibration.time_offset
-    rate = np.stack([np.interp(samples.time, stamps, w) for w in log.imu.gyro_body.T], axis=1)
     shape = (*samples.phasor_sensor.shape[:2], 6)
     cov = measurement_cov(calibration.site, samples) * overlap(samples)
     measurements = FieldMeasurements(
@@ -245,13 +266,9 @@ def _problem(
         applied_offset=calibration.time_offset,
         by_time_offset=np.zeros(shape) if wave is None else stacked(wave.by_time_offset),
     )
-    problem = Problem(
-        native=inertial_graph(preintegrated, model),
-        fields=FieldFactors(measurements, blocks, settings.loss),
-        declared=declared,
-        epochs=len(samples),
-    )
-    return problem, int(np.sum(increments.bridged))
+    blocks = choose_blocks(job.declared.site, job.settings.estimate)
+    fields = FieldFactors(measurements, blocks, job.settings.loss)
+    return Problem(graph, fields, job.declared, len(samples)), bridged
 
 
 def overlap(samples: FieldSamples) -> float:
@@ -261,7 +278,7 @@ def overlap(samples: FieldSamples) -> float:
 
 
 def _posterior(
-    problem: Problem, found: Optimised, states: Trajectory, samples: FieldSamples
+    job: _Job, problem: Problem, found: Optimised, samples: FieldSamples, bridged: int
 ) -> Smoothed:
     held = held_blocks(problem.declared.site, problem.blocks)
     pose_cov, calibration_cov = marginals(problem, found.estimate, held)
@@ -270,17 +287,18 @@ def _posterior(
         poses = read_poses(found.estimate.values)
         error, _, _ = problem.fields.residual(poses, found.estimate.calibration)
         residual = np.where(samples.valid[..., None], error, np.nan)
+    job.told("done", job.settings.passes + 3)
     return Smoothed(
-        states=replace(states, pose_cov=pose_cov),
+        states=replace(read_states(found.estimate.values, samples.time), pose_cov=pose_cov),
         fields=samples,
         declared=problem.declared,
         calibration=found.estimate.calibration,
         blocks=problem.blocks,
         calibration_cov=calibration_cov,
         residual=residual,
-        start=Start(states, np.zeros(0), np.zeros(0, dtype=np.int64), np.inf),
-        dropped={},
-        bridged=0,
+        start=job.start,
+        dropped=job.source.dropped,
+        bridged=bridged,
         cost=found.cost,
         passes=1,
         iterations=found.iterations,
@@ -288,41 +306,14 @@ def _posterior(
     )
 
 
-def _loose(
-    log: Log,
-    samples: FieldSamples,
-    fixes: Fixes,
-    start: Start,
-    states: Trajectory,
-    declared: Calibration,
-    source: Source,
-    settings: SmootherSettings,
-    report: Report,
-) -> Smoothed:
-    site, total = declared.site, settings.passes + 3
-    report("fusing fixes", 2, total)
-    assert states.accel_bias_body is not None
-    assert states.gyro_bias_body is not None
-    increments = cut_at_epochs(log.imu, declared.time_offset, samples.time)
-    preintegrated = preintegrate(
-        increments,
-        site.platform.imu,
-        site.gravity,
-        states.accel_bias_body,
-        states.gyro_bias_body,
-    )
-    native = inertial_graph(preintegrated, site.platform.imu)
-    rows = np.arange(len(fixes))
-    cov = fixes.pose_cov[rows, start.chosen] * overlap(samples)
-    add_pose_fixes(native, replace(start.states, pose_cov=cov), settings.loss)
-    problem = Problem(native, None, declared, len(samples))
-    found = optimise(problem, initial_estimate(states, declared))
-    report("posterior", total - 1, total)
-    result = _posterior(problem, found, read_states(found.estimate.values, samples.time), samples)
-    report("done", total, total)
-    return replace(
-        result,
-        start=start,
-        dropped=source.dropped,
-        bridged=int(np.sum(increments.bridged)),
-    )
+def _loose(job: _Job) -> Smoothed:
+    job.told("fusing fixes", 2)
+    offset = job.declared.time_offset
+    graph, bridged = _inertial(job, job.samples.time, job.states, offset)
+    rows = np.arange(len(job.fixes))
+    cov = job.fixes.pose_cov[rows, job.start.chosen] * overlap(job.samples)
+    add_pose_fixes(graph, replace(job.start.states, pose_cov=cov), job.settings.loss)
+    problem = Problem(graph, None, job.declared, len(job.samples))
+    found = optimise(problem, initial_estimate(job.states, job.declared))
+    job.told("posterior", job.settings.passes + 2)
+    return _posterior(job, problem, found, job.samples, bridged)
