@@ -1,4 +1,4 @@
-"""The dipole's field and gradient against the laws of physics, magpylib and difference quotients."""
+"""The dipole's field and gradient against physical laws, magpylib and difference quotients."""
 
 import magpylib
 import numpy as np
@@ -22,7 +22,7 @@ def offsets_and_moments(seed=1, count=300):
 
 
 def relative(found, expected):
-    """Largest error of a row in units of the size of that row."""
+    """Return the largest error of a row in units of the size of that row."""
     error = np.linalg.norm((found - expected).reshape(len(found), -1), axis=1)
     return np.max(error / np.linalg.norm(np.reshape(expected, (len(found), -1)), axis=1))
 
@@ -110,8 +110,6 @@ def test_a_batch_is_what_its_rows_are_and_arguments_broadcast():
 @pytest.mark.parametrize("seed", [3, 4])
 def test_the_field_is_that_of_magpylib(seed):
     offset, moment = offsets_and_moments(seed, count=40)
-    expected = [
-        magpylib.misc.Dipole(moment=m).getB(o) for o, m in zip(offset, moment, strict=True)
-    ]
+    expected = [magpylib.misc.Dipole(moment=m).getB(o) for o, m in zip(offset, moment, strict=True)]
     # magpylib takes mu0 as measured, which is 4 pi 1e-7 within 1e-9.
     assert relative(dipole_field(offset, moment), np.array(expected)) < 1e-9
