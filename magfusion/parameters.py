@@ -134,8 +134,9 @@ def choose_blocks(site: Site, groups: Iterable[str] | None = None) -> tuple[Bloc
 
 def held_blocks(site: Site, estimated: tuple[Block, ...]) -> tuple[Block, ...]:
     """Return the parameters that are uncertain but not among those estimated."""
-    names = {block.name for block in estimated}
-    free = [b for b in _blocks(site, lambda _group, _kind, _sigma: True) if b.name not in names]
+    # Not by name alone: a beacon may be called sensor.
+    known = {block[:3] for block in estimated}
+    free = [b for b in _blocks(site, lambda _group, _kind, _sigma: True) if b[:3] not in known]
     start, out = 0, []
     for block in free:
         out.append(block._replace(columns=slice(start, start + len(block.sigma))))
@@ -202,7 +203,7 @@ def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) ->
         part = np.array(step[block.columns])  # GTSAM's vectors are read-only
         if block.kind == "time_offset":
             time_offset += float(part[0])
-        elif block.owner in ("magnetometer", "sensor") and block.group != "beacons":
+        elif block.group in ("magnetometer", "extrinsics"):
             site = _moved_magnetometer(site, block.kind, part)
         elif block.kind == "phase":
             phase[[owner == block.owner for owner, _ in site.channels]] += part

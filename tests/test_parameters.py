@@ -1,0 +1,371 @@
+"""Calibration parameters: how they move a site, what the phasors say of them, how they are told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from derivatives import central_difference, relative_to_group
+from example_site import UNEVEN, mixed_site
+from scipy.spatial.transform import Rotation
+
+from magfusion.parameters import (
+    DRIFT_SIGMA,
+    GROUPS,
+    NEGLIGIBLE,
+    PHASE_SIGMA,
+    choose_blocks,
+    difference,
+    dimension,
+    held_blocks,
+    initial_calibration,
+    linearize_channels,
+    predict_channels,
+    prior_sigma,
+    retract,
+)
+from magfusion.refinement import DETERMINED_RATIO, findings, refined_site
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.site import MagnetometerSigma
+from magfusion.site_file import load_site, save_site
+from magfusion.units import DEGREE
+
+REFERENCE_TIME = 40.0  # s
+# Of the difference quotients: an epoch is 60 s away, where a drift of 1e-5 turns a tone by 0.1 rad.
+STEPS = {"drift": 1e-8}
+
+ALL = choose_blocks(mixed_site(), GROUPS)
+
+
+def moved_calibration(seed=1):
+    """Return a calibration away from the declared one in every parameter."""
+    declared = initial_calibration(mixed_site(), REFERENCE_TIME)
+    return retract(declared, ALL, small_step(seed))
+
+
+def small_step(seed):
+    """About a prior sigma in each parameter, a radian in the phases."""
+    return np.random.default_rng(seed).normal(size=dimension(ALL)) * np.minimum(
+        prior_sigma(ALL), 1.0
+    )
+
+
+def epochs(count=5):
+    rng = np.random.default_rng(2)
+    rotation = Rotation.random(count, random_state=3).as_matrix()
+    position = rng.uniform(*DEMO_BOX_WORLD, (count, 3))
+    return np.linspace(0.0, 100.0, count), rotation, position
+
+
+def real(phasor):
+    return np.concatenate([phasor.real, phasor.imag], axis=-1)
+
+
+def kinds(blocks):
+    return {(b.group, b.kind) for b in blocks}
+
+
+def renamed(site, names):
+    beacons = tuple(replace(b, name=n) for b, n in zip(site.beacons, names, strict=True))
+    return replace(site, beacons=beacons)
+
+
+def with_magnetometer_sigma(site, **sigmas):
+    sensor = site.platform.magnetometer
+    sensor = replace(sensor, sigma=replace(sensor.sigma, **sigmas))
+    return replace(site, platform=replace(site.platform, magnetometer=sensor))
+
+
+def well_surveyed():
+    """Every prior so small that it is not worth estimating."""
+    site = with_magnetometer_sigma(demo_site(), matrix=np.full((3, 3), 9e-4))
+    imu = replace(site.platform.imu, time_offset_sigma=9e-5)
+    return replace(site, platform=replace(site.platform, imu=imu))
+
+
+@pytest.mark.parametrize("seed", [4, 5, 6])
+def test_difference_undoes_retract(seed):
+    start, step = moved_calibration(), small_step(seed)
+    found = difference(start, retract(start, ALL, step), ALL)
+    np.testing.assert_allclose(found, step, rtol=1e-9, atol=1e-15)
+
+
+def test_retract_undoes_difference():
+    a, b = moved_calibration(7), moved_calibration(8)
+    again = retract(a, ALL, difference(a, b, ALL))
+    time, rotation, position = epochs()
+    found, expected = (predict_channels(c, time, rotation, position) for c in (again, b))
+    assert relative_to_group(found, expected) < 1e-12
+    assert again.time_offset == pytest.approx(b.time_offset, rel=1e-12)
+
+
+def test_no_step_moves_nothing_and_no_step_changes_its_start():
+    start = moved_calibration()
+    time, rotation, position = epochs()
+    before = predict_channels(start, time, rotation, position)
+    unmoved = retract(start, ALL, np.zeros(dimension(ALL)))
+    retract(start, ALL, small_step(9))
+    assert np.array_equal(predict_channels(start, time, rotation, position), before)
+    assert np.array_equal(predict_channels(unmoved, time, rotation, position), before)
+
+
+def test_retract_turns_on_the_right_and_shifts_beacons_in_world_axes():
+    site = mixed_site()
+    start, step = initial_calibration(site, 0.0), small_step(10)
+    moved = retract(start, ALL, step).site
+    parts = {block.name: step[block.columns] for block in ALL}
+    for old, new in zip(site.beacons, moved.beacons, strict=True):
+        turn = Rotation.from_rotvec(parts[f"{old.name}.rotation"]).as_matrix()
+        np.testing.assert_allclose(new.world_from_beacon, old.world_from_beacon @ turn, rtol=1e-13)
+        np.testing.assert_allclose(
+            new.position_world, old.position_world + parts[f"{old.name}.position"], rtol=1e-13
+        )
+    old, new = site.platform.magnetometer, moved.platform.magnetometer
+    turn = Rotation.from_rotvec(parts["sensor.rotation"]).as_matrix()
+    np.testing.assert_allclose(new.body_from_sensor, old.body_from_sensor @ turn, rtol=1e-13)
+    lever = old.position_body + parts["sensor.position"]
+    np.testing.assert_allclose(new.position_body, lever, rtol=1e-13)
+
+
+@pytest.mark.parametrize("block", ALL, ids=lambda block: block.name)
+def test_each_block_of_the_jacobian_is_the_derivative_through_retract(block):
+    start, (time, rotation, position) = moved_calibration(), epochs()
+    rate, velocity_body = np.random.default_rng(11).normal(size=(2, len(time), 3))
+    alone = (block._replace(columns=slice(0, len(block.sigma))),)
+
+    def predicted(step):
+        moved = retract(start, alone, step)
+        # A sample is taken later than stamped: at the time of an epoch the body is not yet there.
+        late = moved.time_offset - start.time_offset
+        turned = rotation @ Rotation.from_rotvec(-rate * late).as_matrix()
+        place = position - late * (rotation @ velocity_body[..., None])[..., 0]
+        return real(predict_channels(moved, time, turned, place))
+
+    twist = np.concatenate([rate, velocity_body], axis=1)
+    value, _, columns = linearize_channels(start, ALL, time, rotation, position, twist)
+    expected = central_difference(predicted, len(block.sigma), STEPS.get(block.kind, 1e-5))
+    assert relative_to_group(columns[..., block.columns], expected) < 2e-8
+    assert relative_to_group(value, real(predict_channels(start, time, rotation, position))) < 1e-14
+
+
+def test_the_poses_block_is_the_derivative_by_the_pose():
+    start, (time, rotation, position) = moved_calibration(), epochs()
+
+    def predicted(step):
+        turned = rotation @ Rotation.from_rotvec(step[:3]).as_matrix()
+        return real(predict_channels(start, time, turned, position + rotation @ step[3:]))
+
+    _, by_pose, by_calibration = linearize_channels(start, (), time, rotation, position)
+    expected = central_difference(predicted, 6, 1e-5)
+    assert relative_to_group(by_pose[..., :3], expected[..., :3]) < 1e-8
+    assert relative_to_group(by_pose[..., 3:], expected[..., 3:]) < 1e-8
+    assert by_calibration.shape == (*expected.shape[:-1], 0)
+
+
+def test_the_time_offset_cannot_be_linearised_without_a_twist():
+    blocks = choose_blocks(mixed_site(), ["time-offset"])
+    with pytest.raises(ValueError, match="twist_body"):
+        linearize_channels(moved_calibration(), blocks, *epochs())
+
+
+def test_phases_run_from_the_reference_time_at_the_drift_of_their_beacon():
+    site = mixed_site()
+    start = initial_calibration(site, REFERENCE_TIME)
+    moved = replace(start, drift=np.array([0.0, 1e-5, -2e-5, 0.0]), phase=np.arange(6.0))
+    at_reference = moved.drive_phase(np.array([REFERENCE_TIME]))[0]
+    np.testing.assert_allclose(at_reference, np.arange(6.0), rtol=1e-15)
+    cycles = np.array([0.0, 22.0 * 1e-3, 25.0 * 1e-3, 28.0 * 1e-3, -31.0 * 2e-3, 0.0])
+    after = moved.drive_phase(np.array([REFERENCE_TIME + 100.0]))[0]
+    np.testing.assert_allclose(after - at_reference, 2.0 * np.pi * cycles, rtol=1e-12, atol=1e-15)
+
+
+def test_of_its_own_accord_it_estimates_what_the_survey_left_open():
+    site = well_surveyed()
+    assert choose_blocks(site) == ()
+    worse = replace(
+        site,
+        beacons=(
+            replace(
+                site.beacons[0],
+                sigma=replace(site.beacons[0].sigma, position_world=np.array([0.0, 3e-3, 0.0])),
+            ),
+            *site.beacons[1:],
+        ),
+    )
+    (block,) = choose_blocks(worse)
+    assert (block.name, block.columns) == ("A.position", slice(0, 3))
+    # The axes that are known stay so, a millionth of the open one.
+    np.testing.assert_allclose(block.sigma, [3e-9, 3e-3, 3e-9], rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["position", "rotation", "log_moment"])
+def test_a_sigma_at_the_negligible_is_held_and_one_above_it_is_estimated(kind):
+    name = {"position": "position_world", "rotation": "rotation_beacon"}.get(kind, kind)
+    site = well_surveyed()
+    first = site.beacons[0]
+    for factor, expected in ((1.0, ()), (1.01, (f"A.{kind}",))):
+        sigma = np.full_like(getattr(first.sigma, name), factor * NEGLIGIBLE[kind])
+        changed = replace(first, sigma=replace(first.sigma, **{name: sigma}))
+        worse = replace(site, beacons=(changed, *site.beacons[1:]))
+        assert tuple(b.name for b in choose_blocks(worse)) == expected
+
+
+def test_beacons_without_synchronisation_always_have_phase_and_drift():
+    blocks = choose_blocks(demo_site(synchronised=False))
+    drive = [b for b in blocks if b.group == "phase"]
+    assert [b.name for b in drive[:2]] == ["A.phase", "A.drift"]
+    assert len(drive) == 8
+    assert drive[0].sigma == PHASE_SIGMA
+    assert drive[1].sigma == DRIFT_SIGMA
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_a_group_is_chosen_by_its_name_alone(group):
+    blocks = choose_blocks(mixed_site(), [group])
+    assert {b.group for b in blocks} == {group}
+    assert kinds(blocks) == {k for k in kinds(ALL) if k[0] == group}
+
+
+def test_a_group_that_is_asked_for_comes_however_small_its_sigma_unless_it_is_zero():
+    assert {b.group for b in choose_blocks(well_surveyed(), GROUPS)} == set(GROUPS) - {"phase"}
+    known = with_magnetometer_sigma(
+        well_surveyed(), matrix=np.zeros((3, 3)), position_body=np.zeros(3)
+    )
+    names = {b.name for b in choose_blocks(known, ["magnetometer", "extrinsics"])}
+    assert names == {"sensor.rotation"}
+
+
+def test_an_unknown_group_is_refused_by_name():
+    with pytest.raises(ValueError, match="'wheels'"):
+        choose_blocks(mixed_site(), ["moments", "wheels"])
+
+
+def test_columns_follow_each_other_and_carry_the_sites_sigmas():
+    stop = 0
+    for block in ALL:
+        assert block.columns == slice(stop, stop + len(block.sigma))
+        stop = block.columns.stop
+    assert dimension(ALL) == len(prior_sigma(ALL)) == stop
+    sigma = {b.name: b.sigma for b in ALL}
+    np.testing.assert_array_equal(sigma["B.position"], 0.01 * UNEVEN)
+    np.testing.assert_array_equal(sigma["magnetometer.matrix"], 0.01 * np.arange(1.0, 10.0))
+    assert dimension(()) == len(prior_sigma(())) == 0
+
+
+@pytest.mark.parametrize("groups", [None, (), ("moments", "extrinsics"), GROUPS])
+def test_held_and_estimated_are_together_all_that_is_uncertain(groups):
+    site = mixed_site()
+    estimated = choose_blocks(site, groups)
+    held = held_blocks(site, estimated)
+    names = [{b.name for b in blocks} for blocks in (estimated, held)]
+    assert names[0] | names[1] == {b.name for b in ALL}
+    assert not names[0] & names[1]
+    assert dimension(estimated) + dimension(held) == dimension(ALL)
+    assert [b.columns.start for b in held[1:]] == [b.columns.stop for b in held[:-1]]
+
+
+def test_a_beacon_may_be_called_sensor_or_magnetometer():
+    plain = mixed_site()
+    odd = renamed(plain, ("sensor", "magnetometer", "imu", "D"))
+    blocks = choose_blocks(odd, GROUPS)
+    step = small_step(12)
+    plain_moved = retract(initial_calibration(plain, 0.0), ALL, step)
+    odd_moved = retract(initial_calibration(odd, 0.0), blocks, step)
+    found, expected = (predict_channels(c, *epochs()) for c in (odd_moved, plain_moved))
+    assert np.array_equal(found, expected)
+    start = initial_calibration(odd, 0.0)
+    np.testing.assert_allclose(difference(start, odd_moved, blocks), step, rtol=1e-9, atol=1e-15)
+    own = choose_blocks(odd, ["beacons", "moments"])
+    assert dimension(own) + dimension(held_blocks(odd, own)) == dimension(blocks)
+
+
+def refined(shrink=0.1):
+    declared = initial_calibration(mixed_site(), REFERENCE_TIME)
+    fitted = retract(declared, ALL, small_step(13))
+    cov = np.diag((shrink * prior_sigma(ALL)) ** 2)
+    told = findings(declared, fitted, ALL, cov)
+    return fitted, told, refined_site(fitted, ALL, cov, told, "walk")
+
+
+def test_a_parameter_is_determined_where_the_data_halved_its_sigma():
+    declared = initial_calibration(mixed_site(), REFERENCE_TIME)
+    shrink = np.tile([0.9, 1.1], dimension(ALL))[: dimension(ALL)] * DETERMINED_RATIO
+    told = findings(declared, declared, ALL, np.diag((shrink * prior_sigma(ALL)) ** 2))
+    assert [f.determined for f in told] == list(shrink < DETERMINED_RATIO)
+    assert {f.change for f in told} == {0.0}
+
+
+def test_findings_are_named_with_the_unit_of_their_figures():
+    told = {f.name: f for f in refined()[1]}
+    assert len(told) == dimension(ALL)
+    step = dict(zip([f.name for f in refined()[1]], small_step(13), strict=True))
+    units = {
+        "A.rotation_y_deg": DEGREE,
+        "B.position_z_m": 1.0,
+        "B.log_moment_2": 1.0,
+        "C.log_moment": 1.0,
+        "B.phase_1_deg": DEGREE,
+        "C.phase_deg": DEGREE,
+        "C.drift_ppm": 1e-6,
+        "magnetometer.matrix_yx": 1.0,
+        "sensor.rotation_x_deg": DEGREE,
+        "sensor.position_y_m": 1.0,
+        "imu.time_offset_s": 1.0,
+    }
+    for name, unit in units.items():
+        assert told[name].change == pytest.approx(step[name] / unit, rel=1e-8), name
+    assert told["A.rotation_y_deg"].prior_sigma == pytest.approx(0.04 / DEGREE)
+    assert told["A.rotation_y_deg"].sigma == pytest.approx(0.004 / DEGREE)
+    assert told["C.drift_ppm"].prior_sigma == pytest.approx(20.0)
+    assert told["magnetometer.matrix_yx"].prior_sigma == pytest.approx(0.04)
+
+
+def test_a_refined_site_has_the_fitted_values_and_the_posterior_sigmas():
+    fitted, _, site = refined(shrink=0.1)
+    declared = mixed_site()
+    for new, old in zip(site.beacons, declared.beacons, strict=True):
+        for name in ("position_world", "rotation_beacon", "log_moment"):
+            expected = 0.1 * getattr(old.sigma, name)
+            np.testing.assert_allclose(getattr(new.sigma, name), expected, rtol=1e-12)
+    new, old = site.platform.magnetometer.sigma, declared.platform.magnetometer.sigma
+    for name in ("matrix", "rotation_sensor", "position_body"):
+        np.testing.assert_allclose(getattr(new, name), 0.1 * getattr(old, name), rtol=1e-12)
+    assert np.array_equal(new.offset, old.offset)
+    imu = site.platform.imu
+    assert imu.time_offset == fitted.time_offset
+    assert imu.time_offset_sigma == pytest.approx(
+        0.1 * declared.platform.imu.time_offset_sigma, rel=1e-12
+    )
+    assert np.array_equal(site.beacons[1].position_world, fitted.site.beacons[1].position_world)
+
+
+def test_a_refined_site_keeps_the_sigmas_of_what_was_not_estimated():
+    blocks = choose_blocks(mixed_site(), ["moments"])
+    declared = initial_calibration(mixed_site(), 0.0)
+    cov = np.diag((0.2 * prior_sigma(blocks)) ** 2)
+    site = refined_site(declared, blocks, cov, findings(declared, declared, blocks, cov), "walk")
+    np.testing.assert_array_equal(site.beacons[0].sigma.position_world, 0.01 * UNEVEN)
+    np.testing.assert_allclose(site.beacons[0].sigma.log_moment, 0.002 * UNEVEN[:2], rtol=1e-12)
+    assert site.platform.imu == mixed_site().platform.imu
+
+
+def test_a_refined_site_survives_its_file_and_tells_what_was_determined(tmp_path):
+    fitted, told, site = refined()
+    save_site(site, tmp_path / "site.yaml")
+    again = load_site(tmp_path / "site.yaml")
+    # The drive belongs to the log: phases and drifts are not the site's.
+    steady = tuple(block for block in ALL if block.group != "phase")
+    expected, found = (
+        replace(fitted, site=s, time_offset=s.platform.imu.time_offset) for s in (site, again)
+    )
+    step = difference(expected, found, steady)
+    assert np.max(np.abs(step)) < 1e-13
+    loaded = prior_sigma(choose_blocks(again, GROUPS))
+    np.testing.assert_allclose(loaded, prior_sigma(choose_blocks(site, GROUPS)), rtol=1e-12)
+    assert isinstance(again.platform.magnetometer.sigma, MagnetometerSigma)
+    record = again.calibration
+    assert record["log"] == "walk"
+    assert record["determined"] == [f.name for f in told]
+    assert record["undetermined"] == []
+    drive = {f.name: [f.change, f.sigma] for f in told if "phase" in f.name or "drift" in f.name}
+    assert len(drive) == 6
+    assert record["drive"] == drive
