@@ -66,11 +66,19 @@ def cut_at_epochs(imu: ImuSamples, time_offset: float, epochs: Array) -> Increme
     ]
     gyro, accel = (0.5 * (s[:-1] + s[1:]) for s in samples)
     first = np.searchsorted(grid, epochs)
-    usual = float(np.median(np.diff(imu.time)))
-    long = np.flatnonzero(np.diff(grid) > GAP_SAMPLES * usual)
+    silent = np.flatnonzero(_in_gap(time, grid))
     bridged = np.zeros(len(epochs) - 1, dtype=bool)
-    bridged[np.searchsorted(first, long, side="right") - 1] = True
+    bridged[np.searchsorted(first, silent, side="right") - 1] = True
     return Increments(gyro, accel, np.diff(grid), first, bridged)
+
+
+def _in_gap(time: Array, grid: Array) -> BoolArray:
+    """Tell which steps of the grid lie in a gap of the stream, however short the step itself is."""
+    edges = np.concatenate([[min(time[0], grid[0])], time, [max(time[-1], grid[-1])]])
+    spacing = np.diff(edges)
+    holding = np.clip(np.searchsorted(edges, grid[:-1], side="right") - 1, 0, len(spacing) - 1)
+    usual = float(np.median(np.diff(time)))
+    return np.asarray(spacing[holding] > GAP_SAMPLES * usual)
 
 
 def _parameters(
@@ -110,11 +118,7 @@ def preintegrate(
     """
     usual = _parameters(imu, gravity, bridge=False)
     wide = _parameters(imu, gravity, bridge=True)
-    gyro, accel, dt = (
-        list(increments.gyro_body),
-        list(increments.accel_body),
-        increments.dt.tolist(),
-    )
+    gyro, accel, dt = increments.gyro_body, increments.accel_body, increments.dt.tolist()
     out = []
     for i, (lo, hi) in enumerate(
         zip(increments.first[:-1].tolist(), increments.first[1:].tolist(), strict=True)

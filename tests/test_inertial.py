@@ -1,0 +1,228 @@
+"""Between the epochs: preintegration and the IMU's shape against the simulator's exact motion."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from magfusion.fusion.inertial import cut_at_epochs, motion_at, preintegrate
+from magfusion.records.samples import ImuSamples
+from magfusion.simulation.inertial import simulate_imu
+from magfusion.simulation.motion import Motion, Rests, turning_motion
+from magfusion.site import ImuModel
+from magfusion.trajectory import Trajectory
+
+GRAVITY = 9.81
+DURATION = 40.0  # s
+BOX_WORLD = np.array([[1.2, 1.2, 0.6], [4.8, 3.8, 1.6]])
+SILENT = ImuModel(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+MEMS = ImuModel(3e-4, 3e-3, 1e-5, 1e-4, 5e-3, 0.05)
+GYRO_BIAS = np.array([0.01, -0.02, 0.03])
+ACCEL_BIAS = np.array([0.1, 0.2, -0.3])
+
+
+def moving(seed: int, rate_rms: float = 1.5) -> Motion:
+    rests = Rests(start=0.0, move=DURATION, pause=0.0)
+    rng = np.random.default_rng(seed)
+    return turning_motion(rng, DURATION, BOX_WORLD, rate_rms=rate_rms, rests=rests)
+
+
+def recorded(motion: Motion, time_offset: float = 0.0) -> ImuSamples:
+    rng = np.random.default_rng(0)
+    return simulate_imu(motion, SILENT, GRAVITY, 200.0, DURATION, rng, time_offset).samples
+
+
+def biased(imu: ImuSamples) -> ImuSamples:
+    return ImuSamples(imu.time, imu.gyro_body + GYRO_BIAS, imu.accel_body + ACCEL_BIAS)
+
+
+def with_biases(states: Trajectory, gyro: np.ndarray, accel: np.ndarray) -> Trajectory:
+    shape = (len(states), 3)
+    return replace(
+        states,
+        gyro_bias_body=np.broadcast_to(gyro, shape).copy(),
+        accel_bias_body=np.broadcast_to(accel, shape).copy(),
+    )
+
+
+def prediction_errors(
+    motion: Motion, imu: ImuSamples, time_offset: float, epochs: np.ndarray
+) -> np.ndarray:
+    """Largest error of attitude (rad), position (m) and velocity (m/s) over the intervals."""
+    increments = cut_at_epochs(imu, time_offset, epochs)
+    bias = (
+        np.broadcast_to(ACCEL_BIAS, (len(epochs), 3)),
+        np.broadcast_to(GYRO_BIAS, (len(epochs), 3)),
+    )
+    measured = preintegrate(increments, MEMS, GRAVITY, *bias)
+    true = motion.trajectory(epochs)
+    assert true.velocity_world is not None
+    constant = gtsam.imuBias.ConstantBias(ACCEL_BIAS, GYRO_BIAS)
+    errors = []
+    for i, measurement in enumerate(measured):
+        turn = gtsam.Rot3(true.world_from_body[i])
+        state = gtsam.NavState(turn, true.position_world[i], true.velocity_world[i])
+        found = measurement.predict(state, constant)
+        turned = found.attitude().matrix().T @ true.world_from_body[i + 1]
+        errors.append(
+            [
+                Rotation.from_matrix(turned).magnitude(),
+                np.linalg.norm(found.position() - true.position_world[i + 1]),
+                np.linalg.norm(found.velocity() - true.velocity_world[i + 1]),
+            ]
+        )
+    return np.max(errors, axis=0)
+
+
+@pytest.mark.parametrize(
+    ("interval", "rad", "metre", "metre_per_s"),
+    [
+        (0.2, 2e-5, 3e-5, 2e-4),
+        (1.0, 1e-4, 4e-4, 7e-4),
+        (10.0, 3e-4, 3e-2, 1e-2),  # the walk of the gyro's noise is 1e-3 rad by then
+    ],
+)
+def test_preintegration_follows_the_exact_motion(
+    interval: float, rad: float, metre: float, metre_per_s: float
+) -> None:
+    motion = moving(1)
+    epochs = np.arange(2.0033, 38.0, interval)  # never on a sample
+    errors = prediction_errors(motion, biased(recorded(motion)), 0.0, epochs)
+    assert np.all(errors < [rad, metre, metre_per_s]), errors
+
+
+def test_preintegration_survives_more_than_one_turn() -> None:
+    motion = moving(2)
+    epochs = np.array([3.0, 33.0])
+    turned = np.trapezoid(np.linalg.norm(motion.rate_body(np.arange(3.0, 33.0, 0.01)), axis=1))
+    assert 0.01 * turned > 4.0 * np.pi  # rad; two turns
+    attitude = prediction_errors(motion, biased(recorded(motion)), 0.0, epochs)[0]
+    assert attitude < 5e-4  # rad
+
+
+def test_the_time_offset_is_added_to_the_imus_stamps() -> None:
+    motion = moving(3)
+    imu, epochs = biased(recorded(motion, time_offset=0.02)), np.arange(2.0, 38.0, 1.0)
+    right = prediction_errors(motion, imu, 0.02, epochs)
+    ignored = prediction_errors(motion, imu, 0.0, epochs)
+    wrong_sign = prediction_errors(motion, imu, -0.02, epochs)
+    assert right[0] < 1e-4  # rad
+    assert ignored[0] > 1e-2  # rad
+    assert wrong_sign[0] > 1.5 * ignored[0]
+
+
+def test_steps_never_straddle_an_epoch_and_fill_every_interval() -> None:
+    imu = recorded(moving(4))
+    epochs = np.sort(np.random.default_rng(4).uniform(1.0, 39.0, 30))
+    increments = cut_at_epochs(imu, 0.003, epochs)
+    edges = epochs[0] + np.concatenate([[0.0], np.cumsum(increments.dt)])
+    assert np.allclose(edges[increments.first], epochs, rtol=0.0, atol=1e-9)  # s
+    assert np.all(increments.dt > 0.0)
+    assert np.max(increments.dt) < 0.005 + 1e-9  # s; the sampling interval
+    assert not np.any(increments.bridged)
+
+
+def without(imu: ImuSamples, start: float, end: float) -> ImuSamples:
+    kept = (imu.time <= start) | (imu.time >= end)
+    return ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept])
+
+
+@pytest.mark.parametrize("end", [10.35, 10.62, 11.01], ids=["one", "three", "five"])
+def test_intervals_that_touch_a_gap_are_bridged_with_a_wide_covariance(end: float) -> None:
+    epochs = np.arange(9.0, 12.0, 0.2)
+    # Both ends of the gap lie less than a gap's length from an epoch.
+    imu = without(recorded(moving(5)), 10.19, end)
+    increments = cut_at_epochs(imu, 0.0, epochs)
+    touched = (epochs[1:] > 10.19 + 1e-6) & (epochs[:-1] < end - 1e-6)
+    assert np.array_equal(increments.bridged, touched)
+    zero = np.zeros((len(epochs), 3))
+    measured = preintegrate(increments, MEMS, GRAVITY, zero, zero)
+    sigma = np.sqrt([np.diagonal(m.preintMeasCov())[:9] for m in measured])
+    assert np.min(sigma[touched, :3]) > 0.3  # rad; a person turns while the IMU is silent
+    assert np.min(sigma[touched, 6:9]) > 0.01  # m, or m/s
+    assert np.max(sigma[~touched, :3]) < 1e-3  # rad
+
+
+def test_epochs_beyond_the_stream_are_bridged() -> None:
+    imu = without(without(recorded(moving(5)), -1.0, 10.0), 12.0, 50.0)
+    increments = cut_at_epochs(imu, 0.0, np.arange(9.5, 12.6, 0.2))
+    assert np.array_equal(np.flatnonzero(increments.bridged), [0, 1, 2, 12, 13, 14])
+
+
+def states_of(motion: Motion, step: float = 0.2) -> Trajectory:
+    return with_biases(motion.trajectory(np.arange(2.0, 38.0, step)), GYRO_BIAS, ACCEL_BIAS)
+
+
+def test_the_motion_passes_exactly_through_the_states() -> None:
+    motion = moving(6)
+    rng = np.random.default_rng(6)
+    states = states_of(motion)
+    nudge = Rotation.from_rotvec(rng.normal(0.0, 0.01, (len(states), 3))).as_matrix()
+    assert states.velocity_world is not None
+    states = replace(
+        states,
+        world_from_body=states.world_from_body @ nudge,
+        position_world=states.position_world + rng.normal(0.0, 0.01, (len(states), 3)),
+        velocity_world=states.velocity_world + rng.normal(0.0, 0.01, (len(states), 3)),
+    )
+    found = motion_at(states, biased(recorded(motion)), 0.0, GRAVITY, states.time)
+    assert found.velocity_world is not None
+    assert np.allclose(found.position_world, states.position_world, rtol=0.0, atol=1e-9)  # m
+    assert np.allclose(found.velocity_world, states.velocity_world, rtol=0.0, atol=1e-9)  # m/s
+    assert np.allclose(found.world_from_body, states.world_from_body, rtol=0.0, atol=1e-9)
+
+
+def motion_errors(found: Trajectory, motion: Motion) -> np.ndarray:
+    true = motion.trajectory(found.time)
+    assert found.velocity_world is not None
+    assert true.velocity_world is not None
+    turn = np.swapaxes(found.world_from_body, 1, 2) @ true.world_from_body
+    return np.array(
+        [
+            np.max(Rotation.from_matrix(turn).magnitude()),
+            np.max(np.linalg.norm(found.position_world - true.position_world, axis=1)),
+            np.max(np.linalg.norm(found.velocity_world - true.velocity_world, axis=1)),
+        ]
+    )
+
+
+@pytest.mark.parametrize(("step", "allowed"), [(0.2, 1.0), (1.0, 5.0)])
+def test_between_the_states_the_motion_is_the_true_one(step: float, allowed: float) -> None:
+    motion = moving(7)
+    wanted = np.arange(2.0, 36.9, 0.00123)
+    imu = biased(recorded(motion, time_offset=0.004))
+    found = motion_at(states_of(motion, step), imu, 0.004, GRAVITY, wanted)
+    errors = motion_errors(found, motion)
+    assert np.all(errors < allowed * np.array([5e-5, 3e-5, 5e-4])), errors  # rad, m, m/s
+    shifted = motion_at(states_of(motion, step), imu, -0.004, GRAVITY, wanted)
+    # At 1.4 rad/s and up, eight milliseconds show.
+    assert motion_errors(shifted, motion)[0] > 20.0 * errors[0]
+
+
+def test_a_wrong_bias_bends_the_motion_little_between_the_states() -> None:
+    motion = moving(8)
+    states = with_biases(motion.trajectory(np.arange(2.0, 38.0, 0.2)), np.zeros(3), np.zeros(3))
+    found = motion_at(states, biased(recorded(motion)), 0.0, GRAVITY, np.arange(2.0, 37.7, 0.00123))
+    errors = motion_errors(found, motion)
+    assert errors[0] < 1e-3  # rad
+    assert errors[1] < 1e-3  # m
+
+
+def test_beyond_the_states_the_imu_carries_the_motion_on() -> None:
+    motion = moving(9)
+    states = with_biases(motion.trajectory(np.arange(10.0, 12.0, 0.2)), GYRO_BIAS, ACCEL_BIAS)
+    imu = biased(recorded(motion))
+    before = motion_at(states, imu, 0.0, GRAVITY, np.arange(9.5, 10.0, 0.01))
+    after = motion_at(states, imu, 0.0, GRAVITY, np.arange(11.85, 12.3, 0.01))
+    for found in (before, after):
+        assert np.all(motion_errors(found, motion) < [1e-3, 2e-3, 5e-3])  # rad, m, m/s
+
+
+def test_states_without_biases_are_refused() -> None:
+    motion = moving(9)
+    with pytest.raises(ValueError, match="velocity and biases"):
+        motion_at(
+            motion.trajectory(np.arange(3.0)), recorded(motion), 0.0, GRAVITY, np.array([1.0])
+        )
