@@ -9,7 +9,7 @@ import numpy as np
 from magfusion.errors import EstimationError
 from magfusion.fixes.fix import Fixes
 from magfusion.fusion.factors import FieldFactors, FieldMeasurements, read_poses
-from magfusion.fusion.inertial import cut_at_epochs, preintegrate
+from magfusion.fusion.inertial import cut_at_epochs, low_passed, preintegrate
 from magfusion.fusion.smoother import (
     Optimised,
     Problem,
@@ -252,7 +252,7 @@ def _problem(
     wave: WaveFields | None,
 ) -> tuple[Problem, int]:
     graph, bridged = _inertial(job, samples.time, states, calibration.time_offset)
-    imu = job.log.imu
+    imu = low_passed(job.log.imu)
     stamps = imu.time + calibration.time_offset
     rate = np.stack([np.interp(samples.time, stamps, w) for w in imu.gyro_body.T], axis=1)
     assert states.gyro_bias_body is not None

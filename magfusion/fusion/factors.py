@@ -11,7 +11,13 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 from scipy.spatial.transform import Rotation
 
-from magfusion.parameters import Block, Calibration, dimension, linearize_channels
+from magfusion.parameters import (
+    Block,
+    Calibration,
+    dimension,
+    linearize_channels,
+    predict_channels,
+)
 from magfusion.units import Array
 
 CALIBRATION_KEY = gtsam.symbol("c", 0)
@@ -124,6 +130,16 @@ class FieldFactors:
             self._jacobians.append(factor.getA())
             self._errors.append(factor.getb())
 
+    def cost(self, poses: Poses, calibration: Calibration) -> float:
+        """Return half the sum of the losses, without a Jacobian."""
+        data = self.measurements
+        lag, world_from_body, position_world = self._at_field(poses, calibration)
+        phasor = predict_channels(calibration, data.time, world_from_body, position_world)
+        value = np.concatenate([phasor.real, phasor.imag], axis=-1) + lag * data.by_time_offset
+        error = data.root @ (value - data.measured)[..., None]
+        _, rho = robust_weight(np.sum(error[..., 0] ** 2, axis=2), self.loss)
+        return 0.5 * float(np.sum(rho))
+
     def residual(self, poses: Poses, calibration: Calibration) -> tuple[Array, Array, Array]:
         """Return whitened residual (n, channels, 6) and its Jacobians by pose and calibration."""
         data = self.measurements
@@ -143,6 +159,15 @@ class FieldFactors:
         for view, values in zip(self._errors, right.reshape(len(right), -1), strict=True):
             view[...] = values
 
+    def _at_field(self, poses: Poses, calibration: Calibration) -> tuple[float, Array, Array]:
+        """Return lag, attitude and position where the field was taken.
+
+        The states carry the IMU's clock: that was a little before or after.
+        """
+        lag = calibration.time_offset - self.measurements.applied_offset
+        turn = Rotation.from_rotvec(-lag * self.measurements.rate_body).as_matrix()
+        return lag, poses.world_from_body @ turn, poses.position_world - lag * poses.velocity_world
+
     def _predicted(
         self, poses: Poses, calibration: Calibration, blocks: tuple[Block, ...]
     ) -> tuple[Array, Array, Array]:
@@ -150,15 +175,13 @@ class FieldFactors:
         velocity_body = (
             np.swapaxes(poses.world_from_body, 1, 2) @ poses.velocity_world[..., None]
         )[..., 0]
-        # The states carry the IMU's clock: the field was taken a little before or after.
-        lag = calibration.time_offset - data.applied_offset
-        turn = Rotation.from_rotvec(-lag * data.rate_body).as_matrix()
+        lag, world_from_body, position_world = self._at_field(poses, calibration)
         value, by_pose, by_calibration = linearize_channels(
             calibration,
             blocks,
             data.time,
-            poses.world_from_body @ turn,
-            poses.position_world - lag * poses.velocity_world,
+            world_from_body,
+            position_world,
             np.concatenate([data.rate_body, velocity_body], axis=1),
         )
         value += lag * data.by_time_offset

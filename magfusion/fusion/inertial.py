@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
+from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 
 from magfusion.records.samples import ImuSamples
@@ -16,6 +17,7 @@ from magfusion.units import Array, BoolArray, IntArray
 # What may happen while the IMU is silent: the motion of a person or a vehicle.
 BRIDGE_GYRO_NOISE = 1.0  # rad/s/sqrt(Hz)
 BRIDGE_ACCEL_NOISE = 3.0  # m/s^2/sqrt(Hz)
+RATE_SPAN = 0.08  # s; motion is slower, noise is not
 GAP_SAMPLES = 5.0  # a gap is this many times the usual sampling interval
 
 
@@ -132,6 +134,20 @@ def preintegrate(
             integrate(a, w, step)
         out.append(measurement)
     return out
+
+
+def low_passed(imu: ImuSamples) -> ImuSamples:
+    """Return the stream averaged over `RATE_SPAN`: the rate that differentiates a measurement.
+
+    White noise in a derivative would pass for information on the time offset.
+    """
+    usual = float(np.median(np.diff(imu.time)))
+    size = 2 * int(0.5 * RATE_SPAN / usual) + 1
+    gyro, accel = (
+        uniform_filter1d(stream, size, axis=0, mode="nearest")
+        for stream in (imu.gyro_body, imu.accel_body)
+    )
+    return ImuSamples(imu.time, gyro, accel)
 
 
 def motion_at(

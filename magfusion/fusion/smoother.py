@@ -13,7 +13,6 @@ from magfusion.fusion.factors import (
     ROBUST_WIDTH,
     FieldFactors,
     read_poses,
-    robust_weight,
 )
 from magfusion.fusion.ordering import nested_dissection
 from magfusion.parameters import Block, Calibration, difference, prior_sigma, retract
@@ -165,9 +164,7 @@ def cost_of(problem: Problem, estimate: Estimate) -> float:
     """Return half the sum of squared whitened residuals, priors included."""
     total = float(problem.native.error(estimate.values))
     if problem.fields is not None:
-        error, _, _ = problem.fields.residual(read_poses(estimate.values), estimate.calibration)
-        _, rho = robust_weight(np.sum(error**2, axis=2), problem.fields.loss)
-        total += 0.5 * float(np.sum(rho))
+        total += problem.fields.cost(read_poses(estimate.values), estimate.calibration)
     if problem.blocks:
         step = difference(problem.declared, estimate.calibration, problem.blocks)
         total += 0.5 * float(np.sum((step / prior_sigma(problem.blocks)) ** 2))

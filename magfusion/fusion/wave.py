@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.fusion.inertial import motion_at
+from magfusion.fusion.inertial import low_passed, motion_at
 from magfusion.parameters import Calibration, predict_channels
 from magfusion.receiver.lockin import WindowOperator, demodulate
 from magfusion.records.samples import FieldSamples, ImuSamples
@@ -89,17 +89,17 @@ def demodulate_about(
     site = calibration.site
     earth = np.zeros(3) if site.earth_field_world is None else site.earth_field_world
 
-    def predicted(time_offset: float) -> Array:
-        motion = motion_at(states, imu, time_offset, site.gravity, operator.time)
+    def predicted(stream: ImuSamples, time_offset: float) -> Array:
+        motion = motion_at(states, stream, time_offset, site.gravity, operator.time)
         return predicted_waveform(motion, calibration, earth)
 
-    now = predicted(calibration.time_offset)
-    later = predicted(calibration.time_offset + OFFSET_STEP)
-    rest = demodulate(operator, measured_sensor - now)
+    offset, slow = calibration.time_offset, low_passed(imu)
+    rest = demodulate(operator, measured_sensor - predicted(imu, offset))
+    change = predicted(slow, offset + OFFSET_STEP) - predicted(slow, offset - OFFSET_STEP)
     at_centre = predict_channels(
         calibration, states.time, states.world_from_body, states.position_world
     )
     return WaveFields(
         fields=replace(rest, phasor_sensor=rest.phasor_sensor + at_centre),
-        by_time_offset=operator.apply((later - now) / OFFSET_STEP),
+        by_time_offset=operator.apply(change / (2.0 * OFFSET_STEP)),
     )
