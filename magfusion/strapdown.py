@@ -31,13 +31,15 @@ def rotation_increments(time: Array, gyro_body: Array) -> Rotation:
 
 
 def _prefix_products(rotations: Rotation) -> Rotation:
-    """Products of the first 1, 2, ... rotations, by doubling: log2(n) batched products."""
+    """Products of the first 1, 2, ... rotations: those of neighbouring pairs, then the odd ones."""
+    n = len(rotations)
+    if n == 1:
+        return rotations
     quaternion = rotations.as_quat()
-    reach = 1
-    while reach < len(quaternion):
-        head = Rotation.from_quat(quaternion[:-reach]) * Rotation.from_quat(quaternion[reach:])
-        quaternion = np.concatenate([quaternion[:reach], head.as_quat()])
-        reach *= 2
+    pairs = _prefix_products(rotations[: n - 1 : 2] * rotations[1::2])
+    quaternion[1::2] = pairs.as_quat()
+    if n > 2:
+        quaternion[2::2] = (pairs[: (n - 1) // 2] * rotations[2::2]).as_quat()
     return Rotation.from_quat(quaternion)
 
 
