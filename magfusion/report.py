@@ -10,6 +10,8 @@ from magfusion.fusion.batch import Smoothed
 from magfusion.refinement import findings
 from magfusion.units import Array
 
+AMBIGUOUS_CHI_SQUARE = 20.0  # below this a mirrored trajectory explains the log nearly as well
+
 Figures = dict[str, float | int | str | bool | list[str] | None]
 
 
@@ -69,9 +71,9 @@ def smoothed_figures(result: Smoothed) -> Figures:
         "cost": result.cost,
         "intervals_bridged": result.bridged,
         "start_epochs_not_first_hypothesis": int(np.sum(chosen > 0)),
-        "start_rival_chi_square": result.start.rival_cost
-        if np.isfinite(result.start.rival_cost)
-        else None,
+        "rival_chi_square": result.rival_chi_square,
+        "ambiguous": result.rival_chi_square is not None
+        and result.rival_chi_square < AMBIGUOUS_CHI_SQUARE,
         "time_offset_s": result.calibration.time_offset,
     }
     figures |= dropped_figures(result.dropped)

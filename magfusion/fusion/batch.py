@@ -21,7 +21,7 @@ from magfusion.fusion.smoother import (
     read_states,
 )
 from magfusion.fusion.source import Source, first_fixes, open_source
-from magfusion.fusion.start import Start, choose_chain, start_phases
+from magfusion.fusion.start import Start, choose_chains, start_phases
 from magfusion.fusion.wave import WaveFields
 from magfusion.parameters import Block, Calibration, choose_blocks, held_blocks, initial_calibration
 from magfusion.receiver.windows import LockinSettings
@@ -89,6 +89,10 @@ class Smoothed:
     residual : ndarray, shape (n, channels, 6)
         Whitened; NaN where a channel is missing, or with loose coupling.
     start : Start
+    rival_chi_square : float, optional
+        How much worse the best trajectory from another chain of hypotheses is, after its first
+        pass: a small figure means that the log leaves a mirrored trajectory possible.  None where
+        there was no other chain.
     dropped : mapping
         Reason to number of windows.
     bridged : int
@@ -106,6 +110,7 @@ class Smoothed:
     calibration_cov: Array
     residual: Array
     start: Start
+    rival_chi_square: float | None
     dropped: Mapping[str, int]
     bridged: int
     cost: float
@@ -146,7 +151,7 @@ def smooth(
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """A log with its start found."""
+    """A log with a start found."""
 
     log: Log
     settings: SmootherSettings
@@ -157,6 +162,7 @@ class _Job:
     states: Trajectory
     declared: Calibration
     report: Report
+    rival_chi_square: float | None = None
 
     def told(self, stage: str, done: int) -> None:
         self.report(stage, done, self.settings.passes + 3)
@@ -173,19 +179,34 @@ def _prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) 
     report("finding a start", 1, settings.passes + 3)
     calibration = initial_calibration(site, float(np.mean(samples.time)))
     fixes = first_fixes(samples, log, calibration)
-    start = choose_chain(fixes, log.imu, calibration.time_offset, site.gravity)
-    return _Job(
-        log=log,
-        settings=settings,
-        source=source,
-        samples=samples,
-        fixes=fixes,
-        start=start,
-        states=_with_rest_bias(start.states, log.imu, calibration.time_offset),
-        # Unsynchronised drives have no declared phase: their prior is centred on the start.
-        declared=start_phases(calibration, samples.time, start.phase),
-        report=report,
-    )
+    jobs = [
+        _Job(
+            log=log,
+            settings=settings,
+            source=source,
+            samples=samples,
+            fixes=fixes,
+            start=start,
+            states=_with_rest_bias(start.states, log.imu, calibration.time_offset),
+            # Unsynchronised drives have no declared phase: their prior is centred on the start.
+            declared=start_phases(calibration, samples.time, start.phase),
+            report=report,
+        )
+        for start in choose_chains(fixes, log.imu, calibration.time_offset, site.gravity)
+    ]
+    return jobs[0] if len(jobs) == 1 else _likeliest(jobs)
+
+
+def _likeliest(jobs: list[_Job]) -> _Job:
+    """Let the motion decide between chains that single epochs cannot tell apart."""
+    costs = []
+    for job in jobs:
+        problem, _ = _problem(job, job.samples, job.states, job.declared, None)
+        costs.append(optimise(problem, initial_estimate(job.states, job.declared)).cost)
+    order = np.argsort(costs)
+    margin = 2.0 * (costs[int(order[1])] - costs[int(order[0])])
+    likeliest: _Job = jobs[int(order[0])]
+    return replace(likeliest, rival_chi_square=float(margin))
 
 
 def _with_rest_bias(states: Trajectory, imu: ImuSamples, time_offset: float) -> Trajectory:
@@ -297,6 +318,7 @@ def _posterior(
         calibration_cov=calibration_cov,
         residual=residual,
         start=job.start,
+        rival_chi_square=job.rival_chi_square,
         dropped=job.source.dropped,
         bridged=bridged,
         cost=found.cost,

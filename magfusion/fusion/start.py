@@ -18,6 +18,7 @@ ROTATION_SIGMA = 0.1  # rad
 GRAVITY_SIGMA = 1.5  # m/s^2; specific force against gravity, in motion
 AVERAGING = 2.0  # s; over which the specific force is compared with gravity
 LEAP_COST = 100.0  # of a jump between unrelated hypotheses: one bad epoch must not break a chain
+RIVAL_COST = 1000.0  # chi square; a chain worse by more is no rival
 DRIFT_SEARCH = 1e-4  # relative; largest clock error looked for
 
 
@@ -33,18 +34,20 @@ class Start:
         Drive phase of the chosen hypotheses (rad).
     chosen : int ndarray, shape (n,)
         Hypothesis of each epoch.
-    rival_cost : float
-        How much worse, in units of chi square, the best entirely different chain is.
+    cost : float
+        Chi square of the chain.
     """
 
     states: Trajectory
     phase: Array
     chosen: IntArray
-    rival_cost: float
+    cost: float
 
 
-def choose_chain(fixes: Fixes, imu: ImuSamples, time_offset: float, gravity: float) -> Start:
-    """Choose one hypothesis for each epoch so that gyro, gravity and speed agree (Viterbi).
+def choose_chains(
+    fixes: Fixes, imu: ImuSamples, time_offset: float, gravity: float
+) -> tuple[Start, ...]:
+    """Choose chains of hypotheses so that gyro, gravity and speed agree (Viterbi).
 
     Parameters
     ----------
@@ -57,7 +60,9 @@ def choose_chain(fixes: Fixes, imu: ImuSamples, time_offset: float, gravity: flo
 
     Returns
     -------
-    Start
+    tuple of Start
+        The best, then those that differ from it at most epochs and are not much worse: the mirrors
+        of a dipole, between which the motion must decide.
     """
     time = imu.time + time_offset
     attitude = attitude_at(attitude_from_gyro(time, imu.gyro_body), time, imu.gyro_body, fixes.time)
@@ -65,13 +70,21 @@ def choose_chain(fixes: Fixes, imu: ImuSamples, time_offset: float, gravity: flo
     unary = unary + _gravity_cost(fixes, imu, time, gravity)
     unary = np.where(np.isfinite(fixes.cost), unary, np.inf)
     link = _link_cost(fixes, attitude)
-    chosen, cost = _viterbi(unary, link)
-    others = unary.copy()
-    others[np.arange(len(fixes)), chosen] = np.inf
-    usable = np.isfinite(others).any(axis=1)
-    rival = np.inf
-    if np.all(usable):
-        rival = _viterbi(others, link)[1] - cost
+    chains: list[Start] = []
+    left = unary.copy()
+    for _ in range(fixes.cost.shape[1]):
+        chosen, cost = _viterbi(left, link)
+        fresh = all(np.mean(chosen != other.chosen) > 0.5 for other in chains)
+        if not fresh or (chains and cost > chains[0].cost + RIVAL_COST):
+            break
+        chains.append(_start(fixes, chosen, cost))
+        left[np.arange(len(fixes)), chosen] = np.inf
+        spent = ~np.isfinite(left).any(axis=1)
+        left[spent] = unary[spent]
+    return tuple(chains)
+
+
+def _start(fixes: Fixes, chosen: IntArray, cost: float) -> Start:
     rows = np.arange(len(fixes))
     position = fixes.position_world[rows, chosen]
     return Start(
@@ -83,7 +96,7 @@ def choose_chain(fixes: Fixes, imu: ImuSamples, time_offset: float, gravity: flo
         ),
         phase=fixes.phase[rows, chosen],
         chosen=chosen,
-        rival_cost=float(rival),
+        cost=cost,
     )
 
 
