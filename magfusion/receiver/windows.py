@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import binary_opening
 
 from magfusion.errors import InputError
 from magfusion.records.samples import ImuSamples, Waveform
@@ -12,6 +13,7 @@ from magfusion.site import Site
 from magfusion.units import Array, BoolArray, IntArray
 
 SATURATED_RUN = 3  # consecutive samples at the extreme of the range
+ROUNDING = 1e-6  # of a step; what arithmetic may take from the last window
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,20 @@ def channel_frequencies_hz(site: Site) -> Array:
 
 
 def sample_rate_hz(waveform: Waveform) -> float:
-    """Return the usual sampling rate (Hz)."""
-    return 1.0 / float(np.median(np.diff(waveform.time)))
+    """Return the usual sampling rate (Hz).
+
+    Raises
+    ------
+    InputError
+        Where there are less than two samples.
+    """
+    return 1.0 / _usual_step(waveform.time, "magnetometer")
+
+
+def _usual_step(time: Array, stream: str) -> float:
+    if len(time) < 2:
+        raise InputError(f"{stream}: found {len(time)} samples; record at least one window")
+    return float(np.median(np.diff(time)))
 
 
 def choose_windows(
@@ -121,7 +135,8 @@ def choose_windows(
     Raises
     ------
     InputError
-        Where the sampling rate is too low for the tones, or no window is usable.
+        Where the sampling rate is too low for the tones, a stream has less than two samples, or no
+        window is usable.
     """
     rate, highest = sample_rate_hz(waveform), float(np.max(channel_frequencies_hz(site)))
     if highest > 0.45 * rate:
@@ -132,7 +147,8 @@ def choose_windows(
     imu_time = imu.time + site.platform.imu.time_offset
     time, half = waveform.time, settings.window / 2.0
     # The last sample stands for the interval up to the next one, as every sample does.
-    number = int(np.floor((time[-1] + 1.0 / rate - time[0] - settings.window) / settings.step)) + 1
+    last_start = time[-1] + 1.0 / rate - time[0] - settings.window
+    number = int(np.floor(last_start / settings.step + ROUNDING)) + 1
     centre = time[0] - 0.5 / rate + half + settings.step * np.arange(max(number, 0))
     first = np.searchsorted(time, centre - half)
     last = np.searchsorted(time, centre + half)
@@ -143,18 +159,20 @@ def choose_windows(
         reasons[reason] += int(np.sum(usable & spoilt))
         usable[spoilt] = False
 
-    gaps = time[:-1][np.diff(time) > 1.5 / rate]
-    drop("gap in the magnetometer stream", _holds(gaps, centre - half, centre + half))
+    gap = np.flatnonzero(np.diff(time) > 1.5 / rate)
+    # From just before the first missing sample to just after the last.
+    missing = time[gap] + 0.75 / rate, time[gap + 1] - 0.75 / rate
+    drop("gap in the magnetometer stream", _meets(*missing, centre - half, centre + half))
     drop("too few samples", last - first < 0.9 * settings.window * rate)
-    drop("magnetometer saturated", _holds(_saturated(waveform), centre - half, centre + half))
-    step = float(np.median(np.diff(imu_time)))
+    clipped = _saturated(waveform)
+    drop("magnetometer saturated", _meets(clipped, clipped, centre - half, centre + half))
+    step = _usual_step(imu_time, "imu")
     margin = 2.0 * step + 3.0 * site.platform.imu.time_offset_sigma
     inside = (centre - half >= imu_time[0] - margin) & (centre + half <= imu_time[-1] + margin)
     drop("no inertial data", ~inside)
-    missing = np.zeros(len(centre), dtype=bool)
-    for i in np.flatnonzero(np.diff(imu_time) > 3.0 * step):
-        missing |= (centre + half > imu_time[i]) & (centre - half < imu_time[i + 1])
-    drop("gap in the inertial stream", missing)
+    gap = np.flatnonzero(np.diff(imu_time) > 3.0 * step)
+    silent = _meets(imu_time[gap], imu_time[gap + 1], centre - half, centre + half)
+    drop("gap in the inertial stream", silent)
     if not np.any(usable):
         told = "; ".join(f"{k}: {v}" for k, v in reasons.items() if v) or "the log is too short"
         raise InputError(
@@ -169,9 +187,10 @@ def choose_windows(
     )
 
 
-def _holds(instants: Array, start: Array, end: Array) -> BoolArray:
-    """Tell which intervals hold at least one of the sorted instants."""
-    return np.asarray(np.searchsorted(instants, end) > np.searchsorted(instants, start))
+def _meets(begin: Array, end: Array, window_begin: Array, window_end: Array) -> BoolArray:
+    """Tell which windows meet at least one of the stretches, which are sorted and apart."""
+    begun, ended = np.searchsorted(begin, window_end), np.searchsorted(end, window_begin)
+    return np.asarray(begun > ended)
 
 
 def _saturated(waveform: Waveform) -> Array:
@@ -180,6 +199,5 @@ def _saturated(waveform: Waveform) -> Array:
     for axis in waveform.measured_sensor.T:
         for extreme in (np.min(axis), np.max(axis)):
             at = axis == extreme
-            run = np.convolve(at, np.ones(SATURATED_RUN), mode="same") >= SATURATED_RUN
-            hit |= run
+            hit |= binary_opening(at, np.ones(SATURATED_RUN))
     return np.asarray(waveform.time[hit])
