@@ -154,10 +154,30 @@ class FieldFactors:
         by_other = self._predicted(poses, calibration, blocks)[2]
         return np.asarray(self.measurements.root @ by_other)
 
-    def set_right_hand_side(self, right: Array) -> None:
-        """Write other right-hand sides, shape (n, channels, 6), into the factors."""
-        for view, values in zip(self._errors, right.reshape(len(right), -1), strict=True):
-            view[...] = values
+    def with_others(self, key: int, columns: Array) -> gtsam.GaussianFactorGraph:
+        """Return the factors as last linearised, with other parameters and nothing to explain.
+
+        Parameters
+        ----------
+        key : int
+            Of the other parameters.
+        columns : ndarray, shape (n, channels, 6, others)
+            Their whitened Jacobian.
+        """
+        graph = gtsam.GaussianFactorGraph()
+        zero = np.zeros(columns.shape[1] * 6)
+        unit = gtsam.noiseModel.Unit.Create(len(zero))
+        flat = columns.reshape(len(columns), len(zero), -1)
+        for i, (own, other) in enumerate(zip(self._jacobians, flat, strict=True)):
+            by_pose, by_calibration = own[:, :6], own[:, 6:]
+            if self.columns:
+                factor = gtsam.JacobianFactor(
+                    X(i), by_pose, CALIBRATION_KEY, by_calibration, key, other, zero, unit
+                )
+            else:
+                factor = gtsam.JacobianFactor(X(i), by_pose, key, other, zero, unit)
+            graph.push_back(factor)
+        return graph
 
     def _at_field(self, poses: Poses, calibration: Calibration) -> tuple[float, Array, Array]:
         """Return lag, attitude and position where the field was taken.
@@ -201,5 +221,6 @@ class FieldFactors:
         right = -(error * share).reshape(n, -1)
         for view, rows in zip(self._jacobians, block, strict=True):
             view[...] = rows
-        self.set_right_hand_side(right)
+        for view, row in zip(self._errors, right, strict=True):
+            view[...] = row
         return 0.5 * float(np.sum(rho))

@@ -20,6 +20,7 @@ from magfusion.site import ImuModel
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array
 
+HELD_KEY = gtsam.symbol("h", 0)
 VELOCITY_SIGMA = 10.0  # m/s; prior of the first velocity
 DAMPING_START, DAMPING_STOP = 1e-2, 1e10
 # The step that a damping of one holds back: metres, radians, m/s, m/s^2, rad/s.
@@ -294,40 +295,49 @@ def marginals(
     """
     calibrated = bool(problem.blocks)
     ordering = nested_dissection(problem.epochs, CALIBRATION_KEY if calibrated else None)
-    graph = linearized(problem, estimate)
-    tree = _eliminate(graph, ordering)
+    tree = _eliminate(linearized(problem, estimate), ordering)
     poses = np.array([tree.marginalCovariance(X(i)) for i in range(problem.epochs)])
     calibration = np.zeros((0, 0))
     if calibrated:
         calibration = np.array(tree.marginalCovariance(CALIBRATION_KEY))
     if held and problem.fields is not None:
-        by_pose, by_calibration = _responses(problem, estimate, graph, ordering, held)
+        by_pose, by_calibration = _responses(problem, estimate, held)
         poses += np.einsum("hni,hnj->nij", by_pose, by_pose)
         calibration += by_calibration.T @ by_calibration
     return poses, calibration
 
 
 def _responses(
-    problem: Problem,
-    estimate: Estimate,
-    graph: gtsam.GaussianFactorGraph,
-    ordering: gtsam.Ordering,
-    held: tuple[Block, ...],
+    problem: Problem, estimate: Estimate, held: tuple[Block, ...]
 ) -> tuple[Array, Array]:
     """Return the steps that one sigma of each held parameter causes.
 
-    Of the poses, shape (held, n, 6), and of the calibration, shape (held, dimension).
+    Of the poses, shape (held, n, 6), and of the calibration, shape (held, dimension).  The held
+    parameters are left over when all else is eliminated, so that one elimination serves them all.
     """
     assert problem.fields is not None
+    graph = problem.native.linearize(estimate.values)
     for i in range(graph.size()):
         factor = graph.at(i)
         assert isinstance(factor, gtsam.JacobianFactor)
         factor.getb()[...] = 0.0
-    columns = problem.fields.sensitivity(read_poses(estimate.values), estimate.calibration, held)
+    calibrated = bool(problem.blocks)
+    if calibrated:
+        graph.push_back(_prior_factor(problem, problem.declared))
+    poses = read_poses(estimate.values)
+    columns = problem.fields.sensitivity(poses, estimate.calibration, held) * prior_sigma(held)
+    graph.push_back(problem.fields.with_others(HELD_KEY, columns))
+    ordering = nested_dissection(problem.epochs, CALIBRATION_KEY if calibrated else None)
+    try:
+        conditional, _ = graph.eliminatePartialSequential(ordering)
+    except RuntimeError:  # as in _eliminate
+        conditional, _ = graph.eliminatePartialSequential(ordering, gtsam.EliminateQR)
+    keys = [X(i) for i in range(problem.epochs)]
     by_pose, by_calibration = [], []
-    for column in np.moveaxis(columns * prior_sigma(held), -1, 0):
-        problem.fields.set_right_hand_side(-column)
-        step = _eliminate(graph, ordering).optimize()
-        by_pose.append([step.at(X(i)) for i in range(problem.epochs)])
-        by_calibration.append(step.at(CALIBRATION_KEY) if problem.blocks else np.zeros(0))
+    for one in np.eye(columns.shape[-1]):
+        given = gtsam.VectorValues()
+        given.insert(HELD_KEY, one)
+        step = conditional.optimize(given)
+        by_pose.append(step.vector(keys).reshape(-1, 6))
+        by_calibration.append(step.at(CALIBRATION_KEY) if calibrated else np.zeros(0))
     return np.array(by_pose), np.array(by_calibration)
