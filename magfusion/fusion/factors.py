@@ -150,9 +150,16 @@ class FieldFactors:
     def sensitivity(
         self, poses: Poses, calibration: Calibration, blocks: tuple[Block, ...]
     ) -> Array:
-        """Return the whitened Jacobian by other parameters, shape (n, channels, 6, dimension)."""
-        by_other = self._predicted(poses, calibration, blocks)[2]
-        return np.asarray(self.measurements.root @ by_other)
+        """Return the whitened Jacobian by other parameters, shape (n, channels, 6, dimension).
+
+        With the robust weights of the factors, since an outlier that has little say in the estimate
+        passes little of the others' errors on.
+        """
+        data = self.measurements
+        value, _, by_other = self._predicted(poses, calibration, blocks)
+        error = (data.root @ (value - data.measured)[..., None])[..., 0]
+        weight, _ = robust_weight(np.sum(error**2, axis=2), self.loss)
+        return np.asarray(np.sqrt(weight)[..., None, None] * (data.root @ by_other))
 
     def with_others(self, key: int, columns: Array) -> gtsam.GaussianFactorGraph:
         """Return the factors as last linearised, with other parameters and nothing to explain.
