@@ -269,8 +269,8 @@ def test_what_is_held_is_considered_as_dense_algebra_has_it(
     if problem.blocks:
         width = dimension(problem.blocks)
         assert same_covariance(calibration, expected[-width:, -width:], rtol=1e-4)
-    # The survey limits these positions about as much as the noise does.
-    assert np.trace(poses[0][3:, 3:]) > 1.3 * np.trace(alone[0][3:, 3:])
+    # The survey has a share in these sigmas that the comparison could not miss.
+    assert np.trace(poses[0][3:, 3:]) > 1.2 * np.trace(alone[0][3:, 3:])
 
 
 def test_a_considered_survey_covers_errors_of_the_survey() -> None:
