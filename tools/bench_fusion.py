@@ -1,0 +1,401 @@
+"""Time the batch smoother against GTSAM's own optimizer, and against itself on longer logs.
+
+Compared, in one run and from one start, on simulated epochs 1 s apart with 100 Hz inertial data,
+three beacons, and poses and moments of the beacons and the magnetometer matrix estimated:
+
+- `optimise`, our Gauss-Newton loop over GTSAM's linear layer, as the smoother uses it;
+- GTSAM's LevenbergMarquardtOptimizer with one CustomFactor a beacon and epoch.
+
+The native graph is not handicapped.  It holds the same inertial factors and priors; the
+calibration has variables of its own, so that GTSAM retracts it; the ordering is nested dissection,
+calibration last, as ours; and its callbacks only hand out rows of one vectorised call of the
+measurement model a linearisation.  What is left is GTSAM's own work: it copies all values into
+every callback.  Both stop where the cost falls by less than 1e-6 of itself.
+
+Times are of the processor, which other work on the machine disturbs less than those of the clock;
+both optimizers run on one thread.
+
+Then: our loop's time an epoch and iteration on a long log against that on the short one, and the
+posterior's covariances, on their own.  ``python tools/bench_fusion.py --native-epochs 300`` gives
+a quick look.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import L, M, S, X
+from scipy.spatial.transform import Rotation
+
+from magfusion.fusion.factors import FieldFactors, FieldMeasurements
+from magfusion.fusion.inertial import cut_at_epochs, preintegrate
+from magfusion.fusion.ordering import nested_dissection
+from magfusion.fusion.smoother import (
+    Estimate,
+    Optimised,
+    Problem,
+    inertial_graph,
+    initial_estimate,
+    marginals,
+    optimise,
+)
+from magfusion.observation import observe, predict
+from magfusion.parameters import Block, Calibration, choose_blocks, initial_calibration
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.inertial import simulate_imu
+from magfusion.simulation.log import perturb_site, simulate_fields
+from magfusion.simulation.motion import random_walk_motion
+from magfusion.site import Beacon, BeaconSigma, Magnetometer, Site
+from magfusion.trajectory import Trajectory
+from magfusion.units import Array
+from magfusion.weights import paired_whitening, stacked
+
+T = TypeVar("T")
+
+EPOCHS, BEACONS = 2880, 3
+ENLARGED = 5.0  # the demo's room, with moments that keep its fields
+IMU_RATE_HZ = 100.0
+FIELD_SIGMA = 5e-9  # T
+POSITION_ERROR, ROTATION_ERROR = 0.3, 0.02  # of the start (m, rad)
+TOLERANCE = 1e-6  # relative decrease of the cost that ends either optimizer
+NATIVE_ITERATIONS = 15
+AT_LEAST = {"speedup": 100.0}
+AT_MOST = {"cost_difference": 1e-6, "growth": 1.5}
+JACOBIAN_COLUMNS = (6, 6, 2, 9)  # platform, beacon, log-moments, magnetometer matrix
+
+
+def bench_site() -> Site:
+    """Return the demo's first three beacons in a room five times larger, less well surveyed."""
+    site = demo_site(coil_radius=None)
+    sensor = site.platform.magnetometer
+    none = {name: np.zeros(3) for name in ("offset", "rotation_sensor", "position_body")}
+    sigma = replace(sensor.sigma, matrix=np.full((3, 3), 5e-3), **none)
+    platform = replace(site.platform, magnetometer=replace(sensor, sigma=sigma))
+    beacons = tuple(_enlarged(beacon) for beacon in site.beacons[:BEACONS])
+    return replace(site, beacons=beacons, platform=platform)
+
+
+def _enlarged(beacon: Beacon) -> Beacon:
+    coils = [replace(c, moment_beacon=ENLARGED**3 * c.moment_beacon) for c in beacon.coils]
+    return replace(
+        beacon,
+        position_world=ENLARGED * beacon.position_world,
+        coils=tuple(coils),
+        sigma=BeaconSigma(np.full(3, 0.02), np.full(3, 0.01), np.full(2, 0.01)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One simulated log, ready for either optimizer."""
+
+    declared: Calibration
+    blocks: tuple[Block, ...]
+    start: Trajectory
+    measurements: FieldMeasurements
+    preintegrated: list[gtsam.PreintegratedCombinedMeasurementsG]
+    preintegrate_seconds: float
+
+    def problem(self) -> Problem:
+        """Return a graph for our loop."""
+        native = inertial_graph(self.preintegrated, self.declared.site.platform.imu)
+        fields = FieldFactors(self.measurements, self.blocks, None)
+        return Problem(native, fields, self.declared, len(self.start))
+
+
+def timed(job: Callable[[], T]) -> tuple[T, float]:
+    """Return what a job returns, and the seconds that it took."""
+    started = time.process_time()
+    result = job()
+    return result, time.process_time() - started
+
+
+def make_scene(epochs: int, seed: int) -> Scene:
+    """Simulate a walk of so many seconds, and preintegrate it."""
+    site, rng = bench_site(), np.random.default_rng(seed)
+    true_site, imu = perturb_site(site, rng), site.platform.imu
+    motion = random_walk_motion(rng, float(epochs), ENLARGED * DEMO_BOX_WORLD)
+    inertial = simulate_imu(motion, imu, site.gravity, IMU_RATE_HZ, float(epochs), rng).samples
+    truth = motion.trajectory(np.arange(epochs, dtype=float))
+    samples = simulate_fields(true_site, truth, FIELD_SIGMA, rng)
+    zero = np.zeros((epochs, 3))
+    declared = initial_calibration(site, float(np.mean(samples.time)))
+    turn = Rotation.from_rotvec(rng.normal(0.0, ROTATION_ERROR, (epochs, 3))).as_matrix()
+    start = replace(
+        truth,
+        world_from_body=truth.world_from_body @ turn,
+        position_world=truth.position_world + rng.normal(0.0, POSITION_ERROR, (epochs, 3)),
+    )
+    measured = stacked(samples.phasor_sensor)
+    measurements = FieldMeasurements(
+        time=samples.time,
+        measured=measured,
+        root=paired_whitening(samples.phasor_cov, samples.valid),
+        rate_body=zero,
+        applied_offset=0.0,
+        by_time_offset=np.zeros_like(measured),
+    )
+    increments = cut_at_epochs(inertial, 0.0, samples.time)
+    preintegrated, seconds = timed(partial(preintegrate, increments, imu, site.gravity, zero, zero))
+    blocks = choose_blocks(site, ("beacons", "moments", "magnetometer"))
+    return Scene(declared, blocks, start, measurements, preintegrated, seconds)
+
+
+@dataclass(frozen=True, eq=False)
+class Ours:
+    """Our loop on one scene, run once or more."""
+
+    problem: Problem
+    start: Estimate
+    preintegrate_seconds: float
+    build_seconds: float
+    found: Optimised
+    runs: list[float]
+
+    @property
+    def seconds(self) -> float:
+        """Median time of a run."""
+        return float(np.median(self.runs))
+
+    def figures(self, prefix: str) -> dict[str, float]:
+        """Return times and cost, each name with a prefix."""
+        work = self.problem.epochs * self.found.iterations
+        return {
+            f"{prefix}_epochs": self.problem.epochs,
+            f"{prefix}_s": self.seconds,
+            f"{prefix}_iterations": self.found.iterations,
+            f"{prefix}_us_per_epoch_iteration": 1e6 * self.seconds / work,
+            f"{prefix}_preintegrate_s": self.preintegrate_seconds,
+            f"{prefix}_build_s": self.build_seconds,
+            f"{prefix}_cost": self.found.cost,
+        }
+
+    def again(self) -> None:
+        """Run once more, to take the machine's mood into the median."""
+        self.runs.append(timed(partial(optimise, self.problem, self.start, tolerance=TOLERANCE))[1])
+        say(f"ours: {self.problem.epochs} epochs, {self.runs[-1]:.2f} s")
+
+
+def run_ours(scene: Scene, repeats: int) -> Ours:
+    """Run our loop."""
+    problem, build_seconds = timed(scene.problem)
+    start = initial_estimate(scene.start, scene.declared)
+    found, seconds = timed(partial(optimise, problem, start, tolerance=TOLERANCE))
+    say(f"ours: {problem.epochs} epochs, {found.iterations} iterations, {seconds:.2f} s")
+    ours = Ours(problem, start, scene.preintegrate_seconds, build_seconds, found, [seconds])
+    for _ in range(repeats - 1):
+        ours.again()
+    return ours
+
+
+class BatchedModel:
+    """Residuals of all epochs, computed at once and handed out to the factors row by row.
+
+    A row holds for the platform pose and the calibration at which it was computed; where a factor
+    comes with others, all are computed anew.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.site, self.data = scene.declared.site, scene.measurements
+        self._poses = np.zeros((0, 12))
+        self._calibration: list[bytes] = [b""] * BEACONS
+        self._errors: list[Array] = []
+        self._jacobians: list[list[Array]] = []
+
+    def row(
+        self, values: gtsam.Values, epoch: int, beacon: int, derivatives: bool
+    ) -> tuple[Array, list[Array]]:
+        """Return one factor's residual, shape (6,), and its Jacobians if they are wanted."""
+        stale = (derivatives and not self._jacobians) or not self._fits(values, epoch, beacon)
+        if stale:
+            self._compute(values, derivatives)
+        blocks = [b[epoch] for b in self._jacobians[beacon]] if derivatives else []
+        return self._errors[beacon][epoch], blocks
+
+    def _fits(self, values: gtsam.Values, epoch: int, beacon: int) -> bool:
+        if not len(self._poses) or _calibration_at(values, beacon) != self._calibration[beacon]:
+            return False
+        pose = values.atPose3(X(epoch))
+        row = self._poses[epoch]
+        return bool(
+            (pose.translation() == row[9:]).all()
+            and (pose.rotation().matrix().ravel() == row[:9]).all()
+        )
+
+    def _compute(self, values: gtsam.Values, derivatives: bool) -> None:
+        # Sorted by key: the beacons' poses (l) come before the platform's (x).
+        self._poses = gtsam.utilities.extractPose3(values)[BEACONS:]
+        turn, position = self._poses[:, :9].reshape(-1, 3, 3), self._poses[:, 9:]
+        sensor = self.site.platform.magnetometer
+        sensor = replace(sensor, matrix=values.atVector(S(0)).reshape(3, 3))
+        self._calibration = [_calibration_at(values, i) for i in range(BEACONS)]
+        self._errors, self._jacobians = [], []
+        for i, declared in enumerate(self.site.beacons):
+            beacon = _beacon_at(values, declared, i)
+            if derivatives:
+                self._jacobians.append(self._differentiate(beacon, sensor, turn, position, i))
+            else:
+                self._add_error(stacked(predict(beacon, sensor, turn, position)), i)
+
+    def _add_error(self, value: Array, i: int) -> None:
+        error = (value - self.data.measured[:, [i]])[..., None]
+        self._errors.append((self.data.root[:, [i]] @ error)[:, 0, :, 0])
+
+    def _differentiate(
+        self, beacon: Beacon, sensor: Magnetometer, turn: Array, position: Array, i: int
+    ) -> list[Array]:
+        seen = observe(beacon, sensor, turn, position)
+        self._add_error(stacked(seen.phasor_sensor), i)
+        root = self.data.root[:, i]
+        blocks = (seen.platform_pose, seen.beacon_pose, seen.log_moments, seen.matrix)
+        return [root @ np.concatenate([b[:, 0].real, b[:, 0].imag], axis=1) for b in blocks]
+
+
+def _calibration_at(values: gtsam.Values, beacon: int) -> bytes:
+    parts = (values.atPose3(L(beacon)).matrix(), values.atVector(M(beacon)), values.atVector(S(0)))
+    return b"".join(part.tobytes() for part in parts)
+
+
+def _beacon_at(values: gtsam.Values, declared: Beacon, i: int) -> Beacon:
+    pose, sizes = values.atPose3(L(i)), np.exp(values.atVector(M(i)))
+    return replace(
+        declared,
+        world_from_beacon=pose.rotation().matrix(),
+        position_world=pose.translation(),
+        coils=tuple(
+            replace(coil, moment_beacon=size * coil.moment_beacon)
+            for coil, size in zip(declared.coils, sizes, strict=True)
+        ),
+    )
+
+
+def native_factor(model: BatchedModel, epoch: int, beacon: int) -> gtsam.CustomFactor:
+    """Return the factor of one beacon at one epoch; GTSAM does not check shapes, so this does."""
+
+    def error(
+        _factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None
+    ) -> Array:
+        residual, blocks = model.row(values, epoch, beacon, jacobians is not None)
+        if jacobians is not None:
+            shapes = tuple(block.shape for block in blocks)
+            if residual.shape != (6,) or shapes != tuple((6, k) for k in JACOBIAN_COLUMNS):
+                raise ValueError(f"factor of beacon {beacon} has blocks of shapes {shapes}")
+            for i, block in enumerate(blocks):
+                jacobians[i] = block
+        return residual
+
+    keys = [X(epoch), L(beacon), M(beacon), S(0)]
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6), keys, error)
+
+
+def native_graph(scene: Scene) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, gtsam.Ordering]:
+    """Return the same problem for GTSAM's optimizer: graph, start and ordering."""
+    site, epochs = scene.declared.site, len(scene.start)
+    diagonal = gtsam.noiseModel.Diagonal.Sigmas
+    graph = inertial_graph(scene.preintegrated, site.platform.imu)
+    values = gtsam.Values(initial_estimate(scene.start, scene.declared).values)
+    ordering = nested_dissection(epochs, None)
+    for i, beacon in enumerate(site.beacons):
+        pose = gtsam.Pose3(gtsam.Rot3(beacon.world_from_beacon), beacon.position_world)
+        values.insert(L(i), pose)
+        values.insert(M(i), np.zeros(2))
+        sigma = beacon.sigma
+        graph.add(gtsam.PoseRotationPrior3D(L(i), pose, diagonal(sigma.rotation_beacon)))
+        graph.add(gtsam.PoseTranslationPrior3D(L(i), pose, diagonal(sigma.position_world)))
+        graph.addPriorVector(M(i), np.zeros(2), diagonal(sigma.log_moment))
+        ordering.push_back(L(i))
+        ordering.push_back(M(i))
+    sensor = site.platform.magnetometer
+    values.insert(S(0), sensor.matrix.ravel())
+    graph.addPriorVector(S(0), sensor.matrix.ravel(), diagonal(sensor.sigma.matrix.ravel()))
+    ordering.push_back(S(0))
+    model = BatchedModel(scene)
+    for epoch in range(epochs):
+        for i in range(BEACONS):
+            graph.add(native_factor(model, epoch, i))
+    return graph, values, ordering
+
+
+def run_native(scene: Scene) -> dict[str, float]:
+    """Run GTSAM's optimizer to convergence, telling each iteration; return its figures."""
+    (graph, values, ordering), build_seconds = timed(partial(native_graph, scene))
+    started = time.process_time()
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, ordering)
+    cost, seconds = optimizer.error(), 0.0
+    say(f"native: {len(scene.start)} epochs, start, cost {cost:.6g}")
+    for _ in range(NATIVE_ITERATIONS):
+        optimizer.iterate()
+        before, cost = cost, optimizer.error()
+        seconds = time.process_time() - started
+        say(f"native: iteration {optimizer.iterations()}, cost {cost:.9g}, {seconds:.1f} s")
+        if before - cost <= TOLERANCE * (1.0 + cost):
+            break
+    return {
+        "native_epochs": len(scene.start),
+        "native_s": seconds,
+        "native_iterations": optimizer.iterations(),
+        "native_s_per_iteration": seconds / optimizer.iterations(),
+        "native_build_s": build_seconds,
+        "native_cost": cost,
+    }
+
+
+def say(text: str) -> None:
+    """Tell the progress, apart from the result."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def compare(native_epochs: int, long_epochs: int, seed: int) -> dict[str, float]:
+    """Run everything; return the figures by name."""
+    scene = make_scene(EPOCHS, seed)
+    short = run_ours(scene, repeats=3)
+    _, marginal_seconds = timed(partial(marginals, short.problem, short.found.estimate))
+    same = native_epochs == EPOCHS
+    rival_scene = scene if same else make_scene(native_epochs, seed)
+    rival = short if same else run_ours(rival_scene, repeats=3)
+    native = run_native(rival_scene)
+    rival.again()
+    long = run_ours(make_scene(long_epochs, seed), repeats=2)
+    short.again()
+    figures = {**short.figures("ours"), **native, **long.figures("long")}
+    figures["marginals_s"] = marginal_seconds
+    figures["marginals_us_per_epoch"] = 1e6 * marginal_seconds / EPOCHS
+    figures["ours_at_native_epochs_s"] = rival.seconds
+    figures["speedup"] = native["native_s"] / rival.seconds
+    figures["cost_difference"] = abs(rival.found.cost / native["native_cost"] - 1.0)
+    each = [figures[f"{name}_us_per_epoch_iteration"] for name in ("long", "ours")]
+    figures["growth"] = each[0] / each[1]
+    return figures
+
+
+def main() -> int:
+    """Print the figures and what was wanted of them; a benchmark reports, it does not fail."""
+    parser = argparse.ArgumentParser(description="Time the batch smoother.")
+    parser.add_argument(
+        "--native-epochs", type=int, default=EPOCHS, help="fewer: a quicker look, smaller speedup"
+    )
+    parser.add_argument("--long-epochs", type=int, default=40_000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--json", action="store_true", help="end with one line of JSON")
+    chosen = parser.parse_args()
+    figures = compare(chosen.native_epochs, chosen.long_epochs, chosen.seed)
+    for name, value in figures.items():
+        print(f"{name:<30}{value:>16.6g}")
+    for name, wanted in AT_LEAST.items():
+        print(f"{name} at least {wanted:g}: {'met' if figures[name] >= wanted else 'MISSED'}")
+    for name, wanted in AT_MOST.items():
+        print(f"{name} at most {wanted:g}: {'met' if figures[name] <= wanted else 'MISSED'}")
+    if chosen.json:
+        print(json.dumps(figures))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
