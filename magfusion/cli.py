@@ -1,27 +1,28 @@
 """The face: one command a job, no logic."""
 
+import errno
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from enum import StrEnum
+from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NoReturn
 
-import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from magfusion.demo import run_demo
 from magfusion.errors import EstimationError, InputError
 from magfusion.fusion.batch import SmootherSettings
+from magfusion.job import Job, read_job
+from magfusion.options import box_option, check_simulation, groups_option, topics_option
 from magfusion.parameters import GROUPS
 from magfusion.pipeline import (
-    Job,
     Report,
-    read_job,
     run_demodulate,
     run_evaluate,
     run_fix,
@@ -30,14 +31,14 @@ from magfusion.pipeline import (
 )
 from magfusion.receiver.windows import LockinSettings, default_settings
 from magfusion.report import Figures
-from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.screen import show as show_figures
+from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.log import SimulationConfig
 from magfusion.site_file import load_site
 from magfusion.view import open_viewer
 
 app = typer.Typer(
     help="Navigation from magnetic beacons and inertial sensors where there is no GNSS.",
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
 )
@@ -86,6 +87,14 @@ Step = Annotated[float | None, typer.Option(help="Distance of windows, s; defaul
 MainsHz = Annotated[float, typer.Option(help="Mains frequency, Hz; 0 for none.")]
 Start = Annotated[float | None, typer.Option(help="Use the log from here, s since its epoch.")]
 End = Annotated[float | None, typer.Option(help="Use the log up to here, s since its epoch.")]
+TopicNames = Annotated[
+    str | None,
+    typer.Option(
+        "--topics",
+        metavar="ROLE=NAME,...",
+        help="Topics of a bag that has several, e.g. imu=/imu/data,magnetometer=/mag,truth=/odom.",
+    ),
+]
 
 
 @contextmanager
@@ -121,6 +130,7 @@ def _job(
     mains_hz: float,
     start: float | None,
     end: float | None,
+    topics: str | None,
 ) -> Job:
     for name, value in (("--window", window), ("--step", step)):
         if value is not None and not 0.0 < value < 60.0:
@@ -129,43 +139,35 @@ def _job(
         raise InputError(f"--mains-hz must lie between 0 and 1000 Hz; got {mains_hz:g}")
     if start is not None and end is not None and not start < end:
         raise InputError(f"--start must come before --end; got {start:g} and {end:g}")
-    job = Job(log, site, output, None, start, end)
+    job = Job(log, site, output, None, start, end, topics_option(topics))
     if window is None and step is None and mains_hz == 50.0:
         return job
     chosen = default_settings(read_job(job)[1], mains_hz)
     length = chosen.window if window is None else window
     lockin = LockinSettings(length, length / 2.0 if step is None else step, mains_hz)
-    return Job(log, site, output, lockin, start, end)
-
-
-def _groups(estimate: str | None) -> tuple[str, ...] | None:
-    if estimate is None:
-        return None
-    chosen = tuple(part.strip() for part in estimate.split(",") if part.strip())
-    if chosen == ("none",):
-        return ()
-    unknown = [group for group in chosen if group not in GROUPS]
-    if unknown or not chosen:
-        raise InputError(
-            f"--estimate {estimate!r}: {', '.join(unknown) or 'nothing'} is not a calibration "
-            f"group; choose from {', '.join(GROUPS)}, or none"
-        )
-    return chosen
+    return replace(job, lockin=lockin)
 
 
 def _show(figures: Figures, output: Path | None, as_json: bool) -> None:
-    table = Table(show_header=False, box=None)
-    for key, value in figures.items():
-        if isinstance(value, list):
-            table.add_row(key, f"{len(value)} parameters" if value else "none")
-        elif "." not in key:
-            table.add_row(key, f"{value:.4g}" if isinstance(value, float) else str(value))
-    console = Console()
-    console.print(table)
-    if output is not None:
-        console.print(f"results in {output}", soft_wrap=True, highlight=False)
+    show_figures(figures, output)
     if as_json:
         sys.stdout.write(json.dumps(figures, default=float) + "\n")
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        sys.stdout.write(f"magfusion {version('magfusion')}\n")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool,
+        typer.Option("--version", is_eager=True, callback=_print_version, help="Tell the version."),
+    ] = False,
+) -> None:
+    """Navigate by magnetic beacons and inertial sensors where there is no GNSS."""
 
 
 @app.command()
@@ -190,14 +192,15 @@ def smooth(
     mains_hz: MainsHz = 50.0,
     start: Start = None,
     end: End = None,
+    topics: TopicNames = None,
     as_json: AsJson = False,
 ) -> None:
     """Smooth a log into the best trajectory, with the calibration in the same solution."""
-    job = _job(log, site, output, window, step, mains_hz, start, end)
+    job = _job(log, site, output, window, step, mains_hz, start, end, topics)
     settings = SmootherSettings(
         coupling=coupling.value,
         loss=None if robust is Robust.NONE else robust.value,
-        estimate=_groups(estimate),
+        estimate=groups_option(estimate),
     )
     with progress() as report:
         figures = run_smooth(job, settings, imu_rate=rate is Rate.IMU, report=report)
@@ -214,10 +217,11 @@ def fix(
     mains_hz: MainsHz = 50.0,
     start: Start = None,
     end: End = None,
+    topics: TopicNames = None,
     as_json: AsJson = False,
 ) -> None:
     """Fix the pose at every epoch on its own, with every hypothesis that survives."""
-    job = _job(log, site, output, window, step, mains_hz, start, end)
+    job = _job(log, site, output, window, step, mains_hz, start, end, topics)
     with progress() as report:
         figures = run_fix(job, report=report)
     _show(figures, output, as_json)
@@ -233,10 +237,11 @@ def demodulate(
     mains_hz: MainsHz = 50.0,
     start: Start = None,
     end: End = None,
+    topics: TopicNames = None,
     as_json: AsJson = False,
 ) -> None:
     """Turn a log's waveform into phasors: a log that every other command reads."""
-    job = _job(log, site, output, window, step, mains_hz, start, end)
+    job = _job(log, site, output, window, step, mains_hz, start, end, topics)
     with progress() as report:
         figures = run_demodulate(job, report=report)
     _show(figures, output, as_json)
@@ -261,40 +266,24 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Simulate a log, with truth, in the files a user has."""
-    if not 1.0 <= duration <= 1e6:
-        raise InputError(f"--duration must lie between 1 and 1000000 s; got {duration:g}")
-    if seed < 0:
-        raise InputError(f"--seed must not be negative; got {seed}")
+    check_simulation(duration, 1.0, 1e6, seed)
     declared = demo_site() if site is None else load_site(site)
     config = SimulationConfig(
-        box_world=_box(box), duration=duration, motion=motion.value, perturb=perturb
+        box_world=box_option(box), duration=duration, motion=motion.value, perturb=perturb
     )
     figures = run_simulate(declared, config, output, seed)
     _show(figures, output, as_json)
-
-
-def _box(text: str | None) -> np.ndarray:
-    if text is None:
-        return DEMO_BOX_WORLD
-    try:
-        box = np.array([float(part) for part in text.split(",")]).reshape(3, 2).T
-    except ValueError:
-        raise InputError(
-            f"--box {text!r}: six numbers in metres are needed, x, y, z limits"
-        ) from None
-    if not np.all(np.isfinite(box)) or np.any(box[0] >= box[1]):
-        raise InputError(f"--box {text!r}: each lower limit must be below its upper limit")
-    return box
 
 
 @app.command()
 def evaluate(
     estimate: Annotated[Path, typer.Argument(help="Result directory, TUM file or table.")],
     truth: Annotated[Path, typer.Argument(help="Log with truth, TUM file or table.")],
+    topics: TopicNames = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare a trajectory with a truth: ATE, RPE and attitude, absolute and aligned."""
-    _show(run_evaluate(estimate, truth), None, as_json)
+    _show(run_evaluate(estimate, truth, topics_option(topics)), None, as_json)
 
 
 @app.command()
@@ -317,8 +306,7 @@ def demo(
     as_json: AsJson = False,
 ) -> None:
     """Simulate a two-minute walk among four beacons, smooth it, and show the result."""
-    if not 5.0 <= duration <= 3600.0:
-        raise InputError(f"--duration must lie between 5 and 3600 s; got {duration:g}")
+    check_simulation(duration, 5.0, 3600.0, seed)
     with progress() as report:
         figures = run_demo(output, seed, duration, report)
     _show(figures, output, as_json)
@@ -327,13 +315,35 @@ def demo(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line: exit 2 with one sentence for bad input, 1 for a failed estimator."""
-    command: Callable[..., object] = app
+    """Run the command line.
+
+    Exits with 0 and the result; with 2 and one sentence for bad input or usage; with 1 and one
+    sentence for an estimator that failed; with 130 where the user interrupted.
+    """
+    given = sys.argv[1:] if arguments is None else arguments
     try:
-        command(args=arguments)
+        status = app(args=given or ["--help"], prog_name="magfusion", standalone_mode=False)
+    except typer.TyperException as error:
+        context = getattr(error, "ctx", None)
+        command = "magfusion" if context is None else context.command_path
+        _fail(2, f"{error.format_message().rstrip('.')}; see {command} --help")
     except InputError as error:
-        sys.stderr.write(f"magfusion: {error}\n")
-        raise SystemExit(2) from None
+        _fail(2, str(error))
     except EstimationError as error:
-        sys.stderr.write(f"magfusion: {error}\n")
-        raise SystemExit(1) from None
+        _fail(1, str(error))
+    except OSError as error:
+        _fail(2, _told(error))
+    except MemoryError:
+        _fail(2, "the memory does not suffice; use a shorter part, by --start and --end")
+    raise SystemExit(status)
+
+
+def _told(error: OSError) -> str:
+    place = error.filename if error.filename is not None else "a file"
+    remedy = "free some space" if error.errno == errno.ENOSPC else "allow it, or give another path"
+    return f"{place}: cannot be read or written ({error.strerror or error}); {remedy}"
+
+
+def _fail(status: int, sentence: str) -> NoReturn:
+    sys.stderr.write(f"magfusion: {' '.join(sentence.split())}\n")
+    raise SystemExit(status) from None

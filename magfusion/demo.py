@@ -4,7 +4,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from magfusion.fusion.batch import SmootherSettings
-from magfusion.pipeline import Job, Report, run_simulate, run_smooth
+from magfusion.job import Job
+from magfusion.pipeline import Report, run_simulate, run_smooth
 from magfusion.report import Figures
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig

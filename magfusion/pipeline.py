@@ -3,8 +3,7 @@
 import json
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +14,12 @@ from magfusion.fixes.fix import Fixes
 from magfusion.fusion.batch import Smoothed, SmootherSettings, smooth
 from magfusion.fusion.inertial import motion_at
 from magfusion.fusion.source import first_fixes, phasors
+from magfusion.job import Job, claim, named, read_job
 from magfusion.parameters import initial_calibration
-from magfusion.receiver.windows import LockinSettings
-from magfusion.records.atomic import whole_directory
-from magfusion.records.fields import order_channels
 from magfusion.records.fix_table import write_hypotheses
 from magfusion.records.log import write_log
 from magfusion.records.open import open_log
+from magfusion.records.rosbag import BAG_SUFFIXES, Topics
 from magfusion.records.samples import Log
 from magfusion.records.trajectory_table import read_trajectory, write_trajectory
 from magfusion.records.tum import read_tum, write_tum
@@ -35,11 +33,12 @@ from magfusion.report import (
 )
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.site import Site
-from magfusion.site_file import load_site, save_site
+from magfusion.site_file import save_site
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array
 from magfusion.view import write_recording
 
+DIVERGED = 3.0  # whitened residual, one where noise and model are as declared
 Report = Callable[[str, int, int], None]
 
 
@@ -47,73 +46,20 @@ def quiet(_stage: str, _done: int, _total: int) -> None:
     """Tell nobody of the progress."""
 
 
-@dataclass(frozen=True)
-class Job:
-    """What every job on a log needs.
-
-    Parameters
-    ----------
-    log_path : Path
-    site_path : Path, optional
-        None takes ``site.yaml`` in the log's directory.
-    output : Path
-        Directory of the results; an earlier result there is replaced.
-    lockin : LockinSettings, optional
-    start, end : float, optional
-        Part of the log to use, seconds since its epoch.
-    """
-
-    log_path: Path
-    site_path: Path | None
-    output: Path
-    lockin: LockinSettings | None = None
-    start: float | None = None
-    end: float | None = None
-
-
-def _is_result(path: Path) -> bool:
-    return (path / "report.json").is_file()
-
-
-def result_directory(output: Path) -> AbstractContextManager[Path]:
-    """Yield a temporary directory that becomes ``output`` only if nothing fails.
-
-    Raises
-    ------
-    InputError
-        Where ``output`` exists and is not an earlier result.
-    """
-    return whole_directory(output, replaces=_is_result)
-
-
-def read_job(job: Job) -> tuple[Log, Site]:
-    """Read the log and the site of a job, and see that they belong together.
-
-    Raises
-    ------
-    InputError
-        For anything in either file that a user must mend.
-    """
-    if job.site_path is None and not (job.log_path / "site.yaml").is_file():
-        # A log that is not there is the nearer cause.
-        open_log(job.log_path, job.start, job.end)
-        raise InputError(
-            f"{job.log_path}: holds no site.yaml; name the site's file with --site SITE.yaml"
-        )
-    site = load_site(job.log_path / "site.yaml" if job.site_path is None else job.site_path)
-    log = open_log(job.log_path, job.start, job.end)
-    if log.fields is not None:
-        log = replace(log, fields=order_channels(log.fields, site))
-    return log, site
-
-
 def _write_report(directory: Path, figures: Figures) -> None:
     text = json.dumps(figures, indent=1, allow_nan=False, default=float)
     (directory / "report.json").write_text(text + "\n")
 
 
-def _errors(estimate: Trajectory, log: Log) -> TrajectoryErrors | None:
-    return None if log.truth is None else trajectory_errors(estimate, log.truth)
+def _compared(estimate: Trajectory, log: Log) -> tuple[TrajectoryErrors | None, Figures]:
+    """Return the errors against the log's truth, if it has one there, and their figures."""
+    if log.truth is None:
+        return None, {}
+    try:
+        errors = trajectory_errors(estimate, log.truth)
+    except InputError as error:  # a truth elsewhere does not make the trajectory worthless
+        return None, {"not_compared": str(error)}
+    return errors, error_figures(errors)
 
 
 def _innovations(result: Smoothed) -> dict[str, tuple[Array, Array]]:
@@ -176,29 +122,34 @@ def run_smooth(
     InputError, EstimationError
         In the latter case the single-epoch fixes have been saved in the output directory.
     """
+    claimed = claim(job.output, "smooth", "fix")
     log, site = read_job(job)
     began = time.perf_counter()
     settings = replace(settings, lockin=job.lockin)
     try:
-        result = smooth(log, site, settings, report)
-    except EstimationError as error:
-        _save_fixes_instead(job, log, site, error)
+        with named(job.log_path):
+            result = smooth(log, site, settings, report)
+        _refuse_divergence(result)
+    except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
+        reason = _reason(error)
+        with claimed as directory:
+            _save_fixes_instead(directory, job, log, site, reason)
         raise EstimationError(
-            f"{error}; the single-epoch fixes were saved in {job.output}"
+            f"{job.log_path}: {reason}; the single-epoch fixes were saved in {job.output}"
         ) from error
     figures: Figures = {"job": "smooth", "log": log.name, "coupling": settings.coupling}
     figures |= smoothed_figures(result)
     figures["elapsed_s"] = time.perf_counter() - began
-    errors = _errors(result.states, log)
+    errors, compared = _compared(result.states, log)
+    figures |= compared
     if errors is not None:
-        figures |= error_figures(errors)
         figures |= _held_figures(log, site, settings, result)
     told = findings(result.declared, result.calibration, result.blocks, result.calibration_cov)
     refined = refined_site(
         result.calibration, result.blocks, result.calibration_cov, told, log.name
     )
     written = at_imu_rate(result, log) if imu_rate else result.states
-    with result_directory(job.output) as directory:
+    with claimed as directory:
         write_tum(written, directory / "trajectory.tum", log.epoch_ns)
         write_trajectory(written, directory / "trajectory.parquet", log.epoch_ns)
         save_site(refined, directory / "site.yaml")
@@ -219,43 +170,65 @@ def _held_figures(log: Log, site: Site, settings: SmootherSettings, result: Smoo
     kept = ("phase", "time-offset")
     if all(block.group in kept for block in result.blocks):
         return {}
-    held = smooth(log, site, replace(settings, estimate=kept))
+    try:
+        held = smooth(log, site, replace(settings, estimate=kept))
+    except RuntimeError as error:
+        return {"held_failed": _reason(error)}
     assert log.truth is not None
     return error_figures(trajectory_errors(held.states, log.truth), prefix="held_")
 
 
-def _save_fixes_instead(job: Job, log: Log, site: Site, reason: EstimationError) -> None:
+def _refuse_divergence(result: Smoothed) -> None:
+    """Refuse a result that neither converged nor explains the fields."""
+    residual = (
+        float(np.sqrt(np.nanmean(result.residual**2)))
+        if np.isfinite(result.residual).any()
+        else 0.0
+    )
+    if not result.converged and residual > DIVERGED:
+        raise EstimationError(
+            f"the smoother did not converge (residual {residual:.3g} where about 1 is expected):"
+            " add a beacon or a coil, or check the survey"
+        )
+
+
+def _reason(error: RuntimeError) -> str:
+    if isinstance(error, EstimationError):
+        return str(error)
+    if "Indeterminate" in str(error):
+        return "the measurements leave a direction of the motion open: add a beacon or a coil"
+    raise error
+
+
+def _save_fixes_instead(directory: Path, job: Job, log: Log, site: Site, reason: str) -> None:
     samples, dropped = phasors(log, site, job.lockin)
-    fixes = first_fixes(samples, log, initial_calibration(site, 0.0))
-    figures: Figures = {"job": "smooth", "log": log.name, "failed": str(reason)}
+    fixes = first_fixes(samples, log, initial_calibration(site, float(np.mean(samples.time))))
+    figures: Figures = {"job": "smooth", "log": log.name, "failed": reason}
     figures |= fix_figures(fixes) | dropped_figures(dropped)
-    _write_fix_result(job.output, log, site, fixes, figures, _errors(fixes.best(), log))
+    _write_fix_result(directory, log, site, fixes, figures)
 
 
 def _write_fix_result(
-    output: Path,
-    log: Log,
-    site: Site,
-    fixes: Fixes,
-    figures: Figures,
-    errors: TrajectoryErrors | None,
-) -> None:
+    directory: Path, log: Log, site: Site, fixes: Fixes, figures: Figures
+) -> Figures:
+    """Write the fixes; return the figures with the errors against the truth."""
     best = fixes.best()
-    with result_directory(output) as directory:
-        write_tum(best, directory / "trajectory.tum", log.epoch_ns)
-        write_trajectory(best, directory / "trajectory.parquet", log.epoch_ns)
-        write_hypotheses(
-            directory / "fixes.parquet",
-            log.epoch_ns,
-            fixes.time,
-            fixes.world_from_body,
-            fixes.position_world,
-            fixes.cost,
-            fixes.probability,
-            fixes.determined,
-        )
-        write_recording(directory / "run.rrd", site, best, truth=log.truth, errors=errors)
-        _write_report(directory, figures)
+    errors, compared = _compared(best, log)
+    write_tum(best, directory / "trajectory.tum", log.epoch_ns)
+    write_trajectory(best, directory / "trajectory.parquet", log.epoch_ns)
+    write_hypotheses(
+        directory / "fixes.parquet",
+        log.epoch_ns,
+        fixes.time,
+        fixes.world_from_body,
+        fixes.position_world,
+        fixes.cost,
+        fixes.probability,
+        fixes.determined,
+    )
+    write_recording(directory / "run.rrd", site, best, truth=log.truth, errors=errors)
+    _write_report(directory, figures | compared)
+    return figures | compared
 
 
 def run_fix(job: Job, *, report: Report = quiet) -> Figures:
@@ -265,21 +238,20 @@ def run_fix(job: Job, *, report: Report = quiet) -> Figures:
     ------
     InputError, EstimationError
     """
+    claimed = claim(job.output, "smooth", "fix")
     log, site = read_job(job)
     began = time.perf_counter()
     report("demodulating", 0, 2)
-    samples, dropped = phasors(log, site, job.lockin)
+    with named(job.log_path):
+        samples, dropped = phasors(log, site, job.lockin)
     report("fixing", 1, 2)
     fixes = first_fixes(samples, log, initial_calibration(site, float(np.mean(samples.time))))
     report("done", 2, 2)
     figures: Figures = {"job": "fix", "log": log.name}
     figures |= fix_figures(fixes) | dropped_figures(dropped)
     figures["elapsed_s"] = time.perf_counter() - began
-    errors = _errors(fixes.best(), log)
-    if errors is not None:
-        figures |= error_figures(errors)
-    _write_fix_result(job.output, log, site, fixes, figures, errors)
-    return figures
+    with claimed as directory:
+        return _write_fix_result(directory, log, site, fixes, figures)
 
 
 def run_demodulate(job: Job, *, report: Report = quiet) -> Figures:
@@ -290,11 +262,15 @@ def run_demodulate(job: Job, *, report: Report = quiet) -> Figures:
     InputError
         Where the log has no waveform, or no window of it is usable.
     """
+    claimed = claim(job.output, "demodulate")
     log, site = read_job(job)
     if log.waveform is None:
-        raise InputError(f"{job.log_path}: holds no magnetometer stream to demodulate")
+        raise InputError(
+            f"{job.log_path}: holds no magnetometer.parquet to demodulate; give the raw log"
+        )
     report("demodulating", 0, 1)
-    samples, dropped = phasors(log, site, job.lockin)
+    with named(job.log_path):
+        samples, dropped = phasors(log, site, job.lockin)
     report("done", 1, 1)
     sigma = np.sqrt(np.trace(samples.phasor_cov, axis1=2, axis2=3) / 3.0)
     figures: Figures = {
@@ -306,7 +282,7 @@ def run_demodulate(job: Job, *, report: Report = quiet) -> Figures:
     for c, (beacon, tone) in enumerate(samples.channels):
         figures[f"sigma_{beacon}_{tone}_t"] = float(np.median(sigma[:, c]))
     figures |= dropped_figures(dropped)
-    with result_directory(job.output) as directory:
+    with claimed as directory:
         write_log(replace(log, waveform=None, fields=samples), directory)
         save_site(site, directory / "site.yaml")
         _write_report(directory, figures)
@@ -329,6 +305,7 @@ def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) 
     InputError
         Where ``output`` is in the way, or the configuration does not fit the site.
     """
+    claimed = claim(output, "simulate")
     rng = np.random.default_rng(seed)
     imu = site.platform.imu
     if config.time_offset is None and config.perturb:
@@ -343,7 +320,7 @@ def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) 
         "imu_samples": len(simulated.log.imu),
         "time_offset_s": simulated.time_offset,
     }
-    with result_directory(output) as directory:
+    with claimed as directory:
         write_log(simulated.log, directory)
         save_site(site, directory / "site.yaml")
         save_site(simulated.true_site, directory / "true_site.yaml")
@@ -351,38 +328,52 @@ def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) 
     return figures
 
 
-def read_estimate(path: Path, epoch_ns: int) -> Trajectory:
-    """Read a trajectory from a result's directory, a TUM file or a Parquet table.
+def read_estimate(path: Path, epoch_ns: int = 0) -> Trajectory:
+    """Read a trajectory from a result's directory, a TUM file, or a table (Parquet, CSV).
 
     Raises
     ------
     InputError
         Where there is none.
     """
-    if path.is_dir() and (path / "trajectory.parquet").is_file():
-        return read_trajectory(path / "trajectory.parquet", epoch_ns)
     if path.is_dir():
-        log = open_log(path)
-        if log.truth is None:
-            raise InputError(f"{path}: holds neither a trajectory nor a truth; name another")
-        return log.truth
+        if not (path / "trajectory.parquet").is_file():
+            raise InputError(f"{path}: holds no trajectory.parquet; give the result of a job")
+        return read_trajectory(path / "trajectory.parquet", epoch_ns)
     if path.suffix in (".parquet", ".csv"):
         return read_trajectory(path, epoch_ns)
-    found = read_tum(path)
-    return replace(found, time=found.time - epoch_ns * 1e-9)
+    return read_tum(path, epoch_ns)
 
 
-def run_evaluate(estimate: Path, truth: Path) -> Figures:
+def _read_truth(path: Path, topics: Topics | None) -> tuple[Trajectory, int]:
+    """Return the truth, and the zero of the clock (ns) from which its times count."""
+    is_result = (path / "trajectory.parquet").is_file()
+    if is_result or not (path.is_dir() or path.suffix in BAG_SUFFIXES):
+        return read_estimate(path), 0
+    log = open_log(path, topics=topics)
+    if log.truth is None:
+        raise InputError(f"{path}: holds no truth; name a log, TUM file or table that does")
+    return log.truth, log.epoch_ns
+
+
+def run_evaluate(estimate: Path, truth: Path, topics: Topics | None = None) -> Figures:
     """Compare a trajectory with a truth.
+
+    Parameters
+    ----------
+    estimate : Path
+        As `read_estimate`.
+    truth : Path
+        The same, or a log with truth.
+    topics : Topics, optional
+        Of a truth that is a bag.
 
     Raises
     ------
     InputError
+        Where one of the two cannot be read, or they do not overlap in time.
     """
-    log = (
-        open_log(truth) if truth.is_dir() and not (truth / "trajectory.parquet").is_file() else None
-    )
-    epoch_ns = 0 if log is None else log.epoch_ns
-    true = read_estimate(truth, epoch_ns)
+    true, epoch_ns = _read_truth(truth, topics)
     found = read_estimate(estimate, epoch_ns)
-    return {"job": "evaluate"} | error_figures(trajectory_errors(found, true))
+    with named(f"{estimate} against {truth}"):
+        return {"job": "evaluate"} | error_figures(trajectory_errors(found, true))

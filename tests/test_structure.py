@@ -19,8 +19,8 @@ FLOORS = (
     {"parameters", "weights"},
     {"refinement"},
     {"receiver", "simulation", "calibration", "fusion", "fixes", "evaluation"},
-    {"report"},
-    {"pipeline"},
+    {"report", "job"},
+    {"pipeline", "screen", "options"},
     {"demo"},
     {"cli"},
 )

@@ -137,7 +137,7 @@ def _chosen(
     if topic is None and len(names) > 1:
         raise InputError(
             f"{path}: has several topics for {role}: {', '.join(names)};"
-            f" name one of them in Topics({role}=...), or keep only one in the bag."
+            f" name one by --topics {role}=... (in Python, by Topics), or keep one in the bag."
         )
     if topic is not None and topic not in names:
         found = ", ".join(names) or "none"

@@ -1,0 +1,130 @@
+"""What a job reads, and where it may write."""
+
+import json
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from magfusion.errors import InputError
+from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz
+from magfusion.records.atomic import refuse_in_the_way, whole_directory
+from magfusion.records.fields import order_channels
+from magfusion.records.open import open_log
+from magfusion.records.rosbag import Topics
+from magfusion.records.samples import Log
+from magfusion.site import Site
+from magfusion.site_file import load_site
+
+
+@dataclass(frozen=True)
+class Job:
+    """What every job on a log needs.
+
+    Parameters
+    ----------
+    log_path : Path
+    site_path : Path, optional
+        None takes ``site.yaml`` in the log's directory.
+    output : Path
+        Directory of the results; an earlier result there is replaced.
+    lockin : LockinSettings, optional
+    start, end : float, optional
+        Part of the log to use, seconds since its epoch.
+    topics : Topics, optional
+        Of a bag that has several of one type.
+    """
+
+    log_path: Path
+    site_path: Path | None
+    output: Path
+    lockin: LockinSettings | None = None
+    start: float | None = None
+    end: float | None = None
+    topics: Topics | None = None
+
+
+_RESULT = {"trajectory.tum", "trajectory.parquet", "site.yaml", "run.rrd", "report.json"}
+_TABLES = {"imu.parquet", "magnetometer.parquet", "fields.parquet", "truth.parquet"}
+_LOG = {"log.yaml", "site.yaml", "true_site.yaml", "report.json", *_TABLES}
+_WRITTEN = {
+    "smooth": _RESULT | {"fixes.parquet"},
+    "fix": _RESULT | {"fixes.parquet"},
+    "simulate": _LOG,
+    "demodulate": _LOG,
+}
+
+
+def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
+    """Tell whether a directory holds nothing but an earlier result of these jobs."""
+    try:
+        report = json.loads((path / "report.json").read_text(encoding="utf-8"))
+        job = report["job"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return job in kinds and {entry.name for entry in path.iterdir()} <= _WRITTEN[job]
+
+
+def claim(output: Path, *kinds: str) -> AbstractContextManager[Path]:
+    """Return a context whose directory becomes ``output`` only if nothing fails.
+
+    What is in the way is refused at once, before the work is done.
+
+    Raises
+    ------
+    InputError
+        Where ``output`` holds anything but an earlier result of these jobs.
+    """
+
+    def replaces(path: Path) -> bool:
+        return _may_be_replaced(path, kinds)
+
+    refuse_in_the_way(output.resolve(), replaces)
+    return whole_directory(output, replaces)
+
+
+@contextmanager
+def named(place: Path | str) -> Iterator[None]:
+    """Name the file in the refusals of what knows only its content."""
+    try:
+        yield
+    except InputError as error:
+        if str(place) in str(error):
+            raise
+        raise InputError(f"{place}: {error}") from error
+
+
+def read_job(job: Job) -> tuple[Log, Site]:
+    """Read the log and the site of a job, and see that they belong together.
+
+    Raises
+    ------
+    InputError
+        For anything in either file that a user must mend.
+    """
+    if job.site_path is None and not (job.log_path / "site.yaml").is_file():
+        # A log that is not there is the nearer cause.
+        _open(job)
+        raise InputError(
+            f"{job.log_path}: holds no site.yaml; name the site's file with --site SITE.yaml"
+        )
+    site_path = job.log_path / "site.yaml" if job.site_path is None else job.site_path
+    site = load_site(site_path)
+    log = _open(job)
+    if log.waveform is not None:
+        with named(site_path):
+            channel_frequencies_hz(site)
+    if log.fields is not None:
+        with named(job.log_path):
+            log = replace(log, fields=order_channels(log.fields, site))
+    return log, site
+
+
+def _open(job: Job) -> Log:
+    log = open_log(job.log_path, job.start, job.end, job.topics)
+    if log.waveform is None and log.fields is None:
+        raise InputError(
+            f"{job.log_path}: holds no magnetometer samples in the part to use; record the"
+            " magnetometer beside the inertial sensor"
+        )
+    return log
