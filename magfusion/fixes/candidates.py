@@ -5,10 +5,12 @@ gives its range exactly, and its direction up to the mirrors of the dipole.  Att
 Wahba's problem over all phasors at each position.
 """
 
+from itertools import combinations, product
+
 import numpy as np
 
 from magfusion.parameters import Calibration, predict_channels
-from magfusion.site import Beacon
+from magfusion.site import Beacon, Site
 from magfusion.units import MU0_OVER_4PI, Array, BoolArray, ComplexArray
 
 AZIMUTHS = 16  # of the cone that an unknown drive phase leaves
@@ -32,6 +34,25 @@ def beacon_directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Arra
     distance : ndarray, shape (n, candidates)
         (m)
     """
+    if beacon.synchronised or len(beacon.tones) == 1:
+        return _directions(beacon, phasor)
+    found = [_directions(beacon, told) for told in _polarities(beacon, phasor)]
+    return np.concatenate([f[0] for f in found], 1), np.concatenate([f[1] for f in found], 1)
+
+
+def _polarities(beacon: Beacon, phasor: ComplexArray) -> list[ComplexArray]:
+    """Return phasors with each tone's phase undone, once for every polarity against the first tone.
+
+    Where one coil alone drives a tone its phasor is a real vector but for the phase.
+    """
+    declared = np.angle(np.sum(beacon.excitation, axis=0))
+    lag = 0.5 * np.angle(np.sum(phasor**2, axis=-1)) - declared
+    undone = phasor * np.exp(-1j * lag)[..., None]
+    signs = product((1.0, -1.0), repeat=len(beacon.tones) - 1)
+    return [undone * np.array([1.0, *others])[:, None] for others in signs]
+
+
+def _directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Array]:
     drive = beacon.moments_beacon.T @ beacon.excitation  # (3, tones)
     moments = np.concatenate([drive.real, drive.imag], axis=1)
     measured = np.concatenate([phasor.real, phasor.imag], axis=1)  # (n, 2 tones, 3)
@@ -62,7 +83,7 @@ def _planar_directions(beacon: Beacon, power: Array, axes: Array, left: Array) -
     """
     sine_square = np.clip((power[:, 1] / np.maximum(power[:, 0], _TINY) - 1.0) / 3.0, 0.0, 1.0)
     sine, cosine = np.sqrt(sine_square)[:, None, None], np.sqrt(1.0 - sine_square)[:, None, None]
-    if beacon.synchronised:
+    if beacon.synchronised or len(beacon.tones) > 1:
         within = np.stack([axes[:, :, 1], -axes[:, :, 1]], axis=1)
     else:
         azimuth = 2.0 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
@@ -200,16 +221,12 @@ def attitudes(
     phase = np.zeros((*sensor_world.shape[:2], len(free)))
     if not np.any(free):
         return wahba(base), phase
-    # The ellipse's normal does not depend on the drive phase.
-    normals = [np.cross(b.real, b.imag) for b in (world, np.broadcast_to(measured, world.shape))]
-    sizes = [np.linalg.norm(v, axis=-1, keepdims=True) + _TINY for v in normals]
-    power = share * np.sum(np.abs(measured) ** 2, axis=-1)
-    aligned = base + np.einsum(
-        "nclx,ncly,ncl->ncxy",
-        normals[0] / sizes[0],
-        normals[1] / sizes[1],
-        np.broadcast_to(np.where(free, power, 0.0), sizes[0].shape[:-1]),
-    )
+    power = np.where(free, share * np.sum(np.abs(measured) ** 2, axis=-1), 0.0)
+    # The ellipse's normal does not depend on the drive phase; a flat ellipse has none.
+    normals = [_normal(b) for b in (world, np.broadcast_to(measured, world.shape))]
+    spread = np.broadcast_to(power, world.shape[:-1])
+    aligned = base + np.einsum("nclx,ncly,ncl->ncxy", *normals, spread)
+    aligned = aligned + _between_tones(calibration.site, world, measured, power)
     for _ in range(ALTERNATIONS):
         rotation = wahba(aligned)
         seen = world @ rotation
@@ -218,6 +235,36 @@ def attitudes(
         turned = world * np.exp(1j * phase)[..., None]
         aligned = base + _correlation(turned, measured, np.where(free, share, 0.0))
     return wahba(aligned), phase
+
+
+def _normal(phasor: ComplexArray) -> Array:
+    """Return the normal of each phasor's ellipse, of length one for a circle, zero for a line."""
+    power = 0.5 * np.sum(np.abs(phasor) ** 2, axis=-1, keepdims=True)
+    return np.asarray(np.cross(phasor.real, phasor.imag) / (power + _TINY))
+
+
+def _between_tones(site: Site, world: ComplexArray, measured: ComplexArray, power: Array) -> Array:
+    """Correlate the planes of tones of one coil each, which do not depend on the phases either."""
+    one_coil = np.concatenate([np.count_nonzero(b.excitation, axis=0) == 1 for b in site.beacons])
+    out = np.zeros((*world.shape[:2], 3, 3))
+    for pair in combinations(np.flatnonzero(one_coil & np.any(power > 0, axis=(0, 1))), 2):
+        ours, theirs = (_plane(_long_axis(p[..., list(pair), :])) for p in (world, measured))
+        weight = np.sqrt(np.prod(power[..., list(pair)], axis=-1))
+        out += weight[..., None, None] * ours[..., :, None] * theirs[..., None, :]
+    return out
+
+
+def _long_axis(phasor: ComplexArray) -> Array:
+    """Return the direction of the long axis of a phasor's ellipse, of either sign."""
+    turn = np.exp(-0.5j * np.angle(np.sum(phasor**2, axis=-1, keepdims=True)))
+    axis = np.real(phasor * turn)
+    return np.asarray(axis / (np.linalg.norm(axis, axis=-1, keepdims=True) + _TINY))
+
+
+def _plane(axes: Array) -> Array:
+    """Return the normal of two axes (..., 2, 3), whatever their signs; short where unsure."""
+    a, b = axes[..., 0, :], axes[..., 1, :]
+    return np.asarray(np.cross(a, b) * np.sum(a * b, axis=-1, keepdims=True))
 
 
 def _correlation(world: ComplexArray, measured: ComplexArray, weight: Array) -> Array:

@@ -24,7 +24,7 @@ CHUNK = 500  # epochs solved at once
 CANDIDATES = 10  # positions that get an attitude
 REFINED = 6  # of these, how many are refined
 HYPOTHESES = 4  # of these, how many are returned
-ITERATIONS = 25
+ITERATIONS = 100  # a bound; the few that creep along a valley need more than 25
 SAME_POSITION = 0.02  # m; two solutions closer than this and SAME_ROTATION are one
 SAME_ROTATION = 0.02  # rad
 
@@ -266,7 +266,9 @@ def _levenberg_marquardt(
         if len(active) == 0:
             break
         diagonal = np.einsum("mii->mi", normal[active])
-        floor = 1e-9 * np.max(diagonal, axis=1, keepdims=True)
+        largest = np.max(diagonal, axis=1, keepdims=True)
+        # An epoch without any channel has no information at all: it stays where it is.
+        floor = np.where(largest > 0.0, 1e-9 * largest, 1.0)
         added = damping[active, None] * np.maximum(diagonal, floor)
         damped = normal[active] + added[..., None] * np.eye(added.shape[1])
         step = -np.linalg.solve(damped, gradient[active][..., None])[..., 0]
@@ -335,7 +337,9 @@ def _covariance(information: Array) -> tuple[Array, BoolArray]:
     """Pose covariance with the phases marginalised; flat directions are wide, not infinite."""
     value, vector = np.linalg.eigh(information)
     largest = value[..., -1:]
-    open_direction = value < 1e-10 * largest
+    # The phase of a channel that is missing is open too, but is no direction of the pose.
+    in_pose = np.sum(vector[..., :6, :] ** 2, axis=-2) > 1e-6
+    open_direction = (value <= 1e-10 * largest) & in_pose
     safe = np.maximum(value, 1e-10 * largest + 1e-300)
     cov = (vector / safe[..., None, :]) @ np.swapaxes(vector, -1, -2)
     return cov[..., :6, :6], ~np.any(open_direction, axis=-1)
