@@ -12,6 +12,8 @@ from magfusion.records.samples import ImuSamples, Waveform
 from magfusion.site import Site
 from magfusion.units import Array, BoolArray, IntArray
 
+LONGEST_WINDOW = 4.0  # s; motion within a longer one is no longer a ramp
+CLOSEST_TONES_HZ = 2.0 / LONGEST_WINDOW
 SATURATED_RUN = 3  # consecutive samples at the extreme of the range
 ROUNDING = 1e-6  # of a step; what arithmetic may take from the last window
 
@@ -75,7 +77,7 @@ def default_settings(site: Site, mains_hz: float = 50.0) -> LockinSettings:
         order = np.maximum(np.round(frequencies / mains_hz), 1.0)
         to_mains = np.abs(frequencies - order * mains_hz)
         spacing = min(spacing, float(np.min(to_mains[to_mains > 0.5], initial=np.inf)))
-    window = float(np.clip(2.0 / spacing, 0.02, 4.0))
+    window = float(np.clip(2.0 / spacing, 0.02, LONGEST_WINDOW))
     return LockinSettings(window=window, step=window / 2.0, mains_hz=mains_hz)
 
 
@@ -89,12 +91,12 @@ def channel_frequencies_hz(site: Site) -> Array:
             )
     frequencies = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
     order = np.argsort(frequencies)
-    close = np.flatnonzero(np.diff(frequencies[order]) < 0.1)
+    close = np.flatnonzero(np.diff(frequencies[order]) < CLOSEST_TONES_HZ)
     if len(close):
         a, b = (site.channels[order[close[0] + i]][0] for i in (0, 1))
         raise InputError(
             f"beacons {a} and {b} both transmit at {frequencies[order[close[0]]]:g} Hz; "
-            "tones must differ by at least 0.1 Hz to be told apart"
+            f"tones must differ by at least {CLOSEST_TONES_HZ:g} Hz to be told apart"
         )
     return frequencies
 
