@@ -294,6 +294,9 @@ def view(
     path = result / "run.rrd" if result.is_dir() else result
     if not path.is_file():
         raise InputError(f"{path}: no recording there; run magfusion smooth first")
+    with path.open("rb") as stream:
+        if stream.read(3) != b"RRF":
+            raise InputError(f"{path}: is no recording; give a result's directory or its run.rrd")
     open_viewer(path)
 
 

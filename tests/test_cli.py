@@ -1,0 +1,270 @@
+"""Every command does its job, and tells what cannot be known."""
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from conftest import Refuse, Worked, change_table, run_command
+from evo.tools import file_interface
+from rerun.chunk import RrdReader
+
+from magfusion import cli
+from magfusion.cli import main
+from magfusion.pipeline import read_estimate
+from magfusion.records.log import read_log
+from magfusion.site_file import load_site
+
+CONSOLE_SCRIPT = Path(sys.executable).parent / "magfusion"
+
+# What cannot be known -------------------------------------------------------------------------
+
+
+def _site_of_one_beacon(log: Path, path: Path, coils: int, synchronised: bool) -> Path:
+    site = yaml.safe_load((log / "site.yaml").read_text())
+    beacon = site["beacons"][0]
+    beacon["coils"] = beacon["coils"][:coils]
+    beacon["synchronised"] = synchronised
+    path.write_text(yaml.safe_dump({**site, "beacons": [beacon]}))
+    return path
+
+
+def test_fixes_of_one_beacon_are_told_to_be_ambiguous(
+    worked: Worked, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A dipole's field is the same on its other side: no epoch can tell which."""
+    site = _site_of_one_beacon(worked.log, tmp_path / "site.yaml", 2, True)
+    run_command("simulate", "--site", site, "-o", tmp_path / "log", "--duration", 8)
+    run_command("fix", tmp_path / "log", "-o", tmp_path / "run", "--json")
+    out = capfd.readouterr().out
+    figures = json.loads(out.splitlines()[-1])
+    assert figures["ambiguous_epochs"] == figures["epochs"]
+    assert "epochs are ambiguous: fixes.parquet holds every pose" in out
+
+
+def test_what_one_coil_leaves_open_is_told_and_not_smoothed_over(
+    worked: Worked, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    site = _site_of_one_beacon(worked.log, tmp_path / "site.yaml", 1, True)
+    log = tmp_path / "log"
+    run_command("simulate", "--site", site, "-o", log, "--duration", 8)
+    run_command("fix", log, "-o", tmp_path / "fixes", "--json")
+    out = capfd.readouterr().out
+    figures = json.loads(out.splitlines()[-1])
+    assert figures["undetermined_epochs"] == figures["epochs"]
+    assert "leave a direction of the pose open" in out
+    with pytest.raises(SystemExit) as ended:
+        main(["smooth", str(log), "-o", str(tmp_path / "run"), "--window", "0.4"])
+    err = capfd.readouterr().err
+    assert ended.value.code == 1
+    assert err.count("\n") == 1
+    assert "add a beacon or a coil" in err
+    assert "single-epoch fixes were saved" in err
+    assert json.loads((tmp_path / "run" / "report.json").read_text())["failed"] in err
+    assert (tmp_path / "run" / "fixes.parquet").is_file()
+
+
+# The good ways --------------------------------------------------------------------------------
+
+
+def _report(directory: Path) -> dict[str, Any]:
+    report: dict[str, Any] = json.loads((directory / "report.json").read_text())
+    return report
+
+
+def _errors_of(figures: Mapping[str, Any]) -> dict[str, float]:
+    keys = ("ate_m", "attitude_rmse_deg", "aligned_ate_m", "rpe_translation_m", "nees_mean")
+    return {key: figures[key] for key in keys}
+
+
+def test_smoothing_is_better_than_fixing(worked: Worked) -> None:
+    smoothed, fixed = _report(worked.smoothed), _report(worked.fixes)
+    assert smoothed["ate_m"] < fixed["ate_m"] < 0.01  # m
+    assert smoothed["attitude_rmse_deg"] < 0.5  # deg
+
+
+def test_the_last_line_of_json_is_the_report(
+    worked: Worked, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    lines = {
+        "simulate": ["simulate", "--duration", 2],
+        "demodulate": ["demodulate", worked.log],
+        "fix": ["fix", worked.log],
+        "smooth": ["smooth", worked.log],
+        "demo": ["demo", "--duration", 5, "--no-show"],
+    }
+    for name, line in lines.items():
+        run_command(*line, "-o", tmp_path / name, "--json")
+        out, err = capfd.readouterr()
+        assert json.loads(out.splitlines()[-1]) == _report(tmp_path / name)
+        assert err == ""
+
+
+def test_the_screen_tells_the_errors_first_and_the_calibration_as_a_table(
+    worked: Worked, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    run_command("smooth", worked.log, "-o", tmp_path / "run")
+    lines = capfd.readouterr().out.splitlines()
+    assert lines[0] == "smooth of simulated_walk"
+    assert lines[2].split()[:3] == ["position", "(m)", f"{_report(tmp_path / 'run')['ate_m']:.3g}"]
+    row = next(line for line in lines if "imu.time_offset_s" in line).split()
+    assert row[-2:] == ["0.01", "yes"]
+    assert lines[-1] == f"results in {tmp_path / 'run'}"
+
+
+def test_evaluate_tells_what_smooth_told(worked: Worked, capfd: pytest.CaptureFixture[str]) -> None:
+    run_command("evaluate", worked.smoothed, worked.log, "--json")
+    told = _errors_of(json.loads(capfd.readouterr().out.splitlines()[-1]))
+    expected = _errors_of(_report(worked.smoothed))
+    assert told == pytest.approx(expected, rel=1e-5)  # stamps are written to the nanosecond
+
+
+def test_evaluate_reads_tum_tables_and_directories_alike(
+    worked: Worked, capfd: pytest.CaptureFixture[str]
+) -> None:
+    ate = []
+    for estimate in ("", "trajectory.tum", "trajectory.parquet"):
+        for truth in ("", "truth.parquet"):
+            run_command("evaluate", worked.smoothed / estimate, worked.log / truth, "--json")
+            ate.append(json.loads(capfd.readouterr().out.splitlines()[-1])["ate_m"])
+    assert ate == pytest.approx([ate[0]] * 6, abs=1e-6)  # m; TUM holds nine digits
+
+
+def test_evaluate_without_common_time_names_both_files(
+    worked: Worked, log: Path, refuse: Refuse
+) -> None:
+    change_table(
+        log / "truth.parquet", lambda c: c.update(time_ns=[t + 10**12 for t in c["time_ns"]])
+    )
+    sentence = refuse("evaluate", worked.smoothed, log)
+    assert str(worked.smoothed) in sentence
+    assert str(log) in sentence
+    assert "same clock" in sentence
+
+
+def test_a_truth_elsewhere_costs_the_comparison_and_not_the_trajectory(
+    log: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    change_table(
+        log / "truth.parquet", lambda c: c.update(time_ns=[t + 10**12 for t in c["time_ns"]])
+    )
+    run_command("smooth", log, "-o", tmp_path / "run", "--coupling", "loose")
+    assert "There is no comparison with the truth" in capfd.readouterr().out
+    assert "ate_m" not in _report(tmp_path / "run")
+
+
+def test_phasors_smooth_nearly_as_well_as_the_waveform(worked: Worked, tmp_path: Path) -> None:
+    run_command("smooth", worked.phasors, "-o", tmp_path / "run")
+    assert _report(tmp_path / "run")["ate_m"] < 2.0 * _report(worked.smoothed)["ate_m"] + 0.002  # m
+
+
+def test_evo_reads_the_trajectory(worked: Worked) -> None:
+    read = file_interface.read_tum_trajectory_file(worked.smoothed / "trajectory.tum")
+    found = read_estimate(worked.smoothed)
+    assert np.max(np.abs(read.positions_xyz - found.position_world)) < 1e-8  # m; nine digits
+    assert np.max(np.abs(read.timestamps - found.time)) < 1e-6  # s; a double at today's date
+
+
+def test_the_recording_can_be_read_back(worked: Worked) -> None:
+    chunks = RrdReader(worked.smoothed / "run.rrd").stream().to_chunks()
+    expected = {"/world/estimate/path", "/world/truth/path", "/plots/position_error_mm/x/error"}
+    assert expected <= {chunk.entity_path for chunk in chunks}
+
+
+def test_the_refined_site_can_be_fed_back_in(worked: Worked, tmp_path: Path) -> None:
+    site = worked.smoothed / "site.yaml"
+    record = load_site(site).calibration
+    assert record is not None
+    assert record["determined"] == _report(worked.smoothed)["determined"]
+    run_command("smooth", worked.log, "--site", site, "-o", tmp_path / "again")
+    first, again = _report(worked.smoothed), _report(tmp_path / "again")
+    assert again["time_offset_s"] == pytest.approx(
+        first["time_offset_s"], abs=first["imu.time_offset_s_sigma"]
+    )
+    assert again["ate_m"] < 2.0 * first["ate_m"]
+
+
+def test_the_rate_of_the_imu_fills_the_gaps_between_epochs(worked: Worked, tmp_path: Path) -> None:
+    run_command("smooth", worked.log, "-o", tmp_path / "run", "--rate", "imu")
+    dense, truth = read_estimate(tmp_path / "run"), read_log(worked.log).truth
+    assert truth is not None
+    assert 1.0 / np.median(np.diff(dense.time)) == pytest.approx(200.0, rel=1e-3)  # Hz
+    run_command("evaluate", tmp_path / "run", worked.log)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--coupling", "loose"],
+        ["--robust", "huber"],
+        ["--robust", "cauchy"],
+        ["--estimate", "none"],
+        ["--estimate", "time-offset,magnetometer"],
+        ["--window", "0.3"],
+        ["--step", "0.3"],
+        ["--mains-hz", "60"],
+    ],
+    ids=" ".join,
+)
+def test_every_way_of_smoothing_finds_the_trajectory(
+    options: list[str], worked: Worked, tmp_path: Path
+) -> None:
+    run_command("smooth", worked.log, "-o", tmp_path / "run", *options)
+    figures = _report(tmp_path / "run")
+    assert figures["ate_m"] < 0.02  # m
+    assert figures["attitude_rmse_deg"] < 1.0  # deg
+
+
+def test_a_part_of_a_log_is_smoothed_alone(worked: Worked, tmp_path: Path) -> None:
+    run_command("smooth", worked.log, "-o", tmp_path / "run", "--start", 3, "--end", 9)
+    time = read_estimate(tmp_path / "run", read_log(worked.log).epoch_ns).time
+    assert 3.0 <= time[0] < 3.5  # s
+    assert 8.5 < time[-1] <= 9.0  # s
+
+
+def test_the_same_seed_gives_the_same_log(tmp_path: Path) -> None:
+    for name, seed in (("a", 3), ("b", 3), ("c", 4)):
+        run_command("simulate", "-o", tmp_path / name, "--duration", 2, "--seed", seed)
+    a, b, c = (read_log(tmp_path / name).imu.gyro_body for name in "abc")
+    assert np.array_equal(a, b)
+    assert not np.array_equal(a, c)
+
+
+def test_view_opens_the_recording(worked: Worked, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[Path] = []
+    monkeypatch.setattr(cli, "open_viewer", opened.append)
+    run_command("view", worked.smoothed)
+    run_command("view", worked.smoothed / "run.rrd")
+    assert opened == [worked.smoothed / "run.rrd"] * 2
+
+
+# The console script ---------------------------------------------------------------------------
+
+
+def _script(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [str(CONSOLE_SCRIPT), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_the_console_script_keeps_the_contract(worked: Worked, tmp_path: Path) -> None:
+    good = _script("evaluate", worked.smoothed, worked.log, "--json")
+    assert (good.returncode, good.stderr) == (0, "")
+    assert json.loads(good.stdout.splitlines()[-1])["job"] == "evaluate"
+    bad = _script("fix", tmp_path / "none", "-o", tmp_path / "run")
+    assert (bad.returncode, bad.stdout, bad.stderr.count("\n")) == (2, "", 1)
+    usage = _script("fix", "--frobnicate")
+    assert (usage.returncode, usage.stdout, usage.stderr.count("\n")) == (2, "", 1)
+
+
+def test_help_and_version_are_told(capfd: pytest.CaptureFixture[str]) -> None:
+    for arguments in ([], ["--help"], ["smooth", "--help"]):
+        run_command(*arguments)
+        assert "Usage: magfusion" in capfd.readouterr().out
+    run_command("--version")
+    assert re.fullmatch(r"magfusion \d+\.\d+\.\d+\n", capfd.readouterr().out)
