@@ -19,7 +19,13 @@ from magfusion.demo import run_demo
 from magfusion.errors import EstimationError, InputError
 from magfusion.fusion.batch import SmootherSettings
 from magfusion.job import Job, read_job
-from magfusion.options import box_option, check_simulation, groups_option, topics_option
+from magfusion.options import (
+    box_option,
+    check_simulation,
+    groups_option,
+    lockin_option,
+    topics_option,
+)
 from magfusion.parameters import GROUPS
 from magfusion.pipeline import (
     Report,
@@ -29,7 +35,7 @@ from magfusion.pipeline import (
     run_simulate,
     run_smooth,
 )
-from magfusion.receiver.windows import LockinSettings, default_settings
+from magfusion.receiver.windows import default_settings
 from magfusion.report import Figures
 from magfusion.screen import show as show_figures
 from magfusion.simulation.demo_site import demo_site
@@ -132,9 +138,6 @@ def _job(
     end: float | None,
     topics: str | None,
 ) -> Job:
-    for name, value in (("--window", window), ("--step", step)):
-        if value is not None and not 0.0 < value < 60.0:
-            raise InputError(f"{name} must lie between 0 and 60 s; got {value:g}")
     if not 0.0 <= mains_hz < 1e3:
         raise InputError(f"--mains-hz must lie between 0 and 1000 Hz; got {mains_hz:g}")
     if start is not None and end is not None and not start < end:
@@ -142,10 +145,8 @@ def _job(
     job = Job(log, site, output, None, start, end, topics_option(topics))
     if window is None and step is None and mains_hz == 50.0:
         return job
-    chosen = default_settings(read_job(job)[1], mains_hz)
-    length = chosen.window if window is None else window
-    lockin = LockinSettings(length, length / 2.0 if step is None else step, mains_hz)
-    return replace(job, lockin=lockin)
+    usual = default_settings(read_job(job)[1], mains_hz).window
+    return replace(job, lockin=lockin_option(usual, window, step, mains_hz))
 
 
 def _show(figures: Figures, output: Path | None, as_json: bool) -> None:

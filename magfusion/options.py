@@ -6,9 +6,29 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.parameters import GROUPS
+from magfusion.receiver.windows import LockinSettings
 from magfusion.records.rosbag import Topics
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD
 from magfusion.units import Array
+
+
+def lockin_option(
+    usual: float, window: float | None, step: float | None, mains_hz: float
+) -> LockinSettings:
+    """Return how to demodulate, given the usual window (s) of the site's tones."""
+    length = usual if window is None else window
+    if not usual / 2.0 <= length <= 60.0:
+        raise InputError(
+            f"--window must lie between {usual / 2.0:.3g} s, below which the tones cannot be told"
+            f" apart, and 60 s; got {length:g}"
+        )
+    distance = length / 2.0 if step is None else step
+    if not length / 20.0 <= distance <= 60.0:
+        raise InputError(
+            f"--step must lie between a twentieth of the window, {length / 20.0:.3g} s, and 60 s;"
+            f" got {distance:g}"
+        )
+    return LockinSettings(length, distance, mains_hz)
 
 
 def topics_option(text: str | None) -> Topics | None:

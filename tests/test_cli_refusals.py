@@ -184,10 +184,12 @@ def test_hostile_yaml_is_refused(
 # Refusals of options --------------------------------------------------------------------------
 
 BAD_OPTIONS = [
-    ("smooth LOG -o OUT --window -1", "--window.*between 0 and 60 s; got -1"),
+    ("smooth LOG -o OUT --window -1", "--window.*between 0.2 s.* and 60 s; got -1"),
     ("smooth LOG -o OUT --window nan", "--window.*got nan"),
     ("smooth LOG -o OUT --window x", "--window.*number.*see magfusion smooth --help"),
-    ("fix LOG -o OUT --step 0", "--step"),
+    ("fix LOG -o OUT --window 0.02", "--window.*tones cannot be told apart"),
+    ("fix LOG -o OUT --step 0", "--step.*got 0"),
+    ("fix LOG -o OUT --step 0.0001", "--step.*twentieth of the window, 0.02 s.*got 0.0001"),
     ("fix LOG -o OUT --window 30", "no window of 30 s is usable"),
     ("demodulate LOG -o OUT --mains-hz -50", "--mains-hz"),
     ("smooth LOG -o OUT --start nan", "start: found nan"),
