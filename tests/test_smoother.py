@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from small_problem import SmallLog, small_log, small_problem
 
 from magfusion.errors import EstimationError
+from magfusion.evaluation.consistency import average_nees_bounds
 from magfusion.evaluation.errors import trajectory_errors
 from magfusion.fusion.batch import SmootherSettings, smooth
 from magfusion.fusion.factors import CALIBRATION_KEY, FieldFactors, read_poses, robust_weight
@@ -476,3 +477,19 @@ def test_loose_coupling_agrees_with_tight_within_millimetres() -> None:
     assert np.max(apart) < 0.005  # m
     for result in (tight, loose):
         assert trajectory_errors(result.states, small.truth, max_gap=1.0).ate < 0.01  # m
+
+
+@pytest.mark.parametrize("coupling", ["tight", "loose"])
+def test_the_sigmas_of_either_coupling_hold_the_error_of_the_survey(coupling: str) -> None:
+    settings = SmootherSettings(coupling=coupling, estimate=())
+    nees = []
+    for seed in range(100, 120):
+        small = small_log(seed)
+        errors = trajectory_errors(
+            smooth(small.log, small.site, settings).states, small.truth, max_gap=1.0
+        )
+        assert errors.nees is not None
+        nees.append(np.mean(errors.nees))
+    low, high = average_nees_bounds(6, len(nees), confidence=0.999)
+    # Loose coupling weighs its fixes by the survey's error as well: it may err on the safe side.
+    assert (0.5 if coupling == "loose" else 1.0) * low < np.mean(nees) < high, np.mean(nees)

@@ -23,7 +23,15 @@ from magfusion.fusion.smoother import (
 from magfusion.fusion.source import Source, first_fixes, open_source
 from magfusion.fusion.start import Start, choose_chains, start_phases
 from magfusion.fusion.wave import WaveFields
-from magfusion.parameters import Block, Calibration, choose_blocks, held_blocks, initial_calibration
+from magfusion.parameters import (
+    Block,
+    Calibration,
+    choose_blocks,
+    held_blocks,
+    initial_calibration,
+    linearize_channels,
+    prior_sigma,
+)
 from magfusion.receiver.windows import LockinSettings
 from magfusion.records.samples import FieldSamples, ImuSamples, Log
 from magfusion.site import Site
@@ -338,4 +346,31 @@ def _loose(job: _Job) -> Smoothed:
     problem = Problem(graph, None, job.declared, len(job.samples))
     found = optimise(problem, initial_estimate(job.states, job.declared))
     job.told("posterior", job.settings.passes + 2)
-    return _posterior(job, problem, found, job.samples, bridged)
+    result = _posterior(job, problem, found, job.samples, bridged)
+    states = result.states
+    assert states.pose_cov is not None
+    shared = _survey_cov(job, states)
+    return replace(result, states=replace(states, pose_cov=states.pose_cov + shared))
+
+
+def _survey_cov(job: _Job, states: Trajectory) -> Array:
+    """Return what the survey's error does to every fix alike, shape (n, 6, 6).
+
+    The graph takes the fixes' errors for independent, but no number of fixes averages it out.
+    """
+    samples, site = job.samples, job.declared.site
+    blocks = choose_blocks(site, ("beacons", "moments", "phase", "magnetometer", "extrinsics"))
+    survey = np.repeat([b.group != "phase" for b in blocks], [len(b.sigma) for b in blocks])
+    phase = np.repeat([b.kind == "phase" for b in blocks], [len(b.sigma) for b in blocks])
+    if not np.any(survey):
+        return np.zeros((len(samples), 6, 6))
+    _, by_pose, by_calibration = linearize_channels(
+        job.declared, blocks, samples.time, states.world_from_body, states.position_world
+    )
+    root = paired_whitening(measurement_cov(site, samples, survey_error=True), samples.valid)
+    rows = (len(samples), 6 * len(samples.channels), -1)
+    # A fix finds its own drive phases beside its pose.
+    found = np.concatenate([by_pose, by_calibration[..., phase]], axis=-1)
+    by_survey = by_calibration[..., survey] * prior_sigma(blocks)[survey]
+    moved = np.linalg.pinv((root @ found).reshape(rows)) @ (root @ by_survey).reshape(rows)
+    return np.asarray(moved[:, :6] @ np.swapaxes(moved[:, :6], 1, 2))
