@@ -17,8 +17,10 @@ from rerun.chunk import RrdReader
 
 from magfusion import cli
 from magfusion.cli import main
+from magfusion.options import topics_option
 from magfusion.pipeline import read_estimate
 from magfusion.records.log import read_log
+from magfusion.records.rosbag import Topics
 from magfusion.site_file import load_site
 
 CONSOLE_SCRIPT = Path(sys.executable).parent / "magfusion"
@@ -234,6 +236,11 @@ def test_the_same_seed_gives_the_same_log(tmp_path: Path) -> None:
     a, b, c = (read_log(tmp_path / name).imu.gyro_body for name in "abc")
     assert np.array_equal(a, b)
     assert not np.array_equal(a, c)
+
+
+def test_topics_are_given_by_their_role() -> None:
+    found = topics_option("imu=/imu/data, truth=/odom")
+    assert found == Topics(imu="/imu/data", magnetometer=None, truth="/odom")
 
 
 def test_view_opens_the_recording(worked: Worked, monkeypatch: pytest.MonkeyPatch) -> None:
