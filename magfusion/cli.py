@@ -85,6 +85,12 @@ SitePath = Annotated[
     Path | None, typer.Option("--site", help="Site file; default: site.yaml in the log.")
 ]
 Output = Annotated[Path, typer.Option("--output", "-o", help="Directory of the results.")]
+JobOutput = Annotated[
+    Path | None,
+    typer.Option(
+        "--output", "-o", help="Directory of the results; default: the log's name and the job's."
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the report as the last line.")]
 Window = Annotated[
     float | None, typer.Option(help="Lock-in window, s; default: from the tones' spacing.")
@@ -128,9 +134,10 @@ def progress() -> Iterator[Report]:
 
 
 def _job(
+    name: str,
     log: Path,
     site: Path | None,
-    output: Path,
+    output: Path | None,
     window: float | None,
     step: float | None,
     mains_hz: float,
@@ -142,7 +149,8 @@ def _job(
         raise InputError(f"--mains-hz must lie between 0 and 1000 Hz; got {mains_hz:g}")
     if start is not None and end is not None and not start < end:
         raise InputError(f"--start must come before --end; got {start:g} and {end:g}")
-    job = Job(log, site, output, None, start, end, topics_option(topics))
+    place = Path(f"{log.resolve().name}_{name}") if output is None else output
+    job = Job(log, site, place, None, start, end, topics_option(topics))
     if window is None and step is None and mains_hz == 50.0:
         return job
     usual = default_settings(read_job(job)[1], mains_hz).window
@@ -174,7 +182,7 @@ def _options(
 @app.command()
 def smooth(
     log: LogPath,
-    output: Output,
+    output: JobOutput = None,
     site: SitePath = None,
     coupling: Annotated[Coupling, typer.Option(help="Phasors or fixes in the graph.")] = (
         Coupling.TIGHT
@@ -197,7 +205,7 @@ def smooth(
     as_json: AsJson = False,
 ) -> None:
     """Smooth a log into the best trajectory, with the calibration in the same solution."""
-    job = _job(log, site, output, window, step, mains_hz, start, end, topics)
+    job = _job("smooth", log, site, output, window, step, mains_hz, start, end, topics)
     settings = SmootherSettings(
         coupling=coupling.value,
         loss=None if robust is Robust.NONE else robust.value,
@@ -205,13 +213,13 @@ def smooth(
     )
     with progress() as report:
         figures = run_smooth(job, settings, imu_rate=rate is Rate.IMU, report=report)
-    _show(figures, output, as_json)
+    _show(figures, job.output, as_json)
 
 
 @app.command()
 def fix(
     log: LogPath,
-    output: Output,
+    output: JobOutput = None,
     site: SitePath = None,
     window: Window = None,
     step: Step = None,
@@ -222,16 +230,16 @@ def fix(
     as_json: AsJson = False,
 ) -> None:
     """Fix the pose at every epoch on its own, with every hypothesis that survives."""
-    job = _job(log, site, output, window, step, mains_hz, start, end, topics)
+    job = _job("fix", log, site, output, window, step, mains_hz, start, end, topics)
     with progress() as report:
         figures = run_fix(job, report=report)
-    _show(figures, output, as_json)
+    _show(figures, job.output, as_json)
 
 
 @app.command()
 def demodulate(
     log: LogPath,
-    output: Output,
+    output: JobOutput = None,
     site: SitePath = None,
     window: Window = None,
     step: Step = None,
@@ -242,10 +250,10 @@ def demodulate(
     as_json: AsJson = False,
 ) -> None:
     """Turn a log's waveform into phasors: a log that every other command reads."""
-    job = _job(log, site, output, window, step, mains_hz, start, end, topics)
+    job = _job("demodulate", log, site, output, window, step, mains_hz, start, end, topics)
     with progress() as report:
         figures = run_demodulate(job, report=report)
-    _show(figures, output, as_json)
+    _show(figures, job.output, as_json)
 
 
 @app.command()

@@ -25,6 +25,15 @@ from magfusion.site_file import load_site
 
 CONSOLE_SCRIPT = Path(sys.executable).parent / "magfusion"
 
+
+def test_a_job_without_an_output_is_named_after_its_log(
+    worked: Worked, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run_command("fix", worked.log)
+    assert (tmp_path / "log_fix" / "fixes.parquet").is_file()
+
+
 # What cannot be known -------------------------------------------------------------------------
 
 

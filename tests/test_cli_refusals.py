@@ -204,7 +204,7 @@ BAD_OPTIONS = [
     ("smooth LOG -o OUT --topics foo", "--topics 'foo': write role=name"),
     ("smooth LOG -o OUT --site LOG", "is a directory; give the path of a YAML file"),
     ("smooth LOG -o OUT --site NONE", "NONE: there is no such file"),
-    ("smooth LOG", "Missing option '--output'"),
+    ("simulate", "Missing option '--output'"),
     ("smooth", "Missing argument"),
     ("smooth LOG OUT -o OUT", "unexpected extra argument"),
     ("demodulate LOG -o OUT --frobnicate", "No such option: --frobnicate"),
