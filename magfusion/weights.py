@@ -82,10 +82,16 @@ def whitening(cov: Array, valid: BoolArray) -> Array:
 def paired_whitening(cov: Array, valid: BoolArray) -> Array:
     """Return the whitening of real and imaginary part together, shape (..., 6, 6)."""
     single = whitening(cov, valid)
-    root = np.zeros((*single.shape[:-2], 6, 6))
-    root[..., :3, :3] = single
-    root[..., 3:, 3:] = single
-    return root
+    return block_diagonal(np.stack([single, single], axis=-3))
+
+
+def block_diagonal(blocks: Array) -> Array:
+    """Return matrices of shape (..., k, m, m) as one, shape (..., k m, k m)."""
+    count, size = blocks.shape[-3:-1]
+    out = np.zeros((*blocks.shape[:-3], count, size, count, size))
+    for i in range(count):
+        out[..., i, :, i, :] = blocks[..., i, :, :]
+    return out.reshape(*blocks.shape[:-3], count * size, count * size)
 
 
 def stacked(phasor: ComplexArray) -> Array:

@@ -12,13 +12,14 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import EstimationError
 from magfusion.fixes.candidates import attitudes, positions
 from magfusion.fixes.fix import Fixes
+from magfusion.fixes.survey import honest_covariance, survey_jacobians
 from magfusion.observation import skew
 from magfusion.parameters import Block, Calibration, linearize_channels
 from magfusion.records.samples import FieldSamples
 from magfusion.site import Site
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
-from magfusion.weights import measurement_cov, paired_whitening, stacked
+from magfusion.weights import block_diagonal, measurement_cov, paired_whitening, stacked
 
 CHUNK = 500  # epochs solved at once
 CANDIDATES = 10  # positions that get an attitude
@@ -51,6 +52,7 @@ class _Problem:
     time: Array
     measured: Array  # (n, channels, 6)
     root: Array  # (n, channels, 6, 6) whitening
+    noise: Array | None  # (n, channels, 6, 6) whitened noise, where the root is more than that
     phase_blocks: tuple[Block, ...]
     gravity: Gravity | None
     prior: Trajectory | None
@@ -96,6 +98,14 @@ def fix_epochs(
     if len(samples) == 0:
         raise EstimationError("no epoch to fix: every window was dropped")
     cov = measurement_cov(calibration.site, samples, survey_error=survey_error)
+    root = paired_whitening(cov, samples.valid)
+    noise = None
+    if survey_error:
+        known = np.where(
+            samples.valid[..., None, None], measurement_cov(calibration.site, samples), 0
+        )
+        single = root[..., :3, :3] @ known @ np.swapaxes(root[..., :3, :3], -1, -2)
+        noise = block_diagonal(np.stack([single, single], axis=-3))
     parts = []
     for start in range(0, len(samples), CHUNK):
         rows = slice(start, start + CHUNK)
@@ -103,7 +113,8 @@ def fix_epochs(
             calibration=calibration,
             time=samples.time[rows],
             measured=stacked(samples.phasor_sensor[rows]),
-            root=paired_whitening(cov[rows], samples.valid[rows]),
+            root=root[rows],
+            noise=None if noise is None else noise[rows],
             phase_blocks=_phase_blocks(calibration.site),
             gravity=None
             if gravity is None
@@ -308,17 +319,53 @@ def _ranked(
     again = np.argsort(cost, axis=1, kind="stable")[:, :HYPOTHESES]
     order = np.take_along_axis(order, again, axis=1)
     information = np.take_along_axis(information, order[..., None, None], axis=1)
-    cov, determined = _covariance(information)
+    rotation = np.take_along_axis(rotation, again[..., None, None], axis=1)
+    position = np.take_along_axis(position, again[..., None], axis=1)
+    phase = np.take_along_axis(phase, order[..., None], axis=1)
+    inverse, determined = _inverse(information)
+    if problem.noise is not None:
+        inverse = _with_survey(problem, rotation, position, phase, information, inverse)
     return Fixes(
         time=problem.time,
-        world_from_body=np.take_along_axis(rotation, again[..., None, None], axis=1),
-        position_world=np.take_along_axis(position, again[..., None], axis=1),
-        pose_cov=cov,
+        world_from_body=rotation,
+        position_world=position,
+        pose_cov=inverse[..., :6, :6],
         cost=np.take_along_axis(cost, again, axis=1),
         residual_rms=np.take_along_axis(rms, order, axis=1),
-        phase=np.take_along_axis(phase, order[..., None], axis=1),
+        phase=phase,
         determined=determined,
     )
+
+
+def _with_survey(
+    problem: _Problem,
+    rotation: Array,
+    position: Array,
+    phase: Array,
+    information: Array,
+    inverse: Array,
+) -> Array:
+    """Covariance with the error of the survey carried through, rather than taken for noise."""
+    assert problem.noise is not None
+    count, shape = rotation.shape[1], information.shape
+    epoch = np.repeat(np.arange(len(problem.time)), count)
+    flat_phase = phase.reshape(len(epoch), -1)
+    calibration = replace(problem.calibration, phase=problem.calibration.phase + flat_phase)
+    by_found, by_survey = survey_jacobians(
+        calibration,
+        problem.time[epoch],
+        rotation.reshape(-1, 3, 3),
+        position.reshape(-1, 3),
+        problem.root[epoch],
+    )
+    cov = honest_covariance(
+        by_found,
+        by_survey,
+        block_diagonal(problem.noise)[epoch],
+        inverse.reshape(-1, *shape[2:]),
+        information.reshape(-1, *shape[2:]),
+    )
+    return cov.reshape(shape)
 
 
 def _repeated(rotation: Array, position: Array) -> BoolArray:
@@ -333,8 +380,8 @@ def _repeated(rotation: Array, position: Array) -> BoolArray:
     return repeated
 
 
-def _covariance(information: Array) -> tuple[Array, BoolArray]:
-    """Pose covariance with the phases marginalised; flat directions are wide, not infinite."""
+def _inverse(information: Array) -> tuple[Array, BoolArray]:
+    """Return the covariance of pose and phases; flat directions are wide, not infinite."""
     value, vector = np.linalg.eigh(information)
     largest = value[..., -1:]
     # The phase of a channel that is missing is open too, but is no direction of the pose.
@@ -342,4 +389,4 @@ def _covariance(information: Array) -> tuple[Array, BoolArray]:
     open_direction = (value <= 1e-10 * largest) & in_pose
     safe = np.maximum(value, 1e-10 * largest + 1e-300)
     cov = (vector / safe[..., None, :]) @ np.swapaxes(vector, -1, -2)
-    return cov[..., :6, :6], ~np.any(open_direction, axis=-1)
+    return cov, ~np.any(open_direction, axis=-1)

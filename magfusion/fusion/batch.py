@@ -8,6 +8,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError
 from magfusion.fixes.fix import Fixes
+from magfusion.fixes.survey import survey_jacobians
 from magfusion.fusion.factors import FieldFactors, FieldMeasurements, read_poses
 from magfusion.fusion.inertial import cut_at_epochs, low_passed, preintegrate
 from magfusion.fusion.smoother import (
@@ -29,8 +30,6 @@ from magfusion.parameters import (
     choose_blocks,
     held_blocks,
     initial_calibration,
-    linearize_channels,
-    prior_sigma,
 )
 from magfusion.receiver.windows import LockinSettings
 from magfusion.records.samples import FieldSamples, ImuSamples, Log
@@ -358,19 +357,14 @@ def _survey_cov(job: _Job, states: Trajectory) -> Array:
 
     The graph takes the fixes' errors for independent, but no number of fixes averages it out.
     """
-    samples, site = job.samples, job.declared.site
-    blocks = choose_blocks(site, ("beacons", "moments", "phase", "magnetometer", "extrinsics"))
-    survey = np.repeat([b.group != "phase" for b in blocks], [len(b.sigma) for b in blocks])
-    phase = np.repeat([b.kind == "phase" for b in blocks], [len(b.sigma) for b in blocks])
-    if not np.any(survey):
-        return np.zeros((len(samples), 6, 6))
-    _, by_pose, by_calibration = linearize_channels(
-        job.declared, blocks, samples.time, states.world_from_body, states.position_world
+    samples = job.samples
+    cov = measurement_cov(job.declared.site, samples, survey_error=True)
+    by_found, by_survey = survey_jacobians(
+        job.declared,
+        samples.time,
+        states.world_from_body,
+        states.position_world,
+        paired_whitening(cov, samples.valid),
     )
-    root = paired_whitening(measurement_cov(site, samples, survey_error=True), samples.valid)
-    rows = (len(samples), 6 * len(samples.channels), -1)
-    # A fix finds its own drive phases beside its pose.
-    found = np.concatenate([by_pose, by_calibration[..., phase]], axis=-1)
-    by_survey = by_calibration[..., survey] * prior_sigma(blocks)[survey]
-    moved = np.linalg.pinv((root @ found).reshape(rows)) @ (root @ by_survey).reshape(rows)
-    return np.asarray(moved[:, :6] @ np.swapaxes(moved[:, :6], 1, 2))
+    moved = (np.linalg.pinv(by_found) @ by_survey)[:, :6]
+    return np.asarray(moved @ np.swapaxes(moved, 1, 2))
