@@ -324,7 +324,9 @@ def _ranked(
     phase = np.take_along_axis(phase, order[..., None], axis=1)
     inverse, determined = _inverse(information)
     if problem.noise is not None:
-        inverse = _with_survey(problem, rotation, position, phase, information, inverse)
+        carried = _with_survey(problem, rotation, position, phase, information, inverse)
+        # Where a direction is open there is nothing for the survey to make worse.
+        inverse = np.where(determined[..., None, None], carried, inverse)
     return Fixes(
         time=problem.time,
         world_from_body=rotation,

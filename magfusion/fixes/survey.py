@@ -70,4 +70,5 @@ def honest_covariance(
     transposed = np.swapaxes(by_found, 1, 2)
     spread = transposed @ noise @ by_found + information - transposed @ by_found
     moved = inverse @ transposed @ by_survey
-    return np.asarray(inverse @ spread @ inverse + moved @ np.swapaxes(moved, 1, 2))
+    cov = inverse @ spread @ inverse + moved @ np.swapaxes(moved, 1, 2)
+    return np.asarray(0.5 * (cov + np.swapaxes(cov, 1, 2)))
