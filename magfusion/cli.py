@@ -15,6 +15,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from magfusion.coverage_job import CoverageSettings, run_coverage
 from magfusion.demo import run_demo
 from magfusion.errors import EstimationError, InputError
 from magfusion.fusion.batch import SmootherSettings
@@ -282,6 +283,30 @@ def simulate(
     )
     figures = run_simulate(declared, config, output, seed)
     _show(figures, output, as_json)
+
+
+@app.command()
+def coverage(
+    site: Annotated[Path, typer.Argument(help="Site file of the installation.")],
+    output: Output = Path("coverage"),
+    box: Annotated[
+        str | None,
+        typer.Option(help="Volume, m: xmin,xmax,ymin,ymax,zmin,zmax; default: about the beacons."),
+    ] = None,
+    height: Annotated[float | None, typer.Option(help="A single height, m.")] = None,
+    spacing: Annotated[
+        float | None, typer.Option(help="Of the points, m; default: a twentieth of the volume.")
+    ] = None,
+    window: Window = None,
+    extra_beacon: Annotated[
+        bool, typer.Option("--extra-beacon", help="Find where one more beacon adds most.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Tell where an installation can navigate: the best position and attitude over a volume."""
+    limits = None if box is None else box_option(box)
+    settings = CoverageSettings(limits, height, spacing, window, extra_beacon)
+    _show(run_coverage(site, settings, output), output, as_json)
 
 
 @app.command()

@@ -52,6 +52,7 @@ _WRITTEN = {
     "fix": _RESULT | {"fixes.parquet"},
     "simulate": _LOG,
     "demodulate": _LOG,
+    "coverage": {"coverage.parquet", "coverage.png", "run.rrd", "report.json"},
 }
 
 

@@ -86,7 +86,7 @@ def write_recording(
     recording.save(unfinished)
     try:
         recording.send_recording_name(path.resolve().parent.name)
-        _log_beacons(recording, site, scale)
+        log_beacons(recording, site, scale)
         _log_path(recording, "world/estimate", trajectory, _ESTIMATE, 1.2)
         _log_body(recording, trajectory, scale)
         _log_sigmas(recording, trajectory, scale)
@@ -139,7 +139,8 @@ def _beacon_colour(index: int) -> tuple[int, int, int]:
     return _BEACONS[index % len(_BEACONS)]
 
 
-def _log_beacons(recording: rr.RecordingStream, site: Site, scale: Scale) -> None:
+def log_beacons(recording: rr.RecordingStream, site: Site, scale: Scale) -> None:
+    """Draw the beacons: axes, moments, coils, and the shell of their coverage."""
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     longest = max(np.linalg.norm(b.moments_beacon, axis=1).max() for b in site.beacons)
     for index, beacon in enumerate(site.beacons):

@@ -19,8 +19,8 @@ FLOORS = (
     {"parameters", "weights"},
     {"refinement"},
     {"receiver", "simulation", "calibration", "fusion", "fixes", "evaluation"},
-    {"report", "job"},
-    {"pipeline", "screen", "options"},
+    {"report", "job", "coverage_plot", "view_coverage"},
+    {"pipeline", "coverage_job", "screen", "options"},
     {"demo"},
     {"cli"},
 )
@@ -82,7 +82,11 @@ def test_the_drawn_imports_leave_no_circle() -> None:
 
 
 def test_only_the_view_imports_rerun() -> None:
-    assert _importers("rerun") <= {"magfusion/view.py"}
+    assert _importers("rerun") <= {"magfusion/view.py", "magfusion/view_coverage.py"}
+
+
+def test_only_the_plot_imports_matplotlib() -> None:
+    assert _importers("matplotlib") <= {"magfusion/coverage_plot.py"}
 
 
 def test_only_the_ekf_imports_filterpy() -> None:
