@@ -1,6 +1,5 @@
 """The jobs as functions: files in, a directory of results out."""
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -30,6 +29,7 @@ from magfusion.report import (
     error_figures,
     fix_figures,
     smoothed_figures,
+    write_report,
 )
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.site import Site
@@ -44,11 +44,6 @@ Report = Callable[[str, int, int], None]
 
 def quiet(_stage: str, _done: int, _total: int) -> None:
     """Tell nobody of the progress."""
-
-
-def _write_report(directory: Path, figures: Figures) -> None:
-    text = json.dumps(figures, indent=1, allow_nan=False, default=float)
-    (directory / "report.json").write_text(text + "\n")
 
 
 def _compared(estimate: Trajectory, log: Log) -> tuple[TrajectoryErrors | None, Figures]:
@@ -161,7 +156,7 @@ def run_smooth(
             errors=errors,
             innovations=_innovations(result),
         )
-        _write_report(directory, figures)
+        write_report(directory, figures)
     return figures
 
 
@@ -227,7 +222,7 @@ def _write_fix_result(
         fixes.determined,
     )
     write_recording(directory / "run.rrd", site, best, truth=log.truth, errors=errors)
-    _write_report(directory, figures | compared)
+    write_report(directory, figures | compared)
     return figures | compared
 
 
@@ -285,7 +280,7 @@ def run_demodulate(job: Job, *, report: Report = quiet) -> Figures:
     with claimed as directory:
         write_log(replace(log, waveform=None, fields=samples), directory)
         save_site(site, directory / "site.yaml")
-        _write_report(directory, figures)
+        write_report(directory, figures)
     return figures
 
 
@@ -324,7 +319,7 @@ def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) 
         write_log(simulated.log, directory)
         save_site(site, directory / "site.yaml")
         save_site(simulated.true_site, directory / "true_site.yaml")
-        _write_report(directory, figures)
+        write_report(directory, figures)
     return figures
 
 

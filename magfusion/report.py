@@ -1,6 +1,8 @@
 """The flat object of figures that every job writes and prints."""
 
+import json
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -13,6 +15,12 @@ from magfusion.units import Array
 AMBIGUOUS_CHI_SQUARE = 20.0  # below this a mirrored trajectory explains the log nearly as well
 
 Figures = dict[str, float | int | str | bool | list[str] | None]
+
+
+def write_report(directory: Path, figures: Figures) -> None:
+    """Write ``report.json``."""
+    text = json.dumps(figures, indent=1, allow_nan=False, default=float)
+    (directory / "report.json").write_text(text + "\n")
 
 
 def error_figures(errors: TrajectoryErrors, prefix: str = "") -> Figures:

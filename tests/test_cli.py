@@ -15,7 +15,6 @@ from conftest import Refuse, Worked, change_table, run_command
 from evo.tools import file_interface
 from rerun.chunk import RrdReader
 
-from magfusion import cli
 from magfusion.cli import main
 from magfusion.options import topics_option
 from magfusion.pipeline import read_estimate
@@ -254,7 +253,7 @@ def test_topics_are_given_by_their_role() -> None:
 
 def test_view_opens_the_recording(worked: Worked, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[Path] = []
-    monkeypatch.setattr(cli, "open_viewer", opened.append)
+    monkeypatch.setattr("magfusion.cli.result_commands.open_viewer", opened.append)
     run_command("view", worked.smoothed)
     run_command("view", worked.smoothed / "run.rrd")
     assert opened == [worked.smoothed / "run.rrd"] * 2

@@ -12,7 +12,6 @@ import pytest
 import yaml
 from conftest import Refuse, Worked, change_table, run_command
 
-from magfusion import cli
 from magfusion.cli import main
 
 JOBS = ("smooth", "fix", "demodulate")
@@ -297,7 +296,7 @@ def test_an_interrupt_ends_with_130_and_no_word(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "run_fix", interrupted)
+    monkeypatch.setattr("magfusion.cli.log_commands.run_fix", interrupted)
     with pytest.raises(SystemExit) as ended:
         main(["fix", str(worked.log), "-o", str(tmp_path / "run")])
     assert ended.value.code == 130

@@ -20,7 +20,7 @@ FLOORS = (
     {"refinement"},
     {"receiver", "simulation", "calibration", "fusion", "fixes", "evaluation"},
     {"report", "job", "coverage_plot", "view_coverage"},
-    {"pipeline", "coverage_job", "screen", "options"},
+    {"pipeline", "jobs", "screen", "options"},
     {"demo"},
     {"cli"},
 )

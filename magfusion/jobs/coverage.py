@@ -1,6 +1,5 @@
 """The job that plans an installation: a site in, a directory with its coverage out."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from magfusion.evaluation.coverage import (
 from magfusion.job import claim, named
 from magfusion.receiver.windows import default_settings
 from magfusion.records.table import write_table
-from magfusion.report import Figures
+from magfusion.report import Figures, write_report
 from magfusion.site import Site
 from magfusion.site_file import load_site
 from magfusion.units import Array
@@ -85,8 +84,7 @@ def run_coverage(site_path: Path, settings: CoverageSettings, output: Path) -> F
         _write_points(directory / "coverage.parquet", found)
         write_plot(directory / "coverage.png", site, found, beacon)
         write_coverage_recording(directory / "run.rrd", site, found, spacing, beacon)
-        text = json.dumps(figures, indent=1, allow_nan=False)
-        (directory / "report.json").write_text(text + "\n")
+        write_report(directory, figures)
     return figures
 
 

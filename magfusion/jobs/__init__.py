@@ -1,0 +1,1 @@
+"""Jobs as functions: files in, a directory of results out."""
