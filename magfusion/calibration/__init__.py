@@ -1,0 +1,1 @@
+"""Calibration of beacons, antennas and sensors from what they measured, each with a covariance."""
