@@ -4,6 +4,7 @@ Every solver predicts through `observe`; the simulator does not.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -75,6 +76,36 @@ def _coil_fields(beacon: Beacon, offset_beacon: Array) -> tuple[Array, Array]:
     return offset, dipole_field(offset, beacon.moments_beacon)
 
 
+def _mapped(beacon: Beacon, offset_beacon: Array) -> tuple[Array, Array] | None:
+    """Return the map's correction and its derivative, both in beacon axes; None without a map.
+
+    The first, of shape (..., 1, 3, 3), multiplies the model's field.  The second, (..., 3, 4, 3)
+    at ``[j, c]``, is what the position along j adds to gain (c = 0) and rotation, see `_map_slope`.
+    """
+    if beacon.field_map is None:
+        return None
+    world_from_beacon = beacon.world_from_beacon
+    sensor_world = beacon.position_world + offset_beacon @ world_from_beacon.T
+    value, gradient = beacon.field_map.mean(sensor_world)
+    turn = skew(value[..., 1:] @ world_from_beacon)
+    gain = np.exp(value[..., :1, None])
+    correction = gain * (np.eye(3) + turn)
+    gradient = gradient @ world_from_beacon
+    rotation = np.swapaxes(gradient[..., 1:, :], -1, -2) @ world_from_beacon
+    return correction[..., None, :, :], np.concatenate(
+        [gradient[..., 0, :, None], gain * rotation], axis=-1
+    )
+
+
+def _map_slope(
+    slope: Array, field_beacon: ComplexArray, mapped_beacon: ComplexArray
+) -> ComplexArray:
+    """Return what the change of the map along each axis adds to the field, (..., tones, 3, 3)."""
+    by_gain = mapped_beacon[..., :, None] * slope[..., None, None, :, 0]
+    across = -skew(field_beacon) @ np.swapaxes(slope[..., None, :, 1:], -1, -2)
+    return np.asarray(by_gain + across)
+
+
 def predict(
     beacon: Beacon,
     magnetometer: Magnetometer,
@@ -97,6 +128,9 @@ def predict(
     offset = _offset_beacon(beacon, magnetometer, world_from_body, position_world)
     _, coils = _coil_fields(beacon, offset)
     in_beacon = np.swapaxes(_turned(beacon.excitation, phase), -1, -2) @ coils
+    mapped = _mapped(beacon, offset)
+    if mapped is not None:
+        in_beacon = (mapped[0] @ in_beacon[..., None])[..., 0]
     beacon_from_body = beacon.world_from_beacon.T @ world_from_body
     in_body = in_beacon @ beacon_from_body
     return np.asarray(in_body @ (magnetometer.body_from_sensor @ magnetometer.matrix.T))
@@ -114,7 +148,10 @@ def observe(
 
     ::
 
-        Y = S sensor_from_body body_from_world world_from_beacon [G(r_j) m_j]_j X diag(exp(i phase))
+        Y = S sensor_from_body body_from_world C world_from_beacon [G(r_j) m_j]_j X
+            diag(exp(i phase))
+
+    C is the beacon's field map at the sensor, the identity where it has none.
 
     Parameters
     ----------
@@ -136,32 +173,20 @@ def observe(
         Leading axes as those of the poses.
     """
     mounting, matrix = magnetometer.body_from_sensor, magnetometer.matrix
-    offset_beacon = _offset_beacon(beacon, magnetometer, world_from_body, position_world)
-    offset, coils = _coil_fields(beacon, offset_beacon)
-    drive = _turned(beacon.excitation, phase)
-    tones_from_coils = np.swapaxes(drive, -1, -2)  # (..., tones, coils)
-    field_beacon = tones_from_coils @ coils
-    gradients = dipole_gradient(offset, beacon.moments_beacon)
-    flat = gradients.reshape(*gradients.shape[:-2], 9)
-    gradient_beacon = (tones_from_coils @ flat).reshape(*field_beacon.shape, 3)
-
-    body_from_beacon = np.swapaxes(world_from_body, -1, -2) @ beacon.world_from_beacon
+    seen = _seen(beacon, magnetometer, world_from_body, position_world, phase)
+    phasor, platform_pose = seen.phasor_sensor, seen.platform_pose
+    field_beacon = seen.tones_from_coils @ seen.coils_beacon
     sensor_from_body = matrix @ mounting.T
-    measured_from_beacon = (sensor_from_body @ body_from_beacon)[..., None, :, :]
-    field_body = field_beacon @ np.swapaxes(body_from_beacon, -1, -2)
-    phasor = field_body @ sensor_from_body.T
-    in_sensor = field_body @ mounting
+    measured_from_beacon = (sensor_from_body @ seen.body_from_beacon)[..., None, :, :]
+    in_sensor = field_beacon @ (np.swapaxes(seen.body_from_beacon, -1, -2) @ mounting)
 
-    by_beacon_offset = measured_from_beacon @ gradient_beacon
-    by_body = by_beacon_offset @ np.swapaxes(body_from_beacon, -1, -2)[..., None, :, :]
-    platform_rotation = sensor_from_body @ skew(field_body) - by_body @ skew(
-        magnetometer.position_body
-    )
-    platform_pose = np.concatenate([platform_rotation, by_body], axis=-1)
-    beacon_rotation = by_beacon_offset @ skew(offset_beacon)[
+    by_body = platform_pose[..., 3:]
+    by_beacon_offset = by_body @ seen.body_from_beacon[..., None, :, :]
+    beacon_rotation = by_beacon_offset @ skew(seen.offset_beacon)[
         ..., None, :, :
     ] - measured_from_beacon @ skew(field_beacon)
-    by_coil = coils[..., None, :, :] * tones_from_coils[..., None]  # (..., tones, coils, 3)
+    # (..., tones, coils, 3)
+    by_coil = seen.coils_beacon[..., None, :, :] * seen.tones_from_coils[..., None]
     by_matrix = np.zeros((*in_sensor.shape, 3, 3), dtype=np.complex128)
     for row in range(3):
         by_matrix[..., row, row, :] = in_sensor
@@ -181,7 +206,76 @@ def observe(
     )
 
 
-def model_error_cov(phasor_sensor: ComplexArray, model_error: float) -> Array:
+def observe_from(
+    beacon: Beacon,
+    magnetometer: Magnetometer,
+    world_from_body: Array,
+    position_world: Array,
+    phase: Array | None = None,
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return what `observe` returns of the platform alone, at a fraction of the cost.
+
+    Parameters
+    ----------
+    beacon, magnetometer, world_from_body, position_world, phase
+        As in `observe`.
+
+    Returns
+    -------
+    phasor_sensor : complex ndarray, shape (..., tones, 3)
+        (T), measured axes.
+    platform_pose : complex ndarray, shape (..., tones, 3, 6)
+        Right perturbation of world_from_body: rotation, translation, body axes (T/rad, T/m).
+    """
+    seen = _seen(beacon, magnetometer, world_from_body, position_world, phase)
+    return seen.phasor_sensor, seen.platform_pose
+
+
+class _Seen(NamedTuple):
+    """What the blocks of an observation have in common."""
+
+    phasor_sensor: ComplexArray
+    platform_pose: ComplexArray
+    offset_beacon: Array
+    coils_beacon: Array  # (..., coils, 3), field of each coil
+    tones_from_coils: ComplexArray  # (..., tones, coils)
+    body_from_beacon: Array
+
+
+def _seen(
+    beacon: Beacon,
+    magnetometer: Magnetometer,
+    world_from_body: Array,
+    position_world: Array,
+    phase: Array | None,
+) -> _Seen:
+    offset_beacon = _offset_beacon(beacon, magnetometer, world_from_body, position_world)
+    offset, coils = _coil_fields(beacon, offset_beacon)
+    tones_from_coils = np.swapaxes(_turned(beacon.excitation, phase), -1, -2)
+    body_from_beacon = np.swapaxes(world_from_body, -1, -2) @ beacon.world_from_beacon
+    beacon_from_body = np.swapaxes(body_from_beacon, -1, -2)
+    sensor_from_body = magnetometer.matrix @ magnetometer.body_from_sensor.T
+    # Coil by coil all is real; only their sum in a tone is complex.
+    in_body = coils @ beacon_from_body
+    gradients = dipole_gradient(offset, beacon.moments_beacon)
+    by_body = (sensor_from_body @ body_from_beacon)[..., None, :, :] @ gradients
+    by_body = by_body @ beacon_from_body[..., None, :, :]
+    by_rotation = sensor_from_body @ skew(in_body) - by_body @ skew(magnetometer.position_body)
+    parts = (in_body @ sensor_from_body.T, by_rotation, by_body)
+    by_coil = np.concatenate([p.reshape(*coils.shape[:-1], -1) for p in parts], axis=-1)
+    in_tones = tones_from_coils @ by_coil
+    jacobian = in_tones[..., 3:].reshape(*in_tones.shape[:-1], 2, 3, 3)
+    return _Seen(
+        phasor_sensor=in_tones[..., :3],
+        platform_pose=np.concatenate([jacobian[..., 0, :, :], jacobian[..., 1, :, :]], axis=-1),
+        offset_beacon=offset_beacon,
+        coils_beacon=coils,
+        tones_from_coils=tones_from_coils,
+        body_from_beacon=body_from_beacon,
+    )
+
+
+def model_error_cov(phasor_sensor: ComplexArray, model_error: float | Array) -> Array:
     """Return the variance that an inexact field model adds to each component of a phasor.
 
     ``eps^2 |b|^2 / 3``, with ``|b|^2`` the mean square of the two quadratures: plain white-noise
@@ -191,7 +285,7 @@ def model_error_cov(phasor_sensor: ComplexArray, model_error: float) -> Array:
     ----------
     phasor_sensor : complex ndarray, shape (..., 3)
         (T)
-    model_error : float
+    model_error : float or ndarray, shape (...)
         Relative error of the field model, one sigma.
 
     Returns
@@ -200,4 +294,4 @@ def model_error_cov(phasor_sensor: ComplexArray, model_error: float) -> Array:
         (T^2)
     """
     power = 0.5 * np.sum(np.abs(phasor_sensor) ** 2, axis=-1)
-    return np.asarray(model_error**2 * power[..., None, None] / 3.0 * np.eye(3))
+    return np.asarray((model_error**2 * power)[..., None, None] / 3.0 * np.eye(3))
