@@ -314,6 +314,7 @@ def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) 
         "duration_s": config.duration,
         "imu_samples": len(simulated.log.imu),
         "time_offset_s": simulated.time_offset,
+        "iron_spheres": config.iron,
     }
     with claimed as directory:
         write_log(simulated.log, directory)

@@ -38,6 +38,9 @@ def simulate(
     perturb: Annotated[
         bool, typer.Option(help="Draw the true calibration from the site's sigmas.")
     ] = True,
+    iron: Annotated[
+        int, typer.Option(min=0, help="Steel spheres around the room, 0.5 m from it and more.")
+    ] = 0,
     seed: Annotated[int, typer.Option(help="Of every random draw.")] = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -45,7 +48,11 @@ def simulate(
     check_simulation(duration, 1.0, 1e6, seed)
     declared = demo_site() if site is None else load_site(site)
     config = SimulationConfig(
-        box_world=box_option(box), duration=duration, motion=motion.value, perturb=perturb
+        box_world=box_option(box),
+        duration=duration,
+        motion=motion.value,
+        perturb=perturb,
+        iron=iron,
     )
     figures = run_simulate(declared, config, output, seed)
     show_result(figures, output, as_json)

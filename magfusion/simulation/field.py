@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.physics.solenoid import solenoid_field
+from magfusion.simulation.disturbance import Spheres
 from magfusion.site import Beacon, Coil, Site
 from magfusion.units import Array, ComplexArray
 
@@ -56,8 +57,21 @@ def beacon_fields_world(beacon: Beacon, point_world: Array) -> Array:
     return np.asarray(fields_beacon @ beacon.world_from_beacon.T)
 
 
-def phasors_world(beacon: Beacon, point_world: Array) -> ComplexArray:
-    """Return the phasor of each tone without phase or drift of the drive, (n, tones, 3) (T)."""
+def phasors_world(
+    beacon: Beacon, point_world: Array, spheres: Spheres | None = None
+) -> ComplexArray:
+    """Return the phasor of each tone without phase or drift of the drive, (n, tones, 3) (T).
+
+    With what the spheres, if any, add to it.
+    """
+    phasors = _primary_world(beacon, point_world)
+    if spheres is not None:
+        at_spheres = _primary_world(beacon, spheres.position_world)
+        phasors += spheres.secondary_world(at_spheres, beacon.tone_frequencies_hz, point_world)
+    return phasors
+
+
+def _primary_world(beacon: Beacon, point_world: Array) -> ComplexArray:
     fields = beacon_fields_world(beacon, point_world)
     phasors = np.zeros((len(point_world), len(beacon.tones), 3), dtype=np.complex128)
     for j, coil in enumerate(beacon.coils):

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.physics.earth import earth_field_world
 from magfusion.records.samples import FieldSamples, Log
+from magfusion.simulation.disturbance import Ambient, Spheres, draw_spheres
 from magfusion.simulation.field import Drives, phasors_world, synchronised_drives
 from magfusion.simulation.inertial import BiasInstability, simulate_imu
 from magfusion.simulation.motion import (
@@ -57,6 +58,11 @@ class SimulationConfig:
         Step of the magnetometer (T).
     instability : BiasInstability, optional
         Of the IMU, beside its bias walk.
+    ambient : Ambient, optional
+        Iron, noise and drift of the room.
+    iron : int
+        Steel spheres drawn around the box, by `magfusion.simulation.disturbance.draw_spheres`;
+        where there are any they take the place of the ambient's.
     """
 
     box_world: Array
@@ -72,6 +78,8 @@ class SimulationConfig:
     mains: Mains | None = None
     quantisation: float | None = None
     instability: BiasInstability | None = None
+    ambient: Ambient | None = None
+    iron: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +96,15 @@ class SimulatedLog:
         True phases and drifts.
     motion : Motion
         Exact truth at any time.
+    ambient : Ambient, optional
+        With the iron that was drawn.
     """
 
     log: Log
     true_site: Site
     drives: Drives
     motion: Motion
+    ambient: Ambient | None = None
 
     @property
     def time_offset(self) -> float:
@@ -104,7 +115,7 @@ class SimulatedLog:
 def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator) -> SimulatedLog:
     """Return a simulated log of a body moving among the beacons of a site.
 
-    Calibration, motion, IMU and magnetometer have generators of their own, spawned from ``rng``:
+    Calibration, motion, IMU, magnetometer and iron have generators of their own, spawned from it:
     a change to one leaves the draws of the others as they were.
 
     Raises
@@ -112,12 +123,13 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
     InputError
         If the configuration or the site cannot be simulated.
     """
-    calibration_rng, motion_rng, imu_rng, magnetometer_rng = rng.spawn(4)
+    calibration_rng, motion_rng, imu_rng, magnetometer_rng, iron_rng = rng.spawn(5)
     declared = _with_earth_field(site)
     true_site = perturb_site(declared, calibration_rng) if config.perturb else declared
     true_site = _with_instruments(true_site, config)
     drives = draw_drives(true_site, calibration_rng)
     motion = _motion(config, motion_rng)
+    ambient = _with_iron(true_site, config, iron_rng)
     imu = simulate_imu(
         motion,
         true_site.platform.imu,
@@ -137,6 +149,7 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         magnetometer_rng,
         config.mains,
         config.quantisation,
+        ambient,
     )
     stamp = imu.samples.time
     taken = stamp + true_site.platform.imu.time_offset
@@ -153,7 +166,7 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         waveform=waveform,
         truth=truth,
     )
-    return SimulatedLog(log, true_site, drives, motion)
+    return SimulatedLog(log, true_site, drives, motion, ambient)
 
 
 def simulate_fields(
@@ -163,6 +176,7 @@ def simulate_fields(
     rng: np.random.Generator,
     drives: Drives | None = None,
     window: float = 0.4,
+    spheres: Spheres | None = None,
 ) -> FieldSamples:
     """Return phasors with white noise directly, without a waveform and its receiver.
 
@@ -179,6 +193,8 @@ def simulate_fields(
         As the site declares where there is none.
     window : float
         Length that the samples claim (s); the field is that of the instant.
+    spheres : Spheres, optional
+        Iron in the room.
 
     Returns
     -------
@@ -194,7 +210,8 @@ def simulate_fields(
     drifts = np.repeat(drives.drift, [len(b.tones) for b in site.beacons])
     frequencies_hz = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
     phase = drives.phase + 2.0 * np.pi * drifts * frequencies_hz * time[:, None]
-    world = np.concatenate([phasors_world(b, point_world) for b in site.beacons], axis=1)
+    fields_world = [phasors_world(b, point_world, spheres) for b in site.beacons]
+    world = np.concatenate(fields_world, axis=1)
     turned = world * np.exp(1j * phase)[..., None]
     phasor = turned @ world_from_sensor @ magnetometer.matrix.T
     noise = rng.normal(0.0, sigma, (2, *phasor.shape))
@@ -274,6 +291,16 @@ def _with_instruments(site: Site, config: SimulationConfig) -> Site:
     )
     magnetometer = replace(magnetometer, noise_density=scale * magnetometer.noise_density)
     return replace(site, platform=replace(site.platform, imu=imu, magnetometer=magnetometer))
+
+
+def _with_iron(site: Site, config: SimulationConfig, rng: np.random.Generator) -> Ambient | None:
+    if config.iron < 0:
+        raise InputError(f"iron: found {config.iron} spheres; give none or more")
+    if config.iron == 0:
+        return config.ambient
+    beacons_world = np.array([beacon.position_world for beacon in site.beacons]).reshape(-1, 3)
+    spheres = draw_spheres(rng, config.iron, config.box_world, beacons_world)
+    return replace(config.ambient or Ambient(), spheres=spheres)
 
 
 def _motion(config: SimulationConfig, rng: np.random.Generator) -> Motion:

@@ -6,6 +6,7 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.records.samples import Waveform
+from magfusion.simulation.disturbance import Ambient, Spheres
 from magfusion.simulation.field import Drives, phasors_world
 from magfusion.simulation.motion import Motion
 from magfusion.site import Site
@@ -47,6 +48,7 @@ def simulate_waveform(
     rng: np.random.Generator,
     mains: Mains | None = None,
     quantisation: float | None = None,
+    ambient: Ambient | None = None,
 ) -> Waveform:
     """Return the field of everything at each sample's own pose, as the magnetometer gives it.
 
@@ -66,12 +68,14 @@ def simulate_waveform(
         does not filter.
     quantisation : float, optional
         Step of the instrument (T).
+    ambient : Ambient, optional
+        Iron, noise and drift of the room.
 
     Raises
     ------
     InputError
-        If the rate is too low for the tones, or coils are driven in time slots, whose schedule
-        no site declares.
+        If the rate is too low for the tones, coils are driven in time slots, whose schedule no
+        site declares, or the motion leads through iron.
     """
     _check_tones(site, rate_hz)
     count = int(np.floor(duration * rate_hz * (1.0 + 1e-12)))
@@ -84,11 +88,14 @@ def simulate_waveform(
     world_from_body = motion.world_from_body(time)
     lever_world = world_from_body.apply(magnetometer.position_body)
     point_world = motion.position_world(time) + lever_world
-    field_world = _beacons_world(site, drives, time, point_world)
+    spheres = None if ambient is None else ambient.spheres
+    field_world = _beacons_world(site, drives, time, point_world, spheres)
     if site.earth_field_world is not None:
         field_world += site.earth_field_world
     if mains is not None:
         field_world += _mains_world(mains, time, rng)
+    if ambient is not None:
+        field_world += ambient.background_world(time, rate_hz, rng)
     field_sensor = world_from_body.inv().apply(field_world) @ magnetometer.body_from_sensor
     measured = field_sensor @ magnetometer.matrix.T + magnetometer.offset
     measured += rng.normal(0.0, magnetometer.noise_density * np.sqrt(rate_hz / 2.0), (count, 3))
@@ -112,11 +119,13 @@ def _check_tones(site: Site, rate_hz: float) -> None:
             )
 
 
-def _beacons_world(site: Site, drives: Drives, time: Array, point_world: Array) -> Array:
+def _beacons_world(
+    site: Site, drives: Drives, time: Array, point_world: Array, spheres: Spheres | None
+) -> Array:
     field_world = np.zeros((len(time), 3))
     first = 0
     for beacon, drift in zip(site.beacons, drives.drift, strict=True):
-        phasors = phasors_world(beacon, point_world)
+        phasors = phasors_world(beacon, point_world, spheres)
         for k, frequency_hz in enumerate(beacon.tone_frequencies_hz):
             turns = 2.0 * np.pi * frequency_hz * (1.0 + drift) * time
             carrier = np.exp(1j * (turns + drives.phase[first + k]))

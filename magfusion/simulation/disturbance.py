@@ -1,0 +1,270 @@
+"""What disturbs the field of the beacons in a true room: iron, day and night, and slow drift."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from magfusion.errors import InputError
+from magfusion.physics.disturbance import induced_field, sphere_polarizability
+from magfusion.units import Array, ComplexArray
+
+DAY = 86_400.0  # s
+CLEARANCE = 0.5  # m from the surface of drawn iron to where the body moves, and to every beacon
+REACH = 1.5  # m beyond that clearance within which iron is drawn
+STEEL_PERMEABILITY = 100.0
+STEEL_CONDUCTIVITY = 5e6  # S/m
+_ATTEMPTS = 200  # to place one sphere
+_FEATURES = 512
+
+
+@dataclass(frozen=True, eq=False)
+class Spheres:
+    """Permeable or conducting spheres, which answer every tone with a field of their own.
+
+    Parameters
+    ----------
+    position_world : ndarray, shape (n, 3)
+        (m)
+    radius : ndarray, shape (n,)
+        (m)
+    permeability : ndarray, shape (n,)
+        Relative.
+    conductivity : ndarray, shape (n,)
+        (S/m)
+    """
+
+    position_world: Array
+    radius: Array
+    permeability: Array
+    conductivity: Array
+
+    def __len__(self) -> int:
+        return len(self.radius)
+
+    def secondary_world(
+        self, primary_world: ComplexArray, frequencies_hz: Array, point_world: Array
+    ) -> ComplexArray:
+        """Return the phasors that the spheres add at points.
+
+        Parameters
+        ----------
+        primary_world : complex ndarray, shape (spheres, tones, 3)
+            At the spheres' centres (T).
+        frequencies_hz : ndarray, shape (tones,)
+        point_world : ndarray, shape (n, 3)
+            (m)
+
+        Returns
+        -------
+        complex ndarray, shape (n, tones, 3)
+            (T)
+
+        Raises
+        ------
+        InputError
+            If a point lies inside a sphere.
+        """
+        for k, (place, radius) in enumerate(zip(self.position_world, self.radius, strict=True)):
+            square = np.sum((point_world - place) ** 2, axis=1)
+            if np.any(square < radius**2):
+                raise InputError(
+                    f"spheres: the magnetometer passes through sphere {k} of radius {radius:g} m at"
+                    f" {np.round(place, 3).tolist()}; move it out of the way"
+                )
+        polarizability = sphere_polarizability(
+            self.radius[:, None],
+            self.permeability[:, None],
+            self.conductivity[:, None],
+            2.0 * np.pi * frequencies_hz,
+        )
+        return induced_field(point_world, self.position_world, polarizability, primary_world)
+
+
+def draw_spheres(
+    rng: np.random.Generator,
+    count: int,
+    box_world: Array,
+    beacons_world: Array,
+    radius_range: tuple[float, float] = (0.1, 0.3),
+    permeability: float = STEEL_PERMEABILITY,
+    conductivity: float = STEEL_CONDUCTIVITY,
+) -> Spheres:
+    """Return spheres around a box, none near it, near a beacon or in another.
+
+    The surface of each is at least `CLEARANCE` from the box and from every beacon's centre; its
+    centre is drawn evenly from the box grown by its radius, `CLEARANCE` and `REACH` on all sides.
+
+    Parameters
+    ----------
+    rng : Generator
+    count : int
+    box_world : ndarray, shape (2, 3)
+        Lower and upper corner (m) of where the body moves.
+    beacons_world : ndarray, shape (beacons, 3)
+        (m)
+    radius_range : tuple of float
+        Radii are drawn evenly between these (m).
+    permeability, conductivity : float
+        Of all spheres (relative; S/m).
+
+    Raises
+    ------
+    InputError
+        If so many do not fit.
+    """
+    radius = rng.uniform(*radius_range, count)
+    position_world = np.zeros((count, 3))
+    for k in range(count):
+        grown = radius[k] + CLEARANCE + REACH
+        drawn = rng.uniform(box_world[0] - grown, box_world[1] + grown, (_ATTEMPTS, 3))
+        to_box = np.linalg.norm(drawn - np.clip(drawn, box_world[0], box_world[1]), axis=1)
+        free = _farther(drawn, beacons_world, np.full(len(beacons_world), radius[k] + CLEARANCE))
+        free &= _farther(drawn, position_world[:k], radius[k] + radius[:k])
+        fits = np.flatnonzero(free & (to_box > radius[k] + CLEARANCE))
+        if len(fits) == 0:
+            raise InputError(
+                f"iron: found {count} spheres, and room for {k} around where the body moves;"
+                " give fewer, or a larger box"
+            )
+        position_world[k] = drawn[fits[0]]
+    return Spheres(
+        position_world, radius, np.full(count, permeability), np.full(count, conductivity)
+    )
+
+
+def _farther(point: Array, others: Array, least: Array) -> np.ndarray:
+    """Tell which points are farther from all others than the least distance of each."""
+    between = np.linalg.norm(point[:, None] - others, axis=-1)
+    return np.asarray((between > least).all(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class SmoothField:
+    """Gaussian random functions of a place (or of time), of a Gaussian covariance.
+
+    Sums of waves with random vectors and amplitudes (random Fourier features): for any two places
+    at distance d the covariance is ``rms^2 exp(-d^2 / (2 length^2))`` in the mean over draws.
+
+    Parameters
+    ----------
+    wave : ndarray, shape (features, dimension)
+        Wave vectors (rad per unit).
+    cosine, sine : ndarray, shape (features, functions)
+        Amplitudes.
+    """
+
+    wave: Array
+    cosine: Array
+    sine: Array
+
+    def __call__(self, place: Array) -> Array:
+        """Return the functions' values, shape (n, functions), at places (n, dimension)."""
+        angle = place @ self.wave.T
+        return np.asarray(np.cos(angle) @ self.cosine + np.sin(angle) @ self.sine)
+
+
+def draw_smooth(
+    rng: np.random.Generator, rms: float, length: float, functions: int, dimension: int = 3
+) -> SmoothField:
+    """Return independent random functions.
+
+    Parameters
+    ----------
+    rng : Generator
+    rms : float
+        Of each function's value at a place, over draws.
+    length : float
+        Of correlation, in the unit of the places.
+    functions, dimension : int
+    """
+    wave = rng.standard_normal((_FEATURES, dimension)) / length
+    amplitude = rng.standard_normal((2, _FEATURES, functions)) * rms / np.sqrt(_FEATURES)
+    return SmoothField(wave, amplitude[0], amplitude[1])
+
+
+@dataclass(frozen=True)
+class DayNight:
+    """White noise of the surroundings, quiet at night and loud by day, along a cosine.
+
+    Parameters
+    ----------
+    night, day : float
+        One-sided density at its least and at its most (T/sqrt(Hz)).
+    loudest_time : float
+        When it is most, seconds since the log's epoch; once a day.
+    """
+
+    night: float
+    day: float
+    loudest_time: float = 0.0
+
+    def density(self, time: Array) -> Array:
+        """Return the one-sided density (T/sqrt(Hz)) at the times, shape (n,)."""
+        share = 0.5 + 0.5 * np.cos(2.0 * np.pi * (time - self.loudest_time) / DAY)
+        return np.asarray(self.night + (self.day - self.night) * share)
+
+
+@dataclass(frozen=True)
+class FieldDrift:
+    """Slow, smooth, random change of the field at rest.
+
+    Parameters
+    ----------
+    rms : float
+        Of each world component (T).
+    time : float
+        Of correlation (s).
+    """
+
+    rms: float
+    time: float
+
+
+@dataclass(frozen=True, eq=False)
+class Ambient:
+    """Everything in the room beside beacons, Earth and mains; what is None is not there.
+
+    Parameters
+    ----------
+    spheres : Spheres, optional
+    day_night : DayNight, optional
+    drift : FieldDrift, optional
+    """
+
+    spheres: Spheres | None = None
+    day_night: DayNight | None = None
+    drift: FieldDrift | None = None
+
+    def background_world(self, time: Array, rate_hz: float, rng: np.random.Generator) -> Array:
+        """Return noise and drift at the samples of an instrument.
+
+        Parameters
+        ----------
+        time : ndarray, shape (n,)
+            (s)
+        rate_hz : float
+        rng : Generator
+
+        Returns
+        -------
+        ndarray, shape (n, 3)
+            (T)
+        """
+        field_world = np.zeros((len(time), 3))
+        if self.day_night is not None:
+            sigma = self.day_night.density(time) * np.sqrt(rate_hz / 2.0)
+            field_world += sigma[:, None] * rng.standard_normal(field_world.shape)
+        if self.drift is not None:
+            field_world += _drift_world(self.drift, time, rng)
+        return field_world
+
+
+def _drift_world(drift: FieldDrift, time: Array, rng: np.random.Generator) -> Array:
+    """Return the drift at times (n,), by a cubic spline through fifty knots a correlation time."""
+    smooth = draw_smooth(rng, drift.rms, drift.time, 3, dimension=1)
+    span = float(time[-1] - time[0])
+    knots = np.linspace(time[0], time[-1], 4 + int(np.ceil(50.0 * span / drift.time)))
+    if len(knots) >= len(time):
+        return smooth(time[:, None])
+    return np.asarray(CubicSpline(knots, smooth(knots[:, None]))(time))
