@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.observation import Observation, observe, predict
+from magfusion.observation import Observation, observe, observe_from, predict
 from magfusion.site import Beacon, Site
 from magfusion.units import Array, ComplexArray
 
@@ -21,6 +21,7 @@ GROUPS = ("beacons", "moments", "phase", "magnetometer", "extrinsics", "time-off
 
 PHASE_SIGMA = 1e2  # rad; wide enough to be no information
 DRIFT_SIGMA = 2e-5  # relative; ordinary crystal oscillators
+_BY_PHASOR = ("phase", "drift", "gain")  # kinds whose Jacobian is the phasor but for a factor
 
 # A survey this good is held at its declared values; what it may still be wrong by is considered in
 # the covariance of the result.
@@ -65,6 +66,10 @@ class Calibration:
         The IMU's sample stamped t was taken at t + time_offset (s).
     reference_time : float
         Where ``phase`` holds (s).
+    log_gain : ndarray, shape (channels,)
+        Logarithm of what each channel's phasor is larger by than the site says.
+
+    ``phase`` and ``log_gain`` may have one row for each pose.
     """
 
     site: Site
@@ -72,6 +77,7 @@ class Calibration:
     drift: Array
     time_offset: float
     reference_time: float
+    log_gain: Array
 
     def drive_phase(self, time: Array) -> Array:
         """Return the phase of every channel at the given times, shape (..., channels) (rad)."""
@@ -89,6 +95,7 @@ def initial_calibration(site: Site, reference_time: float) -> Calibration:
         drift=np.zeros(len(site.beacons)),
         time_offset=site.platform.imu.time_offset,
         reference_time=reference_time,
+        log_gain=np.zeros(len(site.channels)),
     )
 
 
@@ -197,7 +204,7 @@ def _moved_magnetometer(site: Site, kind: str, step: Array) -> Site:
 def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) -> Calibration:
     """Return the calibration moved by a tangent vector, shape (dimension,)."""
     site, phase, drift = calibration.site, calibration.phase.copy(), calibration.drift.copy()
-    time_offset = calibration.time_offset
+    time_offset, log_gain = calibration.time_offset, calibration.log_gain.copy()
     names = [b.name for b in site.beacons]
     for block in blocks:
         part = np.array(step[block.columns])  # GTSAM's vectors are read-only
@@ -207,13 +214,22 @@ def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) ->
             site = _moved_magnetometer(site, block.kind, part)
         elif block.kind == "phase":
             phase[[owner == block.owner for owner, _ in site.channels]] += part
+        elif block.kind == "gain":
+            log_gain[[owner == block.owner for owner, _ in site.channels]] += part
         elif block.kind == "drift":
             drift[names.index(block.owner)] += float(part[0])
         else:
             index = names.index(block.owner)
             moved = _moved_beacon(site.beacons[index], block.kind, part)
             site = replace(site, beacons=(*site.beacons[:index], moved, *site.beacons[index + 1 :]))
-    return replace(calibration, site=site, phase=phase, drift=drift, time_offset=time_offset)
+    return replace(
+        calibration,
+        site=site,
+        phase=phase,
+        drift=drift,
+        time_offset=time_offset,
+        log_gain=log_gain,
+    )
 
 
 def difference(reference: Calibration, moved: Calibration, blocks: tuple[Block, ...]) -> Array:
@@ -252,6 +268,9 @@ def _beacon_difference(old: Calibration, new: Calibration, block: Block, index: 
     if block.kind == "phase":
         mine = [owner == block.owner for owner, _ in old.site.channels]
         return np.asarray(new.phase[mine] - old.phase[mine])
+    if block.kind == "gain":
+        mine = [owner == block.owner for owner, _ in old.site.channels]
+        return np.asarray((new.log_gain - old.log_gain)[mine][:1])
     sizes = [np.linalg.norm(c.moments_beacon, axis=1) for c in (a, b)]
     return np.asarray(np.log(sizes[1] / sizes[0]))
 
@@ -275,7 +294,8 @@ def predict_channels(
             )
         )
         start = tones.stop
-    return np.concatenate(parts, axis=-2)
+    gain = np.exp(calibration.log_gain)[..., None]
+    return np.asarray(gain * np.concatenate(parts, axis=-2))
 
 
 def linearize_channels(
@@ -312,25 +332,33 @@ def linearize_channels(
     value = np.empty((n, channels, 6))
     by_pose = np.empty((n, channels, 6, 6))
     by_calibration = np.zeros((n, channels, 6, dimension(blocks)))
+    whole = any(block.kind not in _BY_PHASOR for block in blocks)
+    elapsed = time - calibration.reference_time
     start = 0
     for beacon in site.beacons:
         rows = slice(start, start + len(beacon.tones))
-        seen = observe(
-            beacon,
-            site.platform.magnetometer,
-            world_from_body,
-            position_world,
-            phase[..., rows],
-            twist_body,
+        view = (beacon, site.platform.magnetometer, world_from_body, position_world)
+        seen = observe(*view, phase[..., rows], twist_body) if whole else None
+        phasor, pose = (
+            observe_from(*view, phase[..., rows])
+            if seen is None
+            else (seen.phasor_sensor, seen.platform_pose)
         )
-        value[:, rows] = _stacked(seen.phasor_sensor[..., None])[..., 0]
-        by_pose[:, rows] = _stacked(seen.platform_pose)
+        value[:, rows] = _stacked(phasor[..., None])[..., 0]
+        by_pose[:, rows] = _stacked(pose)
         for block in blocks:
-            part = _block_jacobian(beacon, site, block, seen, time - calibration.reference_time)
+            part = (
+                _block_jacobian(beacon, site, block, seen)
+                if block.kind not in _BY_PHASOR and seen is not None
+                else _by_phasor(beacon, block, phasor, elapsed)
+            )
             if part is not None:
                 by_calibration[:, rows, :, block.columns] = _stacked(part)
         start = rows.stop
-    return value, by_pose, by_calibration
+    if not np.any(calibration.log_gain):
+        return value, by_pose, by_calibration
+    gain = np.exp(calibration.log_gain)[..., None]
+    return gain * value, gain[..., None] * by_pose, gain[..., None] * by_calibration
 
 
 def _stacked(block: ComplexArray) -> Array:
@@ -338,11 +366,11 @@ def _stacked(block: ComplexArray) -> Array:
 
 
 def _block_jacobian(
-    beacon: Beacon, site: Site, block: Block, seen: Observation, elapsed: Array
+    beacon: Beacon, site: Site, block: Block, seen: Observation
 ) -> ComplexArray | None:
     """Return the columns of a block, shape (n, tones, 3, columns); None where it has no bearing."""
-    if block.group in ("beacons", "moments", "phase"):
-        return None if block.owner != beacon.name else _own(beacon, block, seen, elapsed)
+    if block.group in ("beacons", "moments"):
+        return None if block.owner != beacon.name else _own(beacon, block, seen)
     if block.kind == "matrix":
         return seen.matrix
     if block.kind == "time_offset":
@@ -355,14 +383,22 @@ def _block_jacobian(
     return np.asarray(seen.body_from_sensor[..., 3:] @ mounting.T)
 
 
-def _own(beacon: Beacon, block: Block, seen: Observation, elapsed: Array) -> ComplexArray:
+def _own(beacon: Beacon, block: Block, seen: Observation) -> ComplexArray:
     if block.kind == "rotation":
         return seen.beacon_pose[..., :3]
     if block.kind == "position":
         return np.asarray(seen.beacon_pose[..., 3:] @ beacon.world_from_beacon.T)
-    if block.kind == "log_moment":
-        return seen.log_moments
+    return seen.log_moments
+
+
+def _by_phasor(
+    beacon: Beacon, block: Block, phasor: ComplexArray, elapsed: Array
+) -> ComplexArray | None:
+    if block.owner != beacon.name:
+        return None
+    if block.kind == "gain":
+        return phasor[..., None]
     if block.kind == "phase":
-        return np.asarray(seen.phase[..., None] * np.eye(len(beacon.tones))[:, None, :])
+        return np.asarray(1j * phasor[..., None] * np.eye(len(beacon.tones))[:, None, :])
     rate = 2.0 * np.pi * beacon.tone_frequencies_hz[:, None] * elapsed[:, None, None]
-    return np.asarray((seen.phase * rate)[..., None])
+    return np.asarray((1j * phasor * rate)[..., None])

@@ -13,6 +13,7 @@ from magfusion.parameters import (
     GROUPS,
     NEGLIGIBLE,
     PHASE_SIGMA,
+    Block,
     choose_blocks,
     difference,
     dimension,
@@ -34,12 +35,16 @@ REFERENCE_TIME = 40.0  # s
 STEPS = {"drift": 1e-8}
 
 ALL = choose_blocks(mixed_site(), GROUPS)
+GAINS = tuple(
+    Block("gain", name, "gain", slice(i, i + 1), np.array([0.2])) for i, name in enumerate("ABC")
+)
 
 
 def moved_calibration(seed=1):
     """Return a calibration away from the declared one in every parameter."""
     declared = initial_calibration(mixed_site(), REFERENCE_TIME)
-    return retract(declared, ALL, small_step(seed))
+    gained = retract(declared, GAINS, np.array([0.1, -0.2, 0.3]))
+    return retract(gained, ALL, small_step(seed))
 
 
 def small_step(seed):
@@ -126,7 +131,7 @@ def test_retract_turns_on_the_right_and_shifts_beacons_in_world_axes():
     np.testing.assert_allclose(new.position_body, lever, rtol=1e-13)
 
 
-@pytest.mark.parametrize("block", ALL, ids=lambda block: block.name)
+@pytest.mark.parametrize("block", ALL + GAINS, ids=lambda block: block.name)
 def test_each_block_of_the_jacobian_is_the_derivative_through_retract(block):
     start, (time, rotation, position) = moved_calibration(), epochs()
     rate, velocity_body = np.random.default_rng(11).normal(size=(2, len(time), 3))
@@ -141,7 +146,8 @@ def test_each_block_of_the_jacobian_is_the_derivative_through_retract(block):
         return real(predict_channels(moved, time, turned, place))
 
     twist = np.concatenate([rate, velocity_body], axis=1)
-    value, _, columns = linearize_channels(start, ALL, time, rotation, position, twist)
+    blocks = GAINS if block in GAINS else ALL
+    value, _, columns = linearize_channels(start, blocks, time, rotation, position, twist)
     expected = central_difference(predicted, len(block.sigma), STEPS.get(block.kind, 1e-5))
     assert relative_to_group(columns[..., block.columns], expected) < 2e-8
     assert relative_to_group(value, real(predict_channels(start, time, rotation, position))) < 1e-14
@@ -159,6 +165,16 @@ def test_the_poses_block_is_the_derivative_by_the_pose():
     assert relative_to_group(by_pose[..., :3], expected[..., :3]) < 1e-8
     assert relative_to_group(by_pose[..., 3:], expected[..., 3:]) < 1e-8
     assert by_calibration.shape == (*expected.shape[:-1], 0)
+
+
+def test_a_gain_scales_its_beacon_and_no_other_and_difference_finds_it():
+    start = initial_calibration(mixed_site(), REFERENCE_TIME)
+    moved = retract(start, GAINS, np.array([0.1, -0.2, 0.0]))
+    owners = [name for name, _ in start.site.channels]
+    factor = np.exp([{"A": 0.1, "B": -0.2}.get(name, 0.0) for name in owners])
+    plain, scaled = (predict_channels(c, *epochs()) for c in (start, moved))
+    np.testing.assert_allclose(scaled, factor[:, None] * plain, rtol=1e-14)
+    np.testing.assert_allclose(difference(start, moved, GAINS), [0.1, -0.2, 0.0], atol=1e-16)
 
 
 def test_the_time_offset_cannot_be_linearised_without_a_twist():

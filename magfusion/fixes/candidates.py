@@ -9,7 +9,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from magfusion.parameters import Calibration, predict_channels
+from magfusion.parameters import Calibration, initial_calibration, predict_channels
 from magfusion.site import Beacon, Site
 from magfusion.units import MU0_OVER_4PI, Array, BoolArray, ComplexArray
 
@@ -165,9 +165,7 @@ def _predicted_at(calibration: Calibration, sensor_world: Array) -> ComplexArray
     # A body whose sensor axes are the world's; the matrix is undone.
     world_from_body = np.broadcast_to(sensor.body_from_sensor.T, (*sensor_world.shape, 3))
     body = sensor_world - sensor.body_from_sensor.T @ sensor.position_body
-    still = Calibration(
-        site, np.zeros_like(calibration.phase), np.zeros_like(calibration.drift), 0.0, 0.0
-    )
+    still = initial_calibration(site, 0.0)
     time = np.zeros(sensor_world.shape[:-1])
     measured = predict_channels(still, time, world_from_body, body)
     return np.asarray(measured @ np.linalg.inv(sensor.matrix).T)

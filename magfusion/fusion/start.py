@@ -1,6 +1,6 @@
 """A start for the smoother: the chain of hypotheses that the motion joins best."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -173,9 +173,7 @@ def start_phases(calibration: Calibration, time: Array, phase: Array) -> Calibra
         rate = 2.0 * np.pi * beacon.tone_frequencies_hz * (drift[i] - calibration.drift[i])
         left = np.exp(1j * (phase[:, rows] - elapsed[:, None] * rate))
         new_phase[rows] += np.angle(np.sum(left, axis=0))
-    return Calibration(
-        calibration.site, new_phase, drift, calibration.time_offset, calibration.reference_time
-    )
+    return replace(calibration, phase=new_phase, drift=drift)
 
 
 def _dominant_drift(elapsed: Array, phase: Array, frequency_hz: float) -> float:
