@@ -1,7 +1,7 @@
 """The error model of a magnetometer, and what every calibration of one hands back.
 
-``measured = matrix @ field_sensor + offset``, as logs and sites have it.  Paper 001 writes
-``V = b + K o (B + E B)`` (Eq 1-3, with ``ezy Bz`` where Eq 2 has ``ezy By``), which is the same with
+``measured = matrix @ field_sensor + offset``, as logs and sites have it.  Paper 001 has
+``V = b + K o (B + E B)`` (Eq 1-3, with ``ezy Bz`` for the ``ezy By`` of Eq 2): the same with
 ``matrix = diag(K) (I + E)`` and ``offset = b``.
 
 Gravity and angular rate are known in body axes, the field in sensor axes.  A rotation of the

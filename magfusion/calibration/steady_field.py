@@ -1,0 +1,167 @@
+"""The steady part of a magnetometer's waveform while it is turned by hand: one reading an epoch.
+
+The beacons' tones and the mains average out over a tapered window of several of their periods.  The
+window is long against the motion, so that each sample is first turned by the gyro into the axes of
+the window's centre, with the calibration that is known so far.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.records.samples import ImuSamples, Waveform
+from magfusion.site import Magnetometer, Site
+from magfusion.strapdown import attitude_at, attitude_from_gyro
+from magfusion.units import Array, BoolArray
+
+PERIODS = 8.0  # of the lowest tone in a window; its taper leaves 6e-4 of it, less of the others
+SHORTEST = 0.2  # s; ten periods of the mains
+LONGEST = 2.0  # s; over which a gyro's bias turns less than it matters
+GAP = 1.5  # a gap is this many times the usual sampling interval
+
+
+@dataclass(frozen=True, eq=False)
+class SteadyField:
+    """Readings averaged over windows.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Centre of each window, on the log's clock (s).
+    window : ndarray, shape (n,)
+        Length of each (s).
+    measured_sensor : ndarray, shape (n, 3)
+        As the instrument would read at the centre (T).
+    accel_body : ndarray, shape (n, 3)
+        Mean specific force in the axes of the centre (m/s^2).
+    """
+
+    time: Array
+    window: Array
+    measured_sensor: Array
+    accel_body: Array
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+def window_length(site: Site) -> float:
+    """Return the length of a window (s) over which the tones of a site average out.
+
+    Raises
+    ------
+    InputError
+        Where a tone is too low for that.
+    """
+    lowest = min((float(np.min(b.tone_frequencies_hz)) for b in site.beacons), default=np.inf)
+    length = max(SHORTEST, PERIODS / lowest)
+    if length > LONGEST:
+        raise InputError(
+            f"a tone at {lowest:g} Hz is too low to average out while the sensor turns; switch that"
+            f" beacon off, or use tones above {PERIODS / LONGEST:g} Hz"
+        )
+    return length
+
+
+def steady_field(
+    waveform: Waveform, imu: ImuSamples, site: Site, *, magnetometer: Magnetometer | None = None
+) -> SteadyField:
+    """Average a waveform over windows that follow each other.
+
+    Parameters
+    ----------
+    waveform : Waveform
+    imu : ImuSamples
+    site : Site
+    magnetometer : Magnetometer, optional
+        The calibration known so far; the site's where it is not given.
+
+    Raises
+    ------
+    InputError
+        Where no window lies in both streams without a gap.
+    """
+    length = window_length(site)
+    offset = site.platform.imu.time_offset
+    begin = max(waveform.time[0], imu.time[0] + offset)
+    end = min(waveform.time[-1], imu.time[-1] + offset)
+    centre = np.arange(begin + 0.5 * length, end - 0.5 * length, length)
+    window = np.full(len(centre), length)
+    known = site.platform.magnetometer if magnetometer is None else magnetometer
+    return average(waveform, imu, offset, known, centre, window)
+
+
+def average(
+    waveform: Waveform,
+    imu: ImuSamples,
+    time_offset: float,
+    magnetometer: Magnetometer,
+    centre: Array,
+    window: Array,
+) -> SteadyField:
+    """Average waveform and specific force over the windows given, leaving out those with a gap.
+
+    Parameters
+    ----------
+    waveform : Waveform
+    imu : ImuSamples
+    time_offset : float
+        Added to the IMU's stamps (s).
+    magnetometer : Magnetometer
+        Calibration with which samples are turned.
+    centre, window : ndarray, shape (n,)
+        (s)
+
+    Raises
+    ------
+    InputError
+        Where no window is left.
+    """
+    imu_time = imu.time + time_offset
+    whole = _whole(waveform.time, centre, window) & _whole(imu_time, centre, window)
+    if not np.any(whole):
+        raise InputError(
+            "magnetometer: no stretch is long enough without a gap for the beacons' tones to"
+            " average out; record at least a minute of slow turning"
+        )
+    centre, window = centre[whole], window[whole]
+    attitude = attitude_from_gyro(imu_time, imu.gyro_body)
+    at_samples = attitude_at(attitude, imu_time, imu.gyro_body, waveform.time)
+    at_centre = attitude_at(attitude, imu_time, imu.gyro_body, centre)
+    body_from_measured = magnetometer.body_from_sensor @ np.linalg.inv(magnetometer.matrix)
+    centred = (waveform.measured_sensor - magnetometer.offset) @ body_from_measured.T
+    field = _turned_means(waveform.time, centred, at_samples, at_centre, centre, window)
+    accel = _turned_means(imu_time, imu.accel_body, attitude, at_centre, centre, window)
+    measured = field @ np.linalg.inv(body_from_measured).T + magnetometer.offset
+    return SteadyField(centre, window, measured, accel)
+
+
+def _turned_means(
+    time: Array, body: Array, attitude: Rotation, at_centre: Rotation, centre: Array, window: Array
+) -> Array:
+    means = _tapered_means(time, attitude.apply(body), centre, window)
+    return np.asarray(at_centre.inv().apply(means))
+
+
+def _whole(time: Array, centre: Array, window: Array) -> BoolArray:
+    """Tell which windows lie in a stream without a gap."""
+    usual = float(np.median(np.diff(time)))
+    gaps = np.flatnonzero(np.diff(time) > GAP * usual)
+    first, last = centre - 0.5 * window, centre + 0.5 * window
+    inside = (first > time[0] - usual) & (last < time[-1] + usual)
+    met = np.searchsorted(time[gaps], last) > np.searchsorted(time[gaps + 1], first)
+    return np.asarray(inside & ~met)
+
+
+def _tapered_means(time: Array, vector: Array, centre: Array, window: Array) -> Array:
+    """Return means under a raised cosine, shape (n, 3)."""
+    out = np.empty((len(centre), 3))
+    first = np.searchsorted(time, centre - 0.5 * window)
+    last = np.searchsorted(time, centre + 0.5 * window, side="right")
+    for i, (begin, end) in enumerate(zip(first, last, strict=True)):
+        part = slice(begin, end)
+        weight = 1.0 + np.cos(2.0 * np.pi * (time[part] - centre[i]) / window[i])
+        out[i] = weight @ vector[part] / np.sum(weight)
+    return out
