@@ -76,34 +76,30 @@ def _coil_fields(beacon: Beacon, offset_beacon: Array) -> tuple[Array, Array]:
     return offset, dipole_field(offset, beacon.moments_beacon)
 
 
-def _mapped(beacon: Beacon, offset_beacon: Array) -> tuple[Array, Array] | None:
-    """Return the map's correction and its derivative, both in beacon axes; None without a map.
+class _Mapped(NamedTuple):
+    """What a field map makes of the model, beacon axes."""
 
-    The first, of shape (..., 1, 3, 3), multiplies the model's field.  The second, (..., 3, 4, 3)
-    at ``[j, c]``, is what the position along j adds to gain (c = 0) and rotation, see `_map_slope`.
-    """
+    model_beacon: Array  # (..., coils, 3), field of each coil without the map
+    correction: Array  # (..., 1, 3, 3), multiplies it
+    slope: Array  # (..., coils, 3, 3), what the map's change along each axis adds to the gradient
+
+
+def _mapped(beacon: Beacon, offset_beacon: Array, model_beacon: Array) -> _Mapped | None:
+    """Evaluate the beacon's map at the sensor; None where it has none."""
     if beacon.field_map is None:
         return None
     world_from_beacon = beacon.world_from_beacon
     sensor_world = beacon.position_world + offset_beacon @ world_from_beacon.T
     value, gradient = beacon.field_map.mean(sensor_world)
-    turn = skew(value[..., 1:] @ world_from_beacon)
-    gain = np.exp(value[..., :1, None])
-    correction = gain * (np.eye(3) + turn)
     gradient = gradient @ world_from_beacon
-    rotation = np.swapaxes(gradient[..., 1:, :], -1, -2) @ world_from_beacon
-    return correction[..., None, :, :], np.concatenate(
-        [gradient[..., 0, :, None], gain * rotation], axis=-1
-    )
-
-
-def _map_slope(
-    slope: Array, field_beacon: ComplexArray, mapped_beacon: ComplexArray
-) -> ComplexArray:
-    """Return what the change of the map along each axis adds to the field, (..., tones, 3, 3)."""
-    by_gain = mapped_beacon[..., :, None] * slope[..., None, None, :, 0]
-    across = -skew(field_beacon) @ np.swapaxes(slope[..., None, :, 1:], -1, -2)
-    return np.asarray(by_gain + across)
+    turn_beacon = value[..., 1:] @ world_from_beacon
+    by_axis = (world_from_beacon.T @ gradient[..., 1:, :])[..., None, :, :]
+    correction = np.exp(value[..., :1, None]) * (np.eye(3) + skew(turn_beacon))
+    correction = np.asarray(correction)[..., None, :, :]
+    mapped = (correction @ model_beacon[..., None])[..., 0]
+    gain = np.exp(value[..., 0])[..., None, None, None]
+    slope = mapped[..., None] * gradient[..., None, :1, :] - gain * skew(model_beacon) @ by_axis
+    return _Mapped(model_beacon, correction, np.asarray(slope))
 
 
 def predict(
@@ -127,10 +123,10 @@ def predict(
     """
     offset = _offset_beacon(beacon, magnetometer, world_from_body, position_world)
     _, coils = _coil_fields(beacon, offset)
-    in_beacon = np.swapaxes(_turned(beacon.excitation, phase), -1, -2) @ coils
-    mapped = _mapped(beacon, offset)
+    mapped = _mapped(beacon, offset, coils)
     if mapped is not None:
-        in_beacon = (mapped[0] @ in_beacon[..., None])[..., 0]
+        coils = (mapped.correction @ coils[..., None])[..., 0]
+    in_beacon = np.swapaxes(_turned(beacon.excitation, phase), -1, -2) @ coils
     beacon_from_body = beacon.world_from_beacon.T @ world_from_body
     in_body = in_beacon @ beacon_from_body
     return np.asarray(in_body @ (magnetometer.body_from_sensor @ magnetometer.matrix.T))
@@ -182,9 +178,14 @@ def observe(
 
     by_body = platform_pose[..., 3:]
     by_beacon_offset = by_body @ seen.body_from_beacon[..., None, :, :]
-    beacon_rotation = by_beacon_offset @ skew(seen.offset_beacon)[
-        ..., None, :, :
-    ] - measured_from_beacon @ skew(field_beacon)
+    turned = measured_from_beacon @ skew(field_beacon)
+    if seen.mapped is not None:  # the map stays where it is when the beacon moves
+        flat = seen.mapped.slope.reshape(*seen.mapped.slope.shape[:-2], 9)
+        slope = (seen.tones_from_coils @ flat).reshape(*field_beacon.shape, 3)
+        by_beacon_offset = by_beacon_offset - measured_from_beacon @ slope
+        model_beacon = seen.tones_from_coils @ seen.mapped.model_beacon
+        turned = measured_from_beacon @ seen.mapped.correction @ skew(model_beacon)
+    beacon_rotation = by_beacon_offset @ skew(seen.offset_beacon)[..., None, :, :] - turned
     # (..., tones, coils, 3)
     by_coil = seen.coils_beacon[..., None, :, :] * seen.tones_from_coils[..., None]
     by_matrix = np.zeros((*in_sensor.shape, 3, 3), dtype=np.complex128)
@@ -240,6 +241,7 @@ class _Seen(NamedTuple):
     coils_beacon: Array  # (..., coils, 3), field of each coil
     tones_from_coils: ComplexArray  # (..., tones, coils)
     body_from_beacon: Array
+    mapped: _Mapped | None
 
 
 def _seen(
@@ -256,8 +258,12 @@ def _seen(
     beacon_from_body = np.swapaxes(body_from_beacon, -1, -2)
     sensor_from_body = magnetometer.matrix @ magnetometer.body_from_sensor.T
     # Coil by coil all is real; only their sum in a tone is complex.
-    in_body = coils @ beacon_from_body
     gradients = dipole_gradient(offset, beacon.moments_beacon)
+    mapped = _mapped(beacon, offset_beacon, coils)
+    if mapped is not None:
+        coils = (mapped.correction @ coils[..., None])[..., 0]
+        gradients = mapped.correction @ gradients + mapped.slope
+    in_body = coils @ beacon_from_body
     by_body = (sensor_from_body @ body_from_beacon)[..., None, :, :] @ gradients
     by_body = by_body @ beacon_from_body[..., None, :, :]
     by_rotation = sensor_from_body @ skew(in_body) - by_body @ skew(magnetometer.position_body)
@@ -272,6 +278,7 @@ def _seen(
         coils_beacon=coils,
         tones_from_coils=tones_from_coils,
         body_from_beacon=body_from_beacon,
+        mapped=mapped,
     )
 
 

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from magfusion.field_map import FieldMap
 from magfusion.units import Array, ComplexArray
 
 
@@ -77,6 +78,8 @@ class Beacon:
     synchronised : bool
         False where the drive phase relative to the log clock is unknown and drifts.
     sigma : BeaconSigma
+    field_map : FieldMap, optional
+        How its field differs from the model where it was surveyed.
     """
 
     name: str
@@ -86,6 +89,7 @@ class Beacon:
     coils: tuple[Coil, ...]
     synchronised: bool
     sigma: BeaconSigma
+    field_map: FieldMap | None = None
 
     @cached_property
     def tones(self) -> tuple[tuple[float, int | None], ...]:
@@ -173,6 +177,9 @@ class Magnetometer:
     offset : ndarray, shape (3,)
         (T)
     sigma : MagnetometerSigma
+    coil_centres_sensor : ndarray, shape (3, 3), optional
+        Magnetic centre of each axis's own coil (m), row by row; None where all three are at
+        ``position_body``.
     """
 
     position_body: Array
@@ -181,6 +188,7 @@ class Magnetometer:
     matrix: Array
     offset: Array
     sigma: MagnetometerSigma
+    coil_centres_sensor: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,24 @@ def _distances(site: Site, samples: FieldSamples) -> Array:
     return np.stack(out, axis=1)
 
 
-def measurement_cov(site: Site, samples: FieldSamples, *, survey_error: bool = False) -> Array:
+def _model_error(site: Site, sensor_world: Array | None) -> Array:
+    """Return the relative error of each beacon's field, shape (beacons,) or (beacons, n)."""
+    parts = [
+        np.asarray(site.model_error**2)
+        if beacon.field_map is None
+        else beacon.field_map.relative_variance(sensor_world)
+        for beacon in site.beacons
+    ]
+    return np.asarray(np.sqrt(np.stack(np.broadcast_arrays(*parts))))
+
+
+def measurement_cov(
+    site: Site,
+    samples: FieldSamples,
+    *,
+    survey_error: bool = False,
+    sensor_world: Array | None = None,
+) -> Array:
     """Return the covariance of each phasor component: noise and model error.
 
     Parameters
@@ -56,15 +73,18 @@ def measurement_cov(site: Site, samples: FieldSamples, *, survey_error: bool = F
     samples : FieldSamples
     survey_error : bool
         Add what the sigmas of the site's calibration cause, for a solver that does not estimate it.
+    sensor_world : ndarray, shape (n, 3), optional
+        Where the magnetometer is (m), as far as it is known: how well a field map is known there.
 
     Returns
     -------
     ndarray, shape (n, channels, 3, 3)
         (T^2), measured axes.
     """
-    total = samples.phasor_cov + model_error_cov(samples.phasor_sensor, site.model_error)
+    owner = [i for i, b in enumerate(site.beacons) for _ in b.tones]
+    error = _model_error(site, sensor_world).T[..., owner]
+    total = samples.phasor_cov + model_error_cov(samples.phasor_sensor, error)
     if survey_error:
-        owner = [i for i, b in enumerate(site.beacons) for _ in b.tones]
         relative = calibration_error(site, _distances(site, samples))[:, owner]
         power = 0.5 * np.sum(np.abs(samples.phasor_sensor) ** 2, axis=-1)
         total = total + (relative**2 * power / 3.0)[..., None, None] * np.eye(3)

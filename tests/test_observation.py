@@ -8,6 +8,7 @@ import pytest
 from derivatives import central_difference, relative_to_group
 from scipy.spatial.transform import Rotation
 
+from magfusion.field_map import FieldMap
 from magfusion.observation import model_error_cov, observe, predict, skew
 from magfusion.site import Beacon, BeaconSigma, Coil, Magnetometer, MagnetometerSigma
 
@@ -34,6 +35,15 @@ def beacon(coils, synchronised=True):
     )
 
 
+FIELD_MAP = FieldMap(
+    points_world=np.array([[1.6, 0.9, 1.2], [2.4, 1.5, 1.9], [3.0, 0.2, 1.0]]),
+    weights=np.array([[4.0, -3.0, 2.0, 6.0], [-7.0, 5.0, 1.0, -2.0], [2.0, 4.0, -6.0, 3.0]]),
+    information=np.broadcast_to(300.0 * np.eye(4), (3, 4, 4)),
+    length_scale=0.9,
+    gain_sigma=0.2,
+    rotation_sigma=0.15,
+    residual=0.01,
+)
 BEACONS = {
     "two axes": beacon(
         (
@@ -47,6 +57,10 @@ BEACONS = {
             Coil(np.array([0.0, 70.0, 0.0]), -0.7, np.array([0.0, 0.05, 0.0]), frequency_hz=23.0),
             Coil(np.array([1.0, 0.0, 110.0]), 2.0, np.array([0.0, -0.02, 0.06]), frequency_hz=27.0),
         )
+    ),
+    "two axes with a field map": replace(
+        beacon((Coil(np.array([220.0, 3.0, -2.0])), Coil(np.array([-4.0, 180.0, 5.0]), -1.5))),
+        field_map=FIELD_MAP,
     ),
     "one coil": beacon((Coil(np.array([10.0, -20.0, 150.0]), phase=0.4),)),
 }
@@ -212,7 +226,7 @@ def test_the_value_is_what_a_magnetometer_sees_of_magpylibs_sources(source, rotv
         dipole.rotate(Rotation.from_matrix(source.world_from_beacon), anchor=0)
         sources.append(dipole.move(source.position_world))
     fields_world = np.array([s.getB(sensor_world) for s in sources])
-    value = seen_from(source, rotvec).phasor_sensor
+    value = seen_from(replace(source, field_map=None), rotvec).phasor_sensor
     # The currents and the field are followed as functions of time over a cycle.
     cycle = np.linspace(0.0, 2.0 * np.pi, 7)
     tones = [(c.frequency_hz or source.frequency_hz) for c in source.coils]
@@ -227,6 +241,21 @@ def test_the_value_is_what_a_magnetometer_sees_of_magpylibs_sources(source, rotv
         found = np.real(value[k] * np.exp(1j * cycle)[:, None])
         # magpylib takes mu0 as measured, which is 4 pi 1e-7 within 1e-9.
         assert relative_to_group(found, expected) < 1e-9
+
+
+@every_attitude
+def test_a_field_map_turns_and_stretches_the_field_in_world_axes(rotvec):
+    source = BEACONS["two axes with a field map"]
+    rotation = attitude(rotvec)
+    sensor_world = POSITION + rotation @ MAGNETOMETER.position_body
+    log_gain, *turn_world = FIELD_MAP.mean(sensor_world)[0]
+    measured_from_world = MAGNETOMETER.matrix @ (rotation @ MAGNETOMETER.body_from_sensor).T
+    plain = seen_from(replace(source, field_map=None), rotvec).phasor_sensor
+    plain_world = plain @ np.linalg.inv(measured_from_world).T
+    mapped_world = np.exp(log_gain) * (plain_world + np.cross(turn_world, plain_world))
+    found = seen_from(source, rotvec).phasor_sensor
+    assert abs(log_gain) > 0.01
+    assert relative_to_group(found, mapped_world @ measured_from_world.T) < 1e-13
 
 
 def test_the_offset_of_the_magnetometer_leaves_phasors_alone():

@@ -12,7 +12,7 @@ PACKAGE = ROOT / "magfusion"
 # The floors of the house, from the ground; what stands on one floor does not see its neighbours.
 FLOORS = (
     {"units", "errors"},
-    {"physics", "strapdown", "files"},
+    {"physics", "strapdown", "files", "field_map"},
     {"site", "trajectory", "site_schema"},
     {"site_file", "shapes"},
     {"records", "observation", "view"},
