@@ -3,7 +3,7 @@
 Every solver predicts through `observe`; the simulator does not.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -121,6 +121,12 @@ def predict(
     complex ndarray, shape (..., tones, 3)
         (T), measured axes.
     """
+    if magnetometer.coil_centres_sensor is not None:
+        apart = [
+            predict(beacon, axis, world_from_body, position_world, phase)[..., i]
+            for i, axis in enumerate(_axes_apart(magnetometer))
+        ]
+        return np.stack(apart, axis=-1)
     offset = _offset_beacon(beacon, magnetometer, world_from_body, position_world)
     _, coils = _coil_fields(beacon, offset)
     mapped = _mapped(beacon, offset, coils)
@@ -168,6 +174,12 @@ def observe(
     Observation
         Leading axes as those of the poses.
     """
+    if magnetometer.coil_centres_sensor is not None:
+        apart = [
+            observe(beacon, axis, world_from_body, position_world, phase, twist_body)
+            for axis in _axes_apart(magnetometer)
+        ]
+        return _joined(apart, magnetometer.coil_centres_sensor)
     mounting, matrix = magnetometer.body_from_sensor, magnetometer.matrix
     seen = _seen(beacon, magnetometer, world_from_body, position_world, phase)
     phasor, platform_pose = seen.phasor_sensor, seen.platform_pose
@@ -228,8 +240,39 @@ def observe_from(
     platform_pose : complex ndarray, shape (..., tones, 3, 6)
         Right perturbation of world_from_body: rotation, translation, body axes (T/rad, T/m).
     """
+    if magnetometer.coil_centres_sensor is not None:
+        whole = observe(beacon, magnetometer, world_from_body, position_world, phase)
+        return whole.phasor_sensor, whole.platform_pose
     seen = _seen(beacon, magnetometer, world_from_body, position_world, phase)
     return seen.phasor_sensor, seen.platform_pose
+
+
+def _axes_apart(magnetometer: Magnetometer) -> list[Magnetometer]:
+    """Return a magnetometer for each axis, at its own coil: only that axis of it is true."""
+    assert magnetometer.coil_centres_sensor is not None
+    return [
+        replace(
+            magnetometer,
+            position_body=magnetometer.position_body + magnetometer.body_from_sensor @ centre,
+            coil_centres_sensor=None,
+        )
+        for centre in magnetometer.coil_centres_sensor
+    ]
+
+
+def _joined(apart: list[Observation], centres_sensor: Array) -> Observation:
+    """Return the observation whose axis i is that of the i-th."""
+    fields = {
+        name: np.stack([getattr(o, name)[..., i, :] for i, o in enumerate(apart)], axis=-2)
+        for name in ("platform_pose", "beacon_pose", "log_moments", "matrix", "body_from_sensor")
+    }
+    for i, centre in enumerate(centres_sensor):  # the mounting turns the coils' centres too
+        turning = fields["body_from_sensor"][..., i, :]
+        turning[..., :3] -= turning[..., 3:] @ skew(centre)
+    for name in ("phasor_sensor", "phase"):
+        fields[name] = np.stack([getattr(o, name)[..., i] for i, o in enumerate(apart)], axis=-1)
+    offsets = [o.time_offset[..., i] for i, o in enumerate(apart) if o.time_offset is not None]
+    return Observation(**fields, time_offset=np.stack(offsets, axis=-1) if offsets else None)
 
 
 class _Seen(NamedTuple):

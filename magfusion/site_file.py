@@ -2,6 +2,7 @@
 
 import datetime
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.field_map import FieldMap
+from magfusion.field_map_file import read_field_maps, write_field_maps
 from magfusion.files import read_yaml, write_yaml
 from magfusion.physics.earth import earth_field_world
 from magfusion.site import (
@@ -54,10 +57,11 @@ def load_site(path: Path) -> Site:
     """
     entry = read_yaml(path, SiteEntry)
     location = _location(entry.world)
+    maps = _field_maps(entry, path)
     return Site(
         gravity=entry.world.gravity_m_s2,
         model_error=entry.world.model_error,
-        beacons=tuple(_beacon(b) for b in entry.beacons),
+        beacons=tuple(replace(_beacon(b), field_map=maps.get(b.name)) for b in entry.beacons),
         platform=Platform(_imu(entry.platform.imu), _magnetometer(entry.platform.magnetometer)),
         earth_field_world=_reference_field(location, path)
         if location
@@ -74,11 +78,14 @@ def save_site(site: Site, path: Path) -> None:
     ----------
     site : Site
     path : Path
-        Replaced as a whole, or left as it was if anything fails.
+        Replaced as a whole, or left as it was if anything fails.  Field maps are written beside
+        it, as ``<stem>_field_map.parquet``.
     """
+    maps = {b.name: b.field_map for b in site.beacons if b.field_map is not None}
+    beside = path.with_name(f"{path.stem}_field_map.parquet")
     content = {
         "magfusion_site": 1,
-        "world": _world_entry(site),
+        "world": _world_entry(site) | ({"field_map": beside.name} if maps else {}),
         "beacons": [_beacon_entry(b) for b in site.beacons],
         "platform": {
             "imu": _imu_entry(site.platform.imu),
@@ -87,7 +94,24 @@ def save_site(site: Site, path: Path) -> None:
     }
     if site.calibration is not None:
         content["calibration"] = _plain(site.calibration)
+    if maps:
+        write_field_maps(maps, beside)
     write_yaml(content, path)
+
+
+def _field_maps(entry: SiteEntry, path: Path) -> dict[str, FieldMap]:
+    if entry.world.field_map is None:
+        return {}
+    place = path.parent / entry.world.field_map
+    maps = read_field_maps(place)
+    known = [b.name for b in entry.beacons]
+    for name in maps:
+        if name not in known:
+            raise InputError(
+                f"{place}: maps beacon {name}, which {path} does not have (it has "
+                f"{', '.join(known)}); learn the map of this site."
+            )
+    return maps
 
 
 def _matrix(rpy_deg: Array) -> Array:
@@ -157,6 +181,7 @@ def _magnetometer(entry: MagnetometerEntry) -> Magnetometer:
             rotation_sensor=sigma.rotation_deg * DEGREE,
             position_body=sigma.position_m,
         ),
+        coil_centres_sensor=entry.coil_centres_m,
     )
 
 
@@ -243,8 +268,9 @@ def _imu_entry(imu: ImuModel) -> dict[str, Any]:
 
 
 def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
-    sigma = magnetometer.sigma
-    return {
+    sigma, centres = magnetometer.sigma, magnetometer.coil_centres_sensor
+    own = {} if centres is None else {"coil_centres_m": _plain(centres)}
+    return own | {
         "body_from_sensor": {
             "position_m": _plain(magnetometer.position_body),
             "rpy_deg": _rpy_deg(magnetometer.body_from_sensor),

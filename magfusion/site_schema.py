@@ -137,16 +137,9 @@ class WorldEntry(StrictModel):
 
     gravity_m_s2: _Positive = 9.80665
     model_error: Annotated[float, Field(ge=0.0, le=1.0)] = 0.005
+    field_map: Annotated[str, Field(min_length=1)] | None = None
     earth_field_t: Annotated[Array, _array(3), _tesla(LARGEST_EARTH_FIELD)] | None = None
     location: LocationEntry | None = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_field_map(cls, value: object) -> object:
-        if isinstance(value, dict) and "field_map" in value:
-            remedy = "field maps are not supported in this version: remove the key"
-            raise _refusal_at(("field_map",), value["field_map"], remedy)
-        return value
 
     @model_validator(mode="after")
     def _one_earth(self) -> Self:
@@ -236,6 +229,7 @@ class MagnetometerEntry(StrictModel):
         default_factory=lambda: np.eye(3)
     )
     offset_t: Annotated[Array, _array(3), _tesla(LARGEST_OFFSET)] = Field(default_factory=_zeros)
+    coil_centres_m: Annotated[Array, _array(3, 3)] | None = None
     sigma: MagnetometerSigmaEntry = Field(default_factory=MagnetometerSigmaEntry)
 
 

@@ -13,9 +13,9 @@ PACKAGE = ROOT / "magfusion"
 FLOORS = (
     {"units", "errors"},
     {"physics", "strapdown", "files", "field_map"},
-    {"site", "trajectory", "site_schema"},
+    {"site", "trajectory", "site_schema", "field_map_file"},
     {"site_file", "shapes"},
-    {"records", "observation", "view"},
+    {"records", "observation", "antenna", "view"},
     {"parameters", "weights"},
     {"refinement"},
     {"receiver", "simulation", "calibration", "fusion", "fixes", "evaluation"},
@@ -99,7 +99,7 @@ def test_the_package_does_without_pandas() -> None:
 
 def test_the_simulator_knows_nothing_of_the_estimators_model() -> None:
     for path in (PACKAGE / "simulation").rglob("*.py"):
-        assert not _rooms_seen(path) & {"observation", "parameters"}, _name(path)
+        assert not _rooms_seen(path) & {"observation", "antenna", "parameters"}, _name(path)
 
 
 def test_one_file_of_fusion_builds_custom_factors() -> None:
