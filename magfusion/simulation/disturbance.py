@@ -11,7 +11,7 @@ from magfusion.units import Array, ComplexArray
 
 DAY = 86_400.0  # s
 CLEARANCE = 0.5  # m from the surface of drawn iron to where the body moves, and to every beacon
-REACH = 1.5  # m beyond that clearance within which iron is drawn
+REACH = 1.5  # m beyond that clearance within which iron is drawn where nothing is said
 STEEL_PERMEABILITY = 100.0
 STEEL_CONDUCTIVITY = 5e6  # S/m
 _ATTEMPTS = 200  # to place one sphere
@@ -89,11 +89,12 @@ def draw_spheres(
     radius_range: tuple[float, float] = (0.1, 0.3),
     permeability: float = STEEL_PERMEABILITY,
     conductivity: float = STEEL_CONDUCTIVITY,
+    reach: float = REACH,
 ) -> Spheres:
     """Return spheres around a box, none near it, near a beacon or in another.
 
     The surface of each is at least `CLEARANCE` from the box and from every beacon's centre; its
-    centre is drawn evenly from the box grown by its radius, `CLEARANCE` and `REACH` on all sides.
+    centre is drawn evenly from the box grown by its radius, `CLEARANCE` and ``reach`` on all sides.
 
     Parameters
     ----------
@@ -107,6 +108,8 @@ def draw_spheres(
         Radii are drawn evenly between these (m).
     permeability, conductivity : float
         Of all spheres (relative; S/m).
+    reach : float
+        (m)
 
     Raises
     ------
@@ -116,7 +119,7 @@ def draw_spheres(
     radius = rng.uniform(*radius_range, count)
     position_world = np.zeros((count, 3))
     for k in range(count):
-        grown = radius[k] + CLEARANCE + REACH
+        grown = radius[k] + CLEARANCE + reach
         drawn = rng.uniform(box_world[0] - grown, box_world[1] + grown, (_ATTEMPTS, 3))
         to_box = np.linalg.norm(drawn - np.clip(drawn, box_world[0], box_world[1]), axis=1)
         free = _farther(drawn, beacons_world, np.full(len(beacons_world), radius[k] + CLEARANCE))
