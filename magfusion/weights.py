@@ -5,6 +5,7 @@ import numpy as np
 from magfusion.observation import model_error_cov
 from magfusion.records.samples import FieldSamples
 from magfusion.site import Site
+from magfusion.trajectory import Trajectory
 from magfusion.units import MU0_OVER_4PI, Array, BoolArray, ComplexArray
 
 
@@ -47,15 +48,33 @@ def _distances(site: Site, samples: FieldSamples) -> Array:
     return np.stack(out, axis=1)
 
 
-def _model_error(site: Site, sensor_world: Array | None) -> Array:
-    """Return the relative error of each beacon's field, shape (beacons,) or (beacons, n)."""
+def model_error(site: Site, sensor_world: Array | None = None) -> Array:
+    """Return the relative error of the field model in each channel, one sigma.
+
+    Parameters
+    ----------
+    site : Site
+    sensor_world : ndarray, shape (n, 3), optional
+        Where the magnetometer is (m): a field map is not equally well known everywhere.
+
+    Returns
+    -------
+    ndarray, shape (channels,) or (n, channels)
+    """
     parts = [
         np.asarray(site.model_error**2)
         if beacon.field_map is None
         else beacon.field_map.relative_variance(sensor_world)
         for beacon in site.beacons
     ]
-    return np.asarray(np.sqrt(np.stack(np.broadcast_arrays(*parts))))
+    owner = [i for i, b in enumerate(site.beacons) for _ in b.tones]
+    return np.asarray(np.sqrt(np.stack(np.broadcast_arrays(*parts), axis=-1))[..., owner])
+
+
+def sensor_positions(site: Site, poses: Trajectory) -> Array:
+    """Return where the magnetometer is at each pose of the body, shape (n, 3), world (m)."""
+    lever_body = site.platform.magnetometer.position_body
+    return np.asarray(poses.position_world + poses.world_from_body @ lever_body)
 
 
 def measurement_cov(
@@ -81,10 +100,10 @@ def measurement_cov(
     ndarray, shape (n, channels, 3, 3)
         (T^2), measured axes.
     """
-    owner = [i for i, b in enumerate(site.beacons) for _ in b.tones]
-    error = _model_error(site, sensor_world).T[..., owner]
+    error = model_error(site, sensor_world)
     total = samples.phasor_cov + model_error_cov(samples.phasor_sensor, error)
     if survey_error:
+        owner = [i for i, b in enumerate(site.beacons) for _ in b.tones]
         relative = calibration_error(site, _distances(site, samples))[:, owner]
         power = 0.5 * np.sum(np.abs(samples.phasor_sensor) ** 2, axis=-1)
         total = total + (relative**2 * power / 3.0)[..., None, None] * np.eye(3)

@@ -22,7 +22,7 @@ from magfusion.parameters import (
 )
 from magfusion.site import Beacon, Site
 from magfusion.units import Array, BoolArray, IntArray
-from magfusion.weights import paired_whitening
+from magfusion.weights import model_error, paired_whitening
 
 SURVEY_GROUPS = ("beacons", "moments", "phase", "magnetometer", "extrinsics")
 CHUNK = 500  # points linearised at once
@@ -256,7 +256,8 @@ def _whitened(
     )
     phasor = value[..., :3] + 1j * value[..., 3:]
     noise = variance[:, None, None] * np.eye(3)
-    cov = noise + model_error_cov(phasor, site.model_error)
+    sensor_world = position_world + attitude @ site.platform.magnetometer.position_body
+    cov = noise + model_error_cov(phasor, model_error(site, sensor_world))
     root = paired_whitening(cov, np.ones(cov.shape[:2], dtype=bool))
     strong = np.linalg.norm(value, axis=2) > HEARD * np.sqrt(variance)
     owners = np.array([[name == b.name for name, _ in site.channels] for b in site.beacons])

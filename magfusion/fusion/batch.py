@@ -37,7 +37,7 @@ from magfusion.site import Site
 from magfusion.strapdown import resting
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array
-from magfusion.weights import measurement_cov, paired_whitening, stacked
+from magfusion.weights import measurement_cov, paired_whitening, sensor_positions, stacked
 
 OFFSET_CONVERGED = 2e-5  # s; change of the time offset at which the passes end
 POSITION_CONVERGED = 5e-5  # m; rms change of the positions at which the passes end
@@ -285,7 +285,8 @@ def _problem(
     rate = np.stack([np.interp(samples.time, stamps, w) for w in imu.gyro_body.T], axis=1)
     assert states.gyro_bias_body is not None
     shape = (*samples.phasor_sensor.shape[:2], 6)
-    cov = measurement_cov(calibration.site, samples) * overlap(samples)
+    sensor_world = sensor_positions(calibration.site, states)
+    cov = measurement_cov(calibration.site, samples, sensor_world=sensor_world) * overlap(samples)
     measurements = FieldMeasurements(
         time=samples.time,
         measured=stacked(samples.phasor_sensor),
@@ -358,7 +359,12 @@ def _survey_cov(job: _Job, states: Trajectory) -> Array:
     The graph takes the fixes' errors for independent, but no number of fixes averages it out.
     """
     samples = job.samples
-    cov = measurement_cov(job.declared.site, samples, survey_error=True)
+    cov = measurement_cov(
+        job.declared.site,
+        samples,
+        survey_error=True,
+        sensor_world=sensor_positions(job.declared.site, states),
+    )
     by_found, by_survey = survey_jacobians(
         job.declared,
         samples.time,

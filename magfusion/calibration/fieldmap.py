@@ -1,0 +1,313 @@
+"""Learn where, and by how much, a beacon's field is not what its model says.
+
+Fingerprinting carried to its end: the model where there is one, a map where it fails.  The
+logarithm of the gain and a small rotation are a Gaussian process of position; a survey measures
+both through the phasors, linearly but for a small step, so that the posterior is exact whatever
+the number of coils and tones, and whatever they leave open.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+
+from magfusion.errors import EstimationError
+from magfusion.field_map import (
+    COMPONENTS,
+    FieldMap,
+    process_covariance,
+    spread_blocks,
+)
+from magfusion.observation import predict, skew
+from magfusion.site import Site
+from magfusion.units import Array, ComplexArray, IntArray
+
+FEWEST_POINTS = 8
+LEARNT_FROM = 100  # points, at most, that decide on the process; the map itself takes all
+RELINEARISATIONS = 3
+_START = (1.0, 0.1, 0.05, 0.01)  # length scale (m), gain, rotation (rad), residual
+_LIMITS = ((0.1, 30.0), (1e-4, 2.0), (1e-4, 0.6), (1e-4, 0.3))
+
+
+@dataclass(frozen=True, eq=False)
+class MapPoints:
+    """What was measured of every beacon at known poses.
+
+    Parameters
+    ----------
+    world_from_body : ndarray, shape (n, 3, 3)
+    position_world : ndarray, shape (n, 3)
+        Of the body (m).
+    phasor_sensor : complex ndarray, shape (n, channels, 3)
+        Measured axes (T), channels in the site's order; NaN where missing.
+    sigma : ndarray, shape (n, channels)
+        Of each component (T).
+    phase : ndarray, shape (n, channels), optional
+        Drive phase beyond what the coils declare (rad).  None leaves that of unsynchronised
+        beacons free at each point.
+    """
+
+    world_from_body: Array
+    position_world: Array
+    phasor_sensor: ComplexArray
+    sigma: Array
+    phase: Array | None = None
+
+    def __len__(self) -> int:
+        return len(self.position_world)
+
+    def rows(self, rows: IntArray) -> "MapPoints":
+        """Return some of the points."""
+        phase = None if self.phase is None else self.phase[rows]
+        return MapPoints(
+            self.world_from_body[rows],
+            self.position_world[rows],
+            self.phasor_sensor[rows],
+            self.sigma[rows],
+            phase,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class MapFit:
+    """A site with its map, and what the map is worth.
+
+    Parameters
+    ----------
+    site : Site
+    error_without, error_with : dict of str to float
+        Relative error of each beacon's modelled field at points that the map was not learnt from,
+        root mean square over the points.
+    points : dict of str to int
+        That the map of each beacon rests on.
+    """
+
+    site: Site
+    error_without: dict[str, float]
+    error_with: dict[str, float]
+    points: dict[str, int]
+
+
+class _Heard(NamedTuple):
+    """One beacon at the points where it was heard, world axes."""
+
+    sensor_world: Array  # (m, 3)
+    model: Array  # (m, 2 tones, 3), real parts, then imaginary parts
+    measured: Array
+    variance: Array  # (m, 2 tones), of each component
+
+
+class _Process(NamedTuple):
+    length_scale: float
+    gain_sigma: float
+    rotation_sigma: float
+    residual: float
+
+    @property
+    def sigma(self) -> Array:
+        return np.array([self.gain_sigma, *[self.rotation_sigma] * 3])
+
+
+def learn_field_map(site: Site, points: MapPoints, folds: int = 5) -> MapFit:
+    """Learn the map of every beacon; its process is common to all and of greatest likelihood.
+
+    Parameters
+    ----------
+    site : Site
+        Maps that it has already are replaced.
+    points : MapPoints
+    folds : int
+        Parts into which the points fall to tell what the map is worth.
+
+    Returns
+    -------
+    MapFit
+
+    Raises
+    ------
+    EstimationError
+        Where a beacon was heard at too few points.
+    """
+    heard = _all_heard(site, points)
+    for beacon, found in zip(site.beacons, heard, strict=True):
+        if len(found.sensor_world) < FEWEST_POINTS:
+            raise EstimationError(
+                f"beacon {beacon.name} was heard at {len(found.sensor_world)} points, and a map"
+                f" needs {FEWEST_POINTS}; survey more of the room"
+            )
+    process = _likeliest_process(heard)
+    maps = [_conditioned(found, process) for found in heard]
+    beacons = tuple(replace(b, field_map=m) for b, m in zip(site.beacons, maps, strict=True))
+    names = [b.name for b in site.beacons]
+    errors = [_cross_validated(found, process, folds) for found in heard]
+    return MapFit(
+        site=replace(site, beacons=beacons),
+        error_without={n: e[0] for n, e in zip(names, errors, strict=True)},
+        error_with={n: e[1] for n, e in zip(names, errors, strict=True)},
+        points={n: len(found.sensor_world) for n, found in zip(names, heard, strict=True)},
+    )
+
+
+def _all_heard(site: Site, points: MapPoints) -> list[_Heard]:
+    sensor = site.platform.magnetometer
+    world_from_sensor = points.world_from_body @ sensor.body_from_sensor
+    sensor_world = points.position_world + points.world_from_body @ sensor.position_body
+    undone = np.swapaxes(world_from_sensor @ np.linalg.inv(sensor.matrix), -1, -2)
+    found, start = [], 0
+    for beacon in site.beacons:
+        tones = slice(start, start + len(beacon.tones))
+        start = tones.stop
+        phase = None if points.phase is None else points.phase[:, tones]
+        plain = predict(
+            replace(beacon, field_map=None),
+            sensor,
+            points.world_from_body,
+            points.position_world,
+            phase,
+        )
+        measured = points.phasor_sensor[:, tones]
+        if phase is None and not beacon.synchronised:
+            plain = _aligned(plain, measured)
+        there = np.isfinite(measured).all(axis=(1, 2))
+        # A matrix near the identity leaves white noise white.
+        variance = np.tile(points.sigma[:, tones] ** 2, 2)
+        found.append(
+            _Heard(
+                sensor_world[there],
+                _stacked(plain @ undone)[there],
+                _stacked(measured @ undone)[there],
+                variance[there],
+            )
+        )
+    return found
+
+
+def _aligned(plain: ComplexArray, measured: ComplexArray) -> ComplexArray:
+    """Return the model with the drive phase of each tone that the measurement has."""
+    lag = np.angle(np.sum(np.conj(plain) * measured, axis=-1, keepdims=True))
+    return np.asarray(plain * np.exp(1j * lag))
+
+
+def _stacked(phasor: ComplexArray) -> Array:
+    return np.concatenate([phasor.real, phasor.imag], axis=1)
+
+
+def _reduced(heard: _Heard, state: Array, residual: float) -> tuple[Array, Array, float]:
+    """Return information (m, 4, 4), its vector (m, 4), and the rest of the log-likelihood.
+
+    Linear about ``state`` (m, 4): gain and rotation at each point.
+    """
+    gain = np.exp(state[:, :1, None])
+    turn = np.asarray(skew(state[:, 1:]))
+    turned = gain * (heard.model + heard.model @ np.swapaxes(turn, -1, -2))
+    by_rotation = -gain[..., None] * np.asarray(skew(heard.model))
+    design = np.concatenate([turned[..., None], by_rotation], axis=-1)  # (m, tones, 3, 4)
+    strength = np.mean(np.sum(heard.model**2, axis=2), axis=1)[:, None]
+    weight = 1.0 / (heard.variance + residual**2 * strength / 3.0)
+    error = heard.measured - turned + (design @ state[:, None, :, None])[..., 0]
+    weighted = design * weight[..., None, None]
+    information = np.einsum("mtia,mtib->mab", weighted, design)
+    vector = np.einsum("mtia,mti->ma", weighted, error)
+    rest = -0.5 * np.sum(weight[..., None] * error**2) + 1.5 * np.sum(np.log(weight))
+    return information, vector, float(rest)
+
+
+def _solved(heard: _Heard, process: _Process) -> tuple[Array, Array, float]:
+    """Return weights (m, 4), information (m, 4, 4) and the log-likelihood."""
+    count = len(heard.sensor_world)
+    kernel = process_covariance(heard.sensor_world, process.length_scale, process.sigma)
+    state = np.zeros((count, COMPONENTS))
+    for _ in range(RELINEARISATIONS):
+        information, vector, rest = _reduced(heard, state, process.residual)
+        system = np.eye(len(kernel)) + spread_blocks(information) @ kernel
+        weights = np.linalg.solve(system, vector.ravel())
+        pulled = kernel @ weights
+        state = pulled.reshape(count, COMPONENTS)
+    _, volume = np.linalg.slogdet(system)
+    likelihood = rest + 0.5 * float(vector.ravel() @ pulled) - 0.5 * float(volume)
+    return weights.reshape(count, COMPONENTS), information, likelihood
+
+
+def _likeliest_process(heard: Sequence[_Heard]) -> _Process:
+    thinned = [_evenly(h, LEARNT_FROM) for h in heard]
+
+    def cost(log_process: Array) -> float:
+        process = _Process(*np.exp(log_process))
+        return -sum(_solved(h, process)[2] for h in thinned)
+
+    found = minimize(
+        cost,
+        np.log(_START),
+        method="L-BFGS-B",
+        bounds=np.log(_LIMITS),
+        options={"maxiter": 40, "ftol": 1e-6},
+    )
+    return _Process(*(float(v) for v in np.exp(found.x)))
+
+
+def _evenly(heard: _Heard, most: int) -> _Heard:
+    count = len(heard.sensor_world)
+    if count <= most:
+        return heard
+    rows = np.unique(np.linspace(0, count - 1, most).astype(np.int64))
+    return _Heard(*(part[rows] for part in heard))
+
+
+def _conditioned(heard: _Heard, process: _Process) -> FieldMap:
+    weights, information, _ = _solved(heard, process)
+    return FieldMap(
+        points_world=heard.sensor_world,
+        weights=weights,
+        information=information,
+        length_scale=process.length_scale,
+        gain_sigma=process.gain_sigma,
+        rotation_sigma=process.rotation_sigma,
+        residual=process.residual,
+    )
+
+
+def _cross_validated(heard: _Heard, process: _Process, folds: int) -> tuple[float, float]:
+    """Return the relative error at points left out, without the map and with it."""
+    fold = np.arange(len(heard.sensor_world)) % folds
+    without, left = [], []
+    for k in range(folds):
+        known = _Heard(*(part[fold != k] for part in heard))
+        asked = _Heard(*(part[fold == k] for part in heard))
+        value, _ = _conditioned(known, process).mean(asked.sensor_world)
+        turned = asked.model + np.cross(value[:, None, 1:], asked.model)
+        mapped = np.exp(value[:, :1, None]) * turned
+        without.append(_relative(asked.model, asked.measured))
+        left.append(_relative(mapped, asked.measured))
+    return _rms(np.concatenate(without)), _rms(np.concatenate(left))
+
+
+def _relative(model: Array, measured: Array) -> Array:
+    error = np.sum((model - measured) ** 2, axis=(1, 2))
+    return np.asarray(np.sqrt(error / np.sum(measured**2, axis=(1, 2))))
+
+
+def _rms(value: Array) -> float:
+    return float(np.sqrt(np.mean(value**2)))
+
+
+def thinned(points: MapPoints, site: Site, spacing: float) -> MapPoints:
+    """Return one point of each cube of a grid: the one with the least noise.
+
+    Parameters
+    ----------
+    points : MapPoints
+        E.g. the epochs of a smoothed log.
+    site : Site
+    spacing : float
+        Edge of the cubes (m).
+    """
+    sensor = site.platform.magnetometer
+    sensor_world = points.position_world + points.world_from_body @ sensor.position_body
+    cell = np.floor(sensor_world / spacing).astype(np.int64)
+    heard = np.sum(np.isfinite(points.phasor_sensor).all(axis=2), axis=1)
+    noise = np.nanmean(np.where(np.isfinite(points.sigma), points.sigma, np.nan), axis=1)
+    best = np.lexsort((noise, -heard))
+    _, first = np.unique(cell[best], axis=0, return_index=True)
+    return points.rows(np.sort(best[first]))
