@@ -13,8 +13,11 @@ from magfusion.records.fields import order_channels
 from magfusion.records.open import open_log
 from magfusion.records.rosbag import Topics
 from magfusion.records.samples import Log
+from magfusion.records.trajectory_table import read_trajectory
+from magfusion.records.tum import read_tum
 from magfusion.site import Site
 from magfusion.site_file import load_site
+from magfusion.trajectory import Trajectory
 
 
 @dataclass(frozen=True)
@@ -52,6 +55,7 @@ _WRITTEN = {
     "fix": _RESULT | {"fixes.parquet"},
     "simulate": _LOG,
     "demodulate": _LOG,
+    "survey": {"survey.parquet", "survey.png", "report.json"},
     "coverage": {"coverage.parquet", "coverage.png", "run.rrd", "report.json"},
 }
 
@@ -129,3 +133,20 @@ def _open(job: Job) -> Log:
             " magnetometer beside the inertial sensor"
         )
     return log
+
+
+def read_estimate(path: Path, epoch_ns: int = 0) -> Trajectory:
+    """Read a trajectory from a result's directory, a TUM file, or a table (Parquet, CSV).
+
+    Raises
+    ------
+    InputError
+        Where there is none.
+    """
+    if path.is_dir():
+        if not (path / "trajectory.parquet").is_file():
+            raise InputError(f"{path}: holds no trajectory.parquet; give the result of a job")
+        return read_trajectory(path / "trajectory.parquet", epoch_ns)
+    if path.suffix in (".parquet", ".csv"):
+        return read_trajectory(path, epoch_ns)
+    return read_tum(path, epoch_ns)

@@ -8,23 +8,24 @@ from pathlib import Path
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.evaluation.errors import TrajectoryErrors, trajectory_errors
+from magfusion.evaluation.errors import trajectory_errors
 from magfusion.fixes.fix import Fixes
 from magfusion.fusion.batch import Smoothed, SmootherSettings, smooth
 from magfusion.fusion.inertial import motion_at
 from magfusion.fusion.source import first_fixes, phasors
-from magfusion.job import Job, claim, named, read_job
+from magfusion.job import Job, claim, named, read_estimate, read_job
 from magfusion.parameters import initial_calibration
 from magfusion.records.fix_table import write_hypotheses
 from magfusion.records.log import write_log
 from magfusion.records.open import open_log
 from magfusion.records.rosbag import BAG_SUFFIXES, Topics
 from magfusion.records.samples import Log
-from magfusion.records.trajectory_table import read_trajectory, write_trajectory
-from magfusion.records.tum import read_tum, write_tum
+from magfusion.records.trajectory_table import write_trajectory
+from magfusion.records.tum import write_tum
 from magfusion.refinement import findings, refined_site
 from magfusion.report import (
     Figures,
+    compared_with_truth,
     dropped_figures,
     error_figures,
     fix_figures,
@@ -44,17 +45,6 @@ Report = Callable[[str, int, int], None]
 
 def quiet(_stage: str, _done: int, _total: int) -> None:
     """Tell nobody of the progress."""
-
-
-def _compared(estimate: Trajectory, log: Log) -> tuple[TrajectoryErrors | None, Figures]:
-    """Return the errors against the log's truth, if it has one there, and their figures."""
-    if log.truth is None:
-        return None, {}
-    try:
-        errors = trajectory_errors(estimate, log.truth)
-    except InputError as error:  # a truth elsewhere does not make the trajectory worthless
-        return None, {"not_compared": str(error)}
-    return errors, error_figures(errors)
 
 
 def _innovations(result: Smoothed) -> dict[str, tuple[Array, Array]]:
@@ -135,7 +125,7 @@ def run_smooth(
     figures: Figures = {"job": "smooth", "log": log.name, "coupling": settings.coupling}
     figures |= smoothed_figures(result)
     figures["elapsed_s"] = time.perf_counter() - began
-    errors, compared = _compared(result.states, log)
+    errors, compared = compared_with_truth(result.states, log)
     figures |= compared
     if errors is not None:
         figures |= _held_figures(log, site, settings, result)
@@ -208,7 +198,7 @@ def _write_fix_result(
 ) -> Figures:
     """Write the fixes; return the figures with the errors against the truth."""
     best = fixes.best()
-    errors, compared = _compared(best, log)
+    errors, compared = compared_with_truth(best, log)
     write_tum(best, directory / "trajectory.tum", log.epoch_ns)
     write_trajectory(best, directory / "trajectory.parquet", log.epoch_ns)
     write_hypotheses(
@@ -322,23 +312,6 @@ def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) 
         save_site(simulated.true_site, directory / "true_site.yaml")
         write_report(directory, figures)
     return figures
-
-
-def read_estimate(path: Path, epoch_ns: int = 0) -> Trajectory:
-    """Read a trajectory from a result's directory, a TUM file, or a table (Parquet, CSV).
-
-    Raises
-    ------
-    InputError
-        Where there is none.
-    """
-    if path.is_dir():
-        if not (path / "trajectory.parquet").is_file():
-            raise InputError(f"{path}: holds no trajectory.parquet; give the result of a job")
-        return read_trajectory(path / "trajectory.parquet", epoch_ns)
-    if path.suffix in (".parquet", ".csv"):
-        return read_trajectory(path, epoch_ns)
-    return read_tum(path, epoch_ns)
 
 
 def _read_truth(path: Path, topics: Topics | None) -> tuple[Trajectory, int]:

@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from magfusion.evaluation.errors import TrajectoryErrors
+from magfusion.errors import InputError
+from magfusion.evaluation.errors import TrajectoryErrors, trajectory_errors
 from magfusion.fixes.fix import Fixes
 from magfusion.fusion.batch import Smoothed
+from magfusion.records.samples import Log
 from magfusion.refinement import findings
+from magfusion.trajectory import Trajectory
 from magfusion.units import Array
 
 AMBIGUOUS_CHI_SQUARE = 20.0  # below this a mirrored trajectory explains the log nearly as well
@@ -109,3 +112,14 @@ def fix_figures(fixes: Fixes) -> Figures:
         "undetermined_epochs": int(np.sum(~fixes.determined[:, 0])),
         "residual_rms_median": float(np.median(fixes.residual_rms[:, 0])),
     }
+
+
+def compared_with_truth(estimate: Trajectory, log: Log) -> tuple[TrajectoryErrors | None, Figures]:
+    """Return the errors against the log's truth, if it has one there, and their figures."""
+    if log.truth is None:
+        return None, {}
+    try:
+        errors = trajectory_errors(estimate, log.truth)
+    except InputError as error:  # a truth elsewhere does not make the trajectory worthless
+        return None, {"not_compared": str(error)}
+    return errors, error_figures(errors)

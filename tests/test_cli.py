@@ -16,8 +16,8 @@ from evo.tools import file_interface
 from rerun.chunk import RrdReader
 
 from magfusion.cli import main
+from magfusion.job import read_estimate
 from magfusion.options import topics_option
-from magfusion.pipeline import read_estimate
 from magfusion.records.log import read_log
 from magfusion.records.rosbag import Topics
 from magfusion.site_file import load_site
