@@ -12,7 +12,7 @@ PACKAGE = ROOT / "magfusion"
 # The floors of the house, from the ground; what stands on one floor does not see its neighbours.
 FLOORS = (
     {"units", "errors"},
-    {"physics", "strapdown", "files", "field_map"},
+    {"physics", "strapdown", "files", "field_map", "monte_carlo"},
     {"site", "trajectory", "site_schema", "field_map_file"},
     {"site_file", "shapes"},
     {"records", "observation", "antenna", "view"},
