@@ -10,7 +10,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from magfusion.errors import EstimationError
-from magfusion.fixes.likelihood import CHUNK, HYPOTHESES, Gravity, fix_epochs
+from magfusion.fixes.fix import Gravity
+from magfusion.fixes.likelihood import HYPOTHESES, fix_epochs
+from magfusion.fixes.refine import CHUNK
 from magfusion.parameters import initial_calibration, predict_channels
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.field import Drives

@@ -1,11 +1,31 @@
-"""What a fix is: for each epoch the poses that explain it, best first."""
+"""What a fix is: for each epoch the poses that explain it, best first; and what may help it."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from magfusion.trajectory import Trajectory
-from magfusion.units import Array, BoolArray
+from magfusion.units import Array, BoolArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Gravity:
+    """Direction of the specific force, where the platform is at rest or nearly so.
+
+    Parameters
+    ----------
+    up_body : ndarray, shape (n, 3)
+        Unit vectors.
+    sigma : ndarray, shape (n,)
+        (rad); infinite where it says nothing.
+    """
+
+    up_body: Array
+    sigma: Array
+
+    def rows(self, chosen: IntArray | BoolArray | slice) -> "Gravity":
+        """Return it at some epochs, or at epochs repeated."""
+        return Gravity(self.up_body[chosen], self.sigma[chosen])
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,9 +47,11 @@ class Fixes:
     residual_rms : ndarray, shape (n, hypotheses)
         Root mean square of the whitened residual; about one where noise and model are as declared.
     phase : ndarray, shape (n, hypotheses, channels)
-        Drive phase (rad); zero for synchronised beacons.
+        Drive phase (rad); zero where it was not sought.
     determined : bool ndarray, shape (n, hypotheses)
         False where the epoch leaves a direction of the pose open.
+    log_gain : ndarray, shape (n, hypotheses, channels)
+        Logarithm of each channel's gain; zero where it was not sought.
     """
 
     time: Array
@@ -40,6 +62,7 @@ class Fixes:
     residual_rms: Array
     phase: Array
     determined: BoolArray
+    log_gain: Array
 
     def __len__(self) -> int:
         return len(self.time)

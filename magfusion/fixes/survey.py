@@ -2,14 +2,22 @@
 
 import numpy as np
 
-from magfusion.parameters import Calibration, choose_blocks, linearize_channels, prior_sigma
+from magfusion.parameters import (
+    Block,
+    Calibration,
+    choose_blocks,
+    dimension,
+    linearize_channels,
+    prior_sigma,
+)
 from magfusion.units import Array
 
-SURVEY_GROUPS = ("beacons", "moments", "phase", "magnetometer", "extrinsics")
+SURVEY_GROUPS = ("beacons", "moments", "magnetometer", "extrinsics")
 
 
 def survey_jacobians(
     calibration: Calibration,
+    nuisances: tuple[Block, ...],
     time: Array,
     world_from_body: Array,
     position_world: Array,
@@ -20,33 +28,50 @@ def survey_jacobians(
     Parameters
     ----------
     calibration : Calibration
-        Its ``phase`` may have one row for each pose.
+        Its ``phase`` and ``log_gain`` may have one row for each pose.
+    nuisances : tuple of Block
+        What is found beside the pose.
     time : ndarray, shape (m,)
     world_from_body : ndarray, shape (m, 3, 3)
     position_world : ndarray, shape (m, 3)
-    root : ndarray, shape (m, channels, 6, 6)
-        Whitening; zero where a channel is missing.
+    root : ndarray, shape (m, channels, 3, 3)
+        Whitening (1/T); zero where a channel is missing.
 
     Returns
     -------
-    by_found : ndarray, shape (m, rows, 6 + phases)
-        By the pose and by the drive phases of unsynchronised beacons.
+    by_found : ndarray, shape (m, rows, 6 + nuisances)
+        By the pose and by the nuisances.
     by_survey : ndarray, shape (m, rows, parameters)
         By one sigma of each parameter of the survey.
     """
-    blocks = choose_blocks(calibration.site, SURVEY_GROUPS)
-    sizes = [len(b.sigma) for b in blocks]
-    survey = np.repeat(np.array([b.group != "phase" for b in blocks], dtype=bool), sizes)
-    phase = np.repeat(np.array([b.kind == "phase" for b in blocks], dtype=bool), sizes)
+    survey, found = choose_blocks(calibration.site, SURVEY_GROUPS), dimension(nuisances)
+    behind = tuple(
+        b._replace(columns=slice(found + b.columns.start, found + b.columns.stop)) for b in survey
+    )
     _, by_pose, by_calibration = linearize_channels(
-        calibration, blocks, time, world_from_body, position_world
+        calibration, nuisances + behind, time, world_from_body, position_world
     )
-    found = np.concatenate([by_pose, by_calibration[..., phase]], axis=-1)
-    by_survey = by_calibration[..., survey] * prior_sigma(blocks)[survey]
-    count = len(time)
-    return (root @ found).reshape(count, -1, found.shape[-1]), (root @ by_survey).reshape(
-        count, 6 * root.shape[1], -1
-    )
+    by_found = np.concatenate([by_pose, by_calibration[..., :found]], axis=-1)
+    by_survey = by_calibration[..., found:] * prior_sigma(survey)
+    return whitened(root, by_found), whitened(root, by_survey)
+
+
+def whitened(root: Array, columns: Array) -> Array:
+    """Return columns of the phasors' rows in units of their sigma.
+
+    Parameters
+    ----------
+    root : ndarray, shape (m, channels, 3, 3)
+    columns : ndarray, shape (m, channels, 6, k)
+        Of real parts, then imaginary parts (T).
+
+    Returns
+    -------
+    ndarray, shape (m, rows, k)
+    """
+    m, channels, _, width = columns.shape
+    halves = columns.reshape(m, channels, 2, 3, width)
+    return np.asarray((root[:, :, None] @ halves).reshape(m, -1, width))
 
 
 def honest_covariance(

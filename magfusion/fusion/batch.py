@@ -8,6 +8,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError
 from magfusion.fixes.fix import Fixes
+from magfusion.fixes.refine import nuisance_blocks
 from magfusion.fixes.survey import survey_jacobians
 from magfusion.fusion.factors import FieldFactors, FieldMeasurements, read_poses
 from magfusion.fusion.inertial import cut_at_epochs, low_passed, preintegrate
@@ -37,7 +38,13 @@ from magfusion.site import Site
 from magfusion.strapdown import resting
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array
-from magfusion.weights import measurement_cov, paired_whitening, sensor_positions, stacked
+from magfusion.weights import (
+    measurement_cov,
+    paired_whitening,
+    sensor_positions,
+    stacked,
+    whitening,
+)
 
 OFFSET_CONVERGED = 2e-5  # s; change of the time offset at which the passes end
 POSITION_CONVERGED = 5e-5  # m; rms change of the positions at which the passes end
@@ -367,10 +374,11 @@ def _survey_cov(job: _Job, states: Trajectory) -> Array:
     )
     by_found, by_survey = survey_jacobians(
         job.declared,
+        nuisance_blocks(job.declared.site),
         samples.time,
         states.world_from_body,
         states.position_world,
-        paired_whitening(cov, samples.valid),
+        whitening(cov, samples.valid),
     )
     moved = (np.linalg.pinv(by_found) @ by_survey)[:, :6]
     return np.asarray(moved @ np.swapaxes(moved, 1, 2))

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.errors import EstimationError
-from magfusion.fixes.fix import Fixes
-from magfusion.fixes.likelihood import Gravity, fix_epochs
+from magfusion.fixes.fix import Fixes, Gravity
+from magfusion.fixes.likelihood import fix_epochs
 from magfusion.fusion.wave import WaveFields, demodulate_about
 from magfusion.parameters import Calibration, initial_calibration
 from magfusion.receiver.lockin import WindowOperator, demodulate, window_operator

@@ -1,0 +1,483 @@
+"""Refinement of given poses on the one measurement model, all epochs and hypotheses at once.
+
+Levenberg-Marquardt, a row for each pose; a row that has converged costs nothing more.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import EstimationError
+from magfusion.fixes.fix import Fixes, Gravity
+from magfusion.fixes.survey import honest_covariance, survey_jacobians, whitened
+from magfusion.observation import skew
+from magfusion.parameters import Block, Calibration, dimension, linearize_channels, predict_channels
+from magfusion.records.samples import FieldSamples
+from magfusion.site import Site
+from magfusion.trajectory import Trajectory
+from magfusion.units import Array, BoolArray, IntArray
+from magfusion.weights import block_diagonal, measurement_cov, stacked, whitening
+
+FREE = ("phase", "gain")  # what may be found beside the pose, whatever the site says of it
+GAIN_SIGMA = 0.2  # of a log-gain; smooth errors of real installations (paper 004, Table 1)
+CHUNK = 500  # epochs solved at once: they fit into the cache
+Chosen = IntArray | BoolArray | slice
+ITERATIONS = 100  # a bound; the few that creep along a valley need more than 25
+
+
+class _Prior(NamedTuple):
+    """Where the body is thought to be."""
+
+    rotation: Array  # (m, 3, 3) world_from_body
+    position: Array  # (m, 3)
+    root: Array | None  # (m, 6, 6) whitening; None where it is a candidate and no more
+
+    def rows(self, chosen: Chosen) -> "_Prior":
+        """Return some rows, or rows repeated."""
+        root = None if self.root is None else self.root[chosen]
+        return _Prior(self.rotation[chosen], self.position[chosen], root)
+
+
+def _prior(prior: Trajectory) -> _Prior:
+    cov = prior.pose_cov
+    root = None if cov is None else np.linalg.inv(np.linalg.cholesky(cov))
+    return _Prior(prior.world_from_body, prior.position_world, root)
+
+
+class State(NamedTuple):
+    """What is found in each row."""
+
+    rotation: Array  # (m, 3, 3) world_from_body
+    position: Array  # (m, 3)
+    phase: Array  # (m, channels), beyond the calibration's
+    log_gain: Array  # (m, channels), beyond the calibration's
+
+    def rows(self, chosen: IntArray | BoolArray) -> "State":
+        """Return some rows."""
+        return State(*(part[chosen] for part in self))
+
+    def where(self, condition: BoolArray, other: "State") -> "State":
+        """Return the other's rows where the condition does not hold."""
+        pairs = zip(self, other, strict=True)
+        return State(
+            *(np.where(condition[(...,) + (None,) * (a.ndim - 1)], a, b) for a, b in pairs)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Phasors with their weights, and what else is known; a row for each pose sought.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    time : ndarray, shape (m,)
+    measured : ndarray, shape (m, channels, 6)
+        Real parts, then imaginary parts (T).
+    root : ndarray, shape (m, channels, 3, 3)
+        Whitening (1/T); zero where a channel is missing.
+    noise : ndarray, shape (m, channels, 3, 3), optional
+        Covariance of the whitened noise, where the root stands for more than noise.
+    blocks : tuple of Block
+        Nuisances found beside the pose.
+    gravity : Gravity, optional
+    prior : optional
+        Poses with their whitening.
+    """
+
+    calibration: Calibration
+    time: Array
+    measured: Array
+    root: Array
+    noise: Array | None
+    blocks: tuple[Block, ...]
+    gravity: Gravity | None
+    prior: "_Prior | None"
+
+    def rows(self, chosen: Chosen) -> "Problem":
+        """Return some rows, or rows repeated."""
+        return replace(
+            self,
+            time=self.time[chosen],
+            measured=self.measured[chosen],
+            root=self.root[chosen],
+            noise=None if self.noise is None else self.noise[chosen],
+            gravity=None if self.gravity is None else self.gravity.rows(chosen),
+            prior=None if self.prior is None else self.prior.rows(chosen),
+        )
+
+    @property
+    def residuals(self) -> int:
+        """Number of residuals of each row."""
+        gains = sum(block.kind == "gain" for block in self.blocks)
+        told = self.prior is not None and self.prior.root is not None
+        return 6 * int(self.root.shape[1]) + 3 * (self.gravity is not None) + 6 * told + gains
+
+    def start(self, rotation: Array, position: Array, phase: Array | None = None) -> State:
+        """Return the state at given poses."""
+        none = np.zeros((len(position), self.root.shape[1]))
+        return State(rotation, position, none if phase is None else phase, none)
+
+    def at(self, state: State) -> Calibration:
+        """Return the calibration with each row's own phases and gains."""
+        known = self.calibration
+        return replace(
+            known, phase=known.phase + state.phase, log_gain=known.log_gain + state.log_gain
+        )
+
+
+class Solved(NamedTuple):
+    """Where the rows ended."""
+
+    state: State
+    cost: Array  # (m,)
+    information: Array  # (m, 6 + nuisances, 6 + nuisances)
+
+
+def nuisance_blocks(site: Site, gain_sigma: float | None = None) -> tuple[Block, ...]:
+    """Return the columns of what is found beside the pose.
+
+    Parameters
+    ----------
+    site : Site
+        The drive phases of its beacons that are not synchronised come first.
+    gain_sigma : float, optional
+        Prior of a log-gain of each beacon; None where gains are known.
+    """
+    blocks: list[Block] = []
+    start = 0
+    for beacon in site.beacons:
+        if not beacon.synchronised:
+            columns = slice(start, start + len(beacon.tones))
+            sigma = np.full(len(beacon.tones), np.inf)
+            blocks.append(Block("phase", beacon.name, "phase", columns, sigma))
+            start = columns.stop
+    for beacon in () if gain_sigma is None else site.beacons:
+        sigma = np.array([gain_sigma])
+        blocks.append(Block("gain", beacon.name, "gain", slice(start, start + 1), sigma))
+        start += 1
+    return tuple(blocks)
+
+
+def problems(
+    samples: FieldSamples,
+    calibration: Calibration,
+    *,
+    gravity: Gravity | None,
+    prior: Trajectory | None,
+    survey_error: bool,
+    free: tuple[str, ...],
+    gain_sigma: float,
+) -> Iterator[Problem]:
+    """Yield the epochs of a log in chunks, weighed.
+
+    Raises
+    ------
+    EstimationError
+        Where there is no epoch.
+    """
+    if len(samples) == 0:
+        raise EstimationError("no epoch to fix: every window was dropped")
+    if not set(free) <= set(FREE):
+        raise ValueError(f"free must be among {FREE}; got {sorted(set(free) - set(FREE))}")
+    if "phase" in free:
+        site = calibration.site
+        loose = tuple(replace(b, synchronised=False) for b in site.beacons)
+        calibration = replace(calibration, site=replace(site, beacons=loose))
+    blocks = nuisance_blocks(calibration.site, gain_sigma if "gain" in free else None)
+    told = None if prior is None else _prior(prior)
+    for start in range(0, len(samples), CHUNK):
+        rows = slice(start, start + CHUNK)
+        some = _rows_of_samples(samples, rows)
+        root, noise = _weights(calibration.site, some, survey_error)
+        yield Problem(
+            calibration=calibration,
+            time=some.time,
+            measured=stacked(some.phasor_sensor),
+            root=root,
+            noise=noise,
+            blocks=blocks,
+            gravity=None if gravity is None else gravity.rows(rows),
+            prior=None if told is None else told.rows(rows),
+        )
+
+
+def _rows_of_samples(samples: FieldSamples, rows: slice) -> FieldSamples:
+    return replace(
+        samples,
+        time=samples.time[rows],
+        window=samples.window[rows],
+        phasor_sensor=samples.phasor_sensor[rows],
+        phasor_cov=samples.phasor_cov[rows],
+    )
+
+
+def _weights(site: Site, samples: FieldSamples, survey_error: bool) -> tuple[Array, Array | None]:
+    """Return the whitening, and the covariance of the whitened noise where the two differ."""
+    valid = samples.valid
+    root = whitening(measurement_cov(site, samples, survey_error=survey_error), valid)
+    if not survey_error:
+        return root, None
+    known = np.where(valid[..., None, None], measurement_cov(site, samples), 0.0)
+    return root, root @ known @ np.swapaxes(root, -1, -2)
+
+
+def refine(
+    samples: FieldSamples,
+    calibration: Calibration,
+    start: Trajectory,
+    *,
+    gravity: Gravity | None = None,
+    prior: Trajectory | None = None,
+    survey_error: bool = True,
+    free: tuple[str, ...] = (),
+    gain_sigma: float = GAIN_SIGMA,
+) -> Fixes:
+    """Refine the pose at every epoch from where it is thought to be.
+
+    It ends in the minimum next to the start; mirrored poses are not looked for.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        Channels in the site's order.
+    calibration : Calibration
+    start : Trajectory
+        Poses at the same times.
+    gravity, prior, survey_error, free, gain_sigma
+        As in `magfusion.fixes.likelihood.fix_epochs`.
+
+    Returns
+    -------
+    Fixes
+        With one hypothesis.
+
+    Raises
+    ------
+    EstimationError
+        Where there is no epoch.
+    """
+    parts, first = [], 0
+    for problem in problems(
+        samples,
+        calibration,
+        gravity=gravity,
+        prior=prior,
+        survey_error=survey_error,
+        free=free,
+        gain_sigma=gain_sigma,
+    ):
+        rows = slice(first, first + len(problem.time))
+        first = rows.stop
+        at = problem.start(start.world_from_body[rows], start.position_world[rows])
+        parts.append(as_fixes(problem, levenberg_marquardt(problem, at), 1))
+    return joined(parts)
+
+
+def joined(parts: list[Fixes]) -> Fixes:
+    """Return the fixes of chunks as one."""
+    return Fixes(
+        *(np.concatenate([getattr(p, f) for p in parts]) for f in Fixes.__dataclass_fields__)
+    )
+
+
+def as_fixes(problem: Problem, solved: Solved, count: int) -> Fixes:
+    """Return rows as fixes of so many hypotheses each, in the order in which they are.
+
+    Parameters
+    ----------
+    problem : Problem
+        Every epoch repeated for each of its hypotheses.
+    solved : Solved
+    count : int
+    """
+    state = solved.state
+    pose_cov, determined = posterior(problem, solved)
+
+    def split(rows: Array) -> Array:
+        return rows.reshape(-1, count, *rows.shape[1:])
+
+    return Fixes(
+        time=problem.time[::count],
+        world_from_body=split(state.rotation),
+        position_world=split(state.position),
+        pose_cov=split(pose_cov),
+        cost=split(solved.cost),
+        residual_rms=split(np.sqrt(solved.cost / problem.residuals)),
+        phase=split(state.phase),
+        determined=determined.reshape(-1, count),
+        log_gain=split(state.log_gain),
+    )
+
+
+def cost(problem: Problem, state: State) -> Array:
+    """Return the squared residual of each row, shape (m,), in units of its sigma."""
+    phasor = predict_channels(problem.at(state), problem.time, state.rotation, state.position)
+    error = whitened(problem.root, (stacked(phasor) - problem.measured)[..., None])
+    total = np.einsum("mij,mij->m", error, error)
+    for _, known in _known(problem, state):
+        total += np.einsum("mi,mi->m", known, known)
+    return np.asarray(total)
+
+
+def _known(problem: Problem, state: State) -> Iterator[tuple[Array, Array]]:
+    """Yield Jacobian (m, rows, 6 + nuisances) and residual (m, rows) of what is no field."""
+    m, width = len(problem.time), 6 + dimension(problem.blocks)
+    if problem.gravity is not None:
+        up = state.rotation[:, 2]
+        share = 1.0 / problem.gravity.sigma
+        block = np.zeros((m, 3, width))
+        block[:, :, :3] = share[:, None, None] * skew(up)
+        yield block, share[:, None] * (up - problem.gravity.up_body)
+    prior = problem.prior
+    if prior is not None and prior.root is not None:
+        step = _pose_difference(prior.rotation, prior.position, state.rotation, state.position)
+        block = np.zeros((m, 6, width))
+        block[:, :, :6] = prior.root
+        yield block, (prior.root @ step[..., None])[..., 0]
+    names = [name for name, _ in problem.calibration.site.channels]
+    for gain in problem.blocks:
+        if gain.kind == "gain":
+            block = np.zeros((m, 1, width))
+            block[:, 0, 6 + gain.columns.start] = 1.0 / gain.sigma[0]
+            yield block, state.log_gain[:, [names.index(gain.owner)]] / gain.sigma[0]
+
+
+def _pose_difference(rotation0: Array, position0: Array, rotation: Array, position: Array) -> Array:
+    """Perturbation from the first pose to the second, small-angle in its translation."""
+    inverse = np.swapaxes(rotation0, -1, -2)
+    turn = Rotation.from_matrix(inverse @ rotation).as_rotvec()
+    shift = (inverse @ (position - position0)[..., None])[..., 0]
+    return np.concatenate([turn, shift], axis=-1)
+
+
+def _normal(problem: Problem, state: State) -> Array:
+    """Return ``[J e]^T [J e]`` of each row: information, gradient, and the cost in the corner."""
+    value, by_pose, by_nuisance = linearize_channels(
+        problem.at(state), problem.blocks, problem.time, state.rotation, state.position
+    )
+    error = (value - problem.measured)[..., None]
+    columns = whitened(problem.root, np.concatenate([by_pose, by_nuisance, error], axis=-1))
+    normal = np.swapaxes(columns, 1, 2) @ columns
+    for block, known in _known(problem, state):
+        rows = np.concatenate([block, known[..., None]], axis=-1)
+        normal += np.swapaxes(rows, 1, 2) @ rows
+    return np.asarray(normal)
+
+
+def _spread(problem: Problem, kind: str) -> Array:
+    """Return which channels a nuisance's column moves, shape (nuisances, channels)."""
+    names = np.array([name for name, _ in problem.calibration.site.channels])
+    out = np.zeros((dimension(problem.blocks), len(names)))
+    for block in problem.blocks:
+        if block.kind == kind:
+            mine = np.flatnonzero(names == block.owner)
+            columns = np.arange(block.columns.start, block.columns.stop)
+            out[columns if kind == "phase" else columns[0], mine] = 1.0
+    return out
+
+
+def levenberg_marquardt(problem: Problem, start: State) -> Solved:
+    """Move every row to the minimum next to its start.
+
+    Parameters
+    ----------
+    problem : Problem
+    start : State
+        Of the same rows.
+
+    Returns
+    -------
+    Solved
+    """
+    spread = _spread(problem, "phase"), _spread(problem, "gain")
+    state, normal = start, _normal(problem, start)
+    found, last = State(*(part.copy() for part in start)), normal.copy()
+    active = np.arange(len(problem.time))
+    damping = np.full(len(active), 1e-3)
+    for _ in range(ITERATIONS):
+        trial = _moved(state, _step(normal, damping), *spread)
+        new = _normal(problem, trial)
+        gain = normal[:, -1, -1] - new[:, -1, -1]
+        better = gain > 0.0
+        state, normal = trial.where(better, state), np.where(better[:, None, None], new, normal)
+        damping = damping * np.where(better, 0.2, 10.0)
+        small = gain < 1e-4 * (1.0 + 1e-3 * new[:, -1, -1])
+        going = ~((damping > 1e8) | (better & small))
+        if not np.all(going):
+            done = active[~going]
+            for kept, part in zip(found, state, strict=True):
+                kept[done] = part[~going]
+            last[done] = normal[~going]
+            active, damping, normal = active[going], damping[going], normal[going]
+            state, problem = state.rows(going), problem.rows(going)
+        if not len(active):
+            break
+    for kept, part in zip(found, state, strict=True):
+        kept[active] = part
+    last[active] = normal
+    return Solved(found, last[:, -1, -1].copy(), last[:, :-1, :-1])
+
+
+def _step(normal: Array, damping: Array) -> Array:
+    """Return the damped step of each row, at most a radian, shape (m, 6 + nuisances)."""
+    information, gradient = normal[:, :-1, :-1], normal[:, :-1, -1:]
+    diagonal = np.einsum("mii->mi", information)
+    largest = np.max(diagonal, axis=1, keepdims=True)
+    # An epoch without any channel has no information at all: it stays where it is.
+    floor = np.where(largest > 0.0, 1e-9 * largest, 1.0)
+    damped = information.copy()
+    np.einsum("mii->mi", damped)[...] += damping[:, None] * np.maximum(diagonal, floor)
+    step = -np.linalg.solve(damped, gradient)[..., 0]
+    angle = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
+    return np.asarray(step * np.minimum(1.0, 1.0 / np.maximum(angle, 1e-12)))
+
+
+def _moved(state: State, step: Array, by_phase: Array, by_gain: Array) -> State:
+    return State(
+        rotation=state.rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix(),
+        position=state.position + (state.rotation @ step[:, 3:6, None])[..., 0],
+        phase=state.phase + step[:, 6:] @ by_phase,
+        log_gain=state.log_gain + step[:, 6:] @ by_gain,
+    )
+
+
+def posterior(problem: Problem, solved: Solved) -> tuple[Array, BoolArray]:
+    """Return the covariance of each row's pose, (m, 6, 6), and whether it is determined."""
+    inverse, determined = _inverse(solved.information)
+    if problem.noise is not None:
+        carried = _with_survey(problem, solved, inverse)
+        # Where a direction is open there is nothing for the survey to make worse.
+        inverse = np.where(determined[..., None, None], carried, inverse)
+    return inverse[..., :6, :6], determined
+
+
+def _with_survey(problem: Problem, solved: Solved, inverse: Array) -> Array:
+    """Covariance with the error of the survey carried through, rather than taken for noise."""
+    assert problem.noise is not None
+    state = solved.state
+    by_found, by_survey = survey_jacobians(
+        problem.at(state),
+        problem.blocks,
+        problem.time,
+        state.rotation,
+        state.position,
+        problem.root,
+    )
+    noise = block_diagonal(np.repeat(problem.noise, 2, axis=1))
+    return honest_covariance(by_found, by_survey, noise, inverse, solved.information)
+
+
+def _inverse(information: Array) -> tuple[Array, BoolArray]:
+    """Return the covariance of pose and nuisances; flat directions are wide, not infinite."""
+    value, vector = np.linalg.eigh(information)
+    largest = value[..., -1:]
+    # The phase of a channel that is missing is open too, but is no direction of the pose.
+    in_pose = np.sum(vector[..., :6, :] ** 2, axis=-2) > 1e-6
+    open_direction = (value <= 1e-10 * largest) & in_pose
+    safe = np.maximum(value, 1e-10 * largest + 1e-300)
+    cov = (vector / safe[..., None, :]) @ np.swapaxes(vector, -1, -2)
+    return cov, ~np.any(open_direction, axis=-1)
