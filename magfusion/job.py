@@ -56,6 +56,7 @@ _WRITTEN = {
     "simulate": _LOG,
     "demodulate": _LOG,
     "survey": {"survey.parquet", "survey.png", "report.json"},
+    "calibrate fieldmap": {"site.yaml", "site_field_map.parquet", "field_map.png", "report.json"},
     "coverage": {"coverage.parquet", "coverage.png", "run.rrd", "report.json"},
 }
 

@@ -19,7 +19,7 @@ FLOORS = (
     {"parameters", "weights"},
     {"refinement"},
     {"receiver", "simulation", "calibration", "fusion", "fixes", "evaluation"},
-    {"report", "job", "coverage_plot", "view_coverage"},
+    {"report", "job", "coverage_plot", "fieldmap_plot", "view_coverage"},
     {"pipeline", "jobs", "screen", "options"},
     {"demo"},
     {"cli"},
@@ -86,7 +86,10 @@ def test_only_the_view_imports_rerun() -> None:
 
 
 def test_only_the_plot_imports_matplotlib() -> None:
-    assert _importers("matplotlib") <= {"magfusion/coverage_plot.py"}
+    assert _importers("matplotlib") <= {
+        "magfusion/coverage_plot.py",
+        "magfusion/fieldmap_plot.py",
+    }
 
 
 def test_only_the_ekf_imports_filterpy() -> None:

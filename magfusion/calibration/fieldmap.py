@@ -227,7 +227,7 @@ def _solved(heard: _Heard, process: _Process) -> tuple[Array, Array, float]:
         state = pulled.reshape(count, COMPONENTS)
     _, volume = np.linalg.slogdet(system)
     likelihood = rest + 0.5 * float(vector.ravel() @ pulled) - 0.5 * float(volume)
-    return weights.reshape(count, COMPONENTS), information, likelihood
+    return np.asarray(weights.reshape(count, COMPONENTS)), information, likelihood
 
 
 def _likeliest_process(heard: Sequence[_Heard]) -> _Process:

@@ -1,0 +1,88 @@
+"""A field map as a picture: gain and turn of each beacon's field, and where it is known."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from magfusion.calibration.fieldmap import MapFit
+from magfusion.site import Beacon
+from magfusion.units import Array
+
+_GRID = 60
+
+
+def write_plot(path: Path, fit: MapFit) -> None:
+    """Write a PNG: a column for each beacon; gain above, turn below, at the survey's height.
+
+    Parameters
+    ----------
+    path : Path
+    fit : MapFit
+    """
+    beacons = fit.site.beacons
+    figure = Figure(figsize=(1.5 + 4.2 * len(beacons), 8.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(2, len(beacons), squeeze=False)
+    sheets = [_sheet(beacon) for beacon in beacons]
+    most = max(float(np.max(np.abs(s.gain))) for s in sheets) or 1.0
+    largest = max(float(np.max(s.turn_deg)) for s in sheets) or 1.0
+    for column, (beacon, sheet) in enumerate(zip(beacons, sheets, strict=True)):
+        upper, lower = panels[:, column]
+        shown = (
+            (upper, sheet.gain, {"cmap": "RdBu_r", "vmin": -most, "vmax": most}),
+            (lower, sheet.turn_deg, {"cmap": "viridis", "vmin": 0.0, "vmax": largest}),
+        )
+        for axes, values, scale in shown:
+            mesh = axes.pcolormesh(sheet.x, sheet.y, values, shading="nearest", **scale)
+            # What is hatched is hardly better known than before the survey.
+            axes.contourf(
+                sheet.x, sheet.y, sheet.unknown, [0.5, 2.0], hatches=["//"], colors="none"
+            )
+            axes.plot(*sheet.points.T, ".", color="black", markersize=2.0)
+            axes.plot(*beacon.position_world[:2], "^", color="black", markersize=9)
+            axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+            if column == len(beacons) - 1:
+                label = "gain (%)" if axes is upper else "turn (deg)"
+                figure.colorbar(mesh, ax=axes, label=label)
+        without, left = (100.0 * e[beacon.name] for e in (fit.error_without, fit.error_with))
+        upper.set_title(f"beacon {beacon.name}\nerror {without:.2g} %, with the map {left:.2g} %")
+    figure.suptitle(
+        "Field measured against field modelled; dots: survey, triangle: beacon; hatched: not known"
+    )
+    figure.savefig(path, dpi=100, metadata={"Software": None})
+
+
+class _Sheet(NamedTuple):
+    """The map of one beacon at the median height of its survey."""
+
+    points: Array  # (m, 2), m
+    x: Array
+    y: Array
+    gain: Array  # percent
+    turn_deg: Array
+    unknown: Array  # sigma left of that before the survey
+
+
+def _sheet(beacon: Beacon) -> _Sheet:
+    found = beacon.field_map
+    assert found is not None
+    points = found.points_world
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.5 * found.length_scale
+    x, y = (np.linspace(low[i] - margin, high[i] + margin, _GRID) for i in (0, 1))
+    mesh = np.meshgrid(x, y, [float(np.median(points[:, 2]))], indexing="xy")
+    spots = np.stack(mesh, axis=-1).reshape(-1, 3)
+    value, _ = found.mean(spots)
+    left = np.sqrt(found.variance(spots)[:, 0]) / found.gain_sigma
+    square = (_GRID, _GRID)
+    return _Sheet(
+        points=points[:, :2],
+        x=x,
+        y=y,
+        gain=100.0 * np.expm1(value[:, 0]).reshape(square),
+        turn_deg=np.rad2deg(np.linalg.norm(value[:, 1:], axis=1)).reshape(square),
+        unknown=left.reshape(square),
+    )
