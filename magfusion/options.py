@@ -1,6 +1,7 @@
 """Option values that are more than a number or a name."""
 
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 
@@ -59,6 +60,14 @@ def groups_option(estimate: str | None) -> tuple[str, ...] | None:
             f"group; choose from {', '.join(GROUPS)}, or none"
         )
     return chosen
+
+
+def check_fix(method: str, survey: Path | None, block: float | None) -> None:
+    """Refuse options of ``fix`` that the method does not take, or lacks."""
+    if method == "likelihood" and survey is not None:
+        raise InputError("--survey belongs to the methods of paper 004; choose one with --method")
+    if method != "paper-lines" and block is not None:
+        raise InputError("--block belongs to --method paper-lines")
 
 
 def check_simulation(duration: float, shortest: float, longest: float, seed: int) -> None:

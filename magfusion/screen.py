@@ -25,11 +25,12 @@ _COLUMNS = ("rms", "aligned", "survey held", "claimed sigma per axis")
 _ELSEWHERE = re.compile(
     r"job|log|ate_m|attitude_rmse_deg|aligned_.*|rpe_.*|held_.*|.*_sigma_median_.*|cost|failed|"
     r"nees_median|(position|attitude)_inside_3_sigma|start_.*|rival_.*|ambiguous|not_compared|"
-    r"windows_dropped_.*|determined|undetermined|time_offset_s|passes|iterations|.*\..*"
+    r"(windows|epochs)_dropped_.*|determined|undetermined|time_offset_s|passes|iterations|.*\..*"
 )
-_USUAL = {"coupling": "tight", "converged": True, "windows_dropped": 0, "intervals_bridged": 0}
+_USUAL = {"coupling": "tight", "converged": True, "windows_dropped": 0, "epochs_dropped": 0}
+_USUAL |= {"intervals_bridged": 0}
 _USUAL |= {"ambiguous_epochs": 0, "undetermined_epochs": 0}
-_LISTED = re.compile(r"(?P<name>residual_rms|sigma)_(?P<part>.+?)(?P<unit>_t)?")
+_LISTED = re.compile(r"(?P<name>residual_rms|sigma|points_hearing)_(?P<part>.+?)(?P<unit>_t)?")
 _PART = re.compile(r"_([xyz]|\d)(?=(_m|_deg|_ppm)?$)|(?<=_[xyz])[xyz]$")
 POOR_FIT = 3.0  # whitened residual, one where noise and model are as declared
 
@@ -117,8 +118,8 @@ def _others(figures: Figures) -> Table:
 
 
 def _reasons(figures: Figures, key: str) -> str:
-    found = [k for k in figures if key == "windows_dropped" and k.startswith("windows_dropped_")]
-    told = [f"{figures[k]} {k.removeprefix('windows_dropped_').replace('_', ' ')}" for k in found]
+    found = [k for k in figures if key.endswith("_dropped") and k.startswith(f"{key}_")]
+    told = [f"{figures[k]} {k.removeprefix(f'{key}_').replace('_', ' ')}" for k in found]
     return f" ({', '.join(told)})" if told else ""
 
 

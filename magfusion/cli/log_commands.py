@@ -1,7 +1,8 @@
 """Commands that take a log."""
 
 from enum import StrEnum
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Literal
 
 import typer
 
@@ -21,8 +22,11 @@ from magfusion.cli.app import (
     progress,
     show_result,
 )
+from magfusion.fixes.published import Method
 from magfusion.fusion.batch import SmootherSettings
-from magfusion.options import groups_option
+from magfusion.jobs.published import run_published_fix
+from magfusion.jobs.survey import SurveySettings, run_survey
+from magfusion.options import check_fix, groups_option
 from magfusion.parameters import GROUPS
 from magfusion.pipeline import run_demodulate, run_fix, run_smooth
 
@@ -40,6 +44,23 @@ class Robust(StrEnum):
     NONE = "none"
     HUBER = "huber"
     CAUCHY = "cauchy"
+
+
+class FixMethod(StrEnum):
+    """How an epoch is located."""
+
+    LIKELIHOOD = "likelihood"
+    PAPER_LINES = "paper-lines"
+    PAPER_KNN = "paper-knn"
+    PAPER_KNN_NT = "paper-knn-nt"
+    PAPER_FINGERPRINT = "paper-fingerprint"
+
+
+class SurveyPoints(StrEnum):
+    """What becomes a point of a survey."""
+
+    RESTS = "rests"
+    EPOCHS = "epochs"
 
 
 class Rate(StrEnum):
@@ -91,6 +112,15 @@ def fix(
     log: LogPath,
     output: JobOutput = None,
     site: SitePath = None,
+    method: Annotated[
+        FixMethod, typer.Option(help="Maximum likelihood, or an algorithm of paper 004.")
+    ] = FixMethod.LIKELIHOOD,
+    survey: Annotated[
+        Path | None, typer.Option(help="Fingerprint survey, which the paper's methods need.")
+    ] = None,
+    block: Annotated[
+        float | None, typer.Option(help="Of paper-lines: a line for each block of this size, m.")
+    ] = None,
     window: Window = None,
     step: Step = None,
     mains_hz: MainsHz = 50.0,
@@ -101,8 +131,13 @@ def fix(
 ) -> None:
     """Fix the pose at every epoch on its own, with every hypothesis that survives."""
     job = log_job("fix", log, site, output, window, step, mains_hz, start, end, topics)
-    with progress() as report:
-        figures = run_fix(job, report=report)
+    chosen: Literal["likelihood"] | Method = method.value
+    check_fix(chosen, survey, block)
+    if chosen == "likelihood":
+        with progress() as report:
+            figures = run_fix(job, report=report)
+    else:
+        figures = run_published_fix(job, chosen, survey, block)
     show_result(figures, job.output, as_json)
 
 
@@ -123,4 +158,31 @@ def demodulate(
     job = log_job("demodulate", log, site, output, window, step, mains_hz, start, end, topics)
     with progress() as report:
         figures = run_demodulate(job, report=report)
+    show_result(figures, job.output, as_json)
+
+
+@app.command()
+def survey(
+    log: LogPath,
+    output: JobOutput = None,
+    site: SitePath = None,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(help="Result, TUM file or table with the poses; default: the log's truth."),
+    ] = None,
+    points: Annotated[SurveyPoints, typer.Option(help="One point a stop, or one an epoch.")] = (
+        SurveyPoints.RESTS
+    ),
+    spacing: Annotated[float, typer.Option(help="Least distance of two points, m.")] = 0.0,
+    window: Window = None,
+    step: Step = None,
+    mains_hz: MainsHz = 50.0,
+    start: Start = None,
+    end: End = None,
+    topics: TopicNames = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make a fingerprint survey of a log: the fields at places with known poses."""
+    job = log_job("survey", log, site, output, window, step, mains_hz, start, end, topics)
+    figures = run_survey(job, SurveySettings(points.value, spacing, trajectory))
     show_result(figures, job.output, as_json)

@@ -160,7 +160,7 @@ def locate_by_neighbours(
     met = difference == 0.0
     share = np.where(met.any(axis=1, keepdims=True), met, 1.0 / np.where(met, 1.0, difference))
     share = share / np.sum(share, axis=1, keepdims=True)
-    return np.einsum("nj,njx->nx", share, database.position_world[point])
+    return np.asarray(np.einsum("nj,njx->nx", share, database.position_world[point]))
 
 
 def locate_by_differential_range(

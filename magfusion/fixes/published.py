@@ -168,7 +168,7 @@ def locate_by_lines(
     for _ in range(BLOCK_PASSES):
         ranges = ranges_from_lines(by_block.at(position), amplitude)
         position = trilaterate_from_both_sides(ranges, known.beacons_world, position)
-    return position
+    return np.asarray(position)
 
 
 def attitude_as_published(

@@ -1,0 +1,226 @@
+"""The job that makes a fingerprint survey: a log and its poses in, a survey out."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.fusion.source import phasors
+from magfusion.job import Job, claim, named, read_estimate, read_job
+from magfusion.records.samples import FieldSamples, Log
+from magfusion.records.survey import Survey, write_survey
+from magfusion.report import Figures, dropped_figures, write_report
+from magfusion.site import Site
+from magfusion.strapdown import resting
+from magfusion.survey_plot import write_survey_plot
+from magfusion.trajectory import Trajectory, interpolate
+from magfusion.units import Array, BoolArray, ComplexArray, IntArray
+
+Points = Literal["rests", "epochs"]
+MAX_GAP = 1.0  # s; of the poses, across which they are interpolated
+STILL = 0.02  # m; within a stop, by the poses: at constant speed the IMU feels as if at rest
+GAP = 1.5  # of the distance of two windows, beyond which they belong to two stops
+
+
+@dataclass(frozen=True)
+class SurveySettings:
+    """What becomes a point of the survey.
+
+    Parameters
+    ----------
+    points : {"rests", "epochs"}
+        One point a stop of the platform, or one an epoch.
+    spacing : float
+        Least distance of two points (m); of those that are nearer the first is kept.
+    trajectory : Path, optional
+        Poses in place of the log's truth: a result's directory, TUM file or table.
+    """
+
+    points: Points = "rests"
+    spacing: float = 0.0
+    trajectory: Path | None = None
+
+
+class _Point(NamedTuple):
+    position_world: Array
+    world_from_body: Array
+    phasor: ComplexArray  # (channels, 3); NaN where a channel is missing
+    sigma: Array  # (channels,)
+
+
+def run_survey(job: Job, settings: SurveySettings) -> Figures:
+    """Make a survey of the fields at known poses: table, picture and report.
+
+    Returns
+    -------
+    dict
+        The figures of ``report.json``.
+
+    Raises
+    ------
+    InputError
+        Where the log has no pose, none of its epochs can be a point, or ``output`` is in the way.
+    """
+    if not 0.0 <= settings.spacing < np.inf:
+        raise InputError(f"--spacing must be at least 0 m; got {settings.spacing:g}")
+    claimed = claim(job.output, "survey")
+    log, site = read_job(job)
+    poses = _poses(job, settings, log)
+    with named(job.log_path):
+        samples, windows_dropped = phasors(log, site, job.lockin)
+    survey, dropped = make_survey(samples, poses, log, site, settings)
+    if len(survey) == 0:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
+        raise InputError(
+            f"{job.log_path}: none of its {len(samples)} epochs can be a point of a survey"
+            f" ({reasons}); rest at known places, or take moving epochs with --points epochs"
+        )
+    figures = _figures(log, site, survey, dropped) | dropped_figures(windows_dropped)
+    with claimed as directory:
+        write_survey(survey, directory / "survey.parquet")
+        write_survey_plot(directory / "survey.png", site, survey)
+        write_report(directory, figures)
+    return figures
+
+
+def _poses(job: Job, settings: SurveySettings, log: Log) -> Trajectory:
+    if settings.trajectory is not None:
+        return read_estimate(settings.trajectory, log.epoch_ns)
+    if log.truth is None:
+        raise InputError(
+            f"{job.log_path}: holds no truth to take the poses from; name a smoothed result with"
+            " --trajectory"
+        )
+    return log.truth
+
+
+def make_survey(
+    samples: FieldSamples, poses: Trajectory, log: Log, site: Site, settings: SurveySettings
+) -> tuple[Survey, dict[str, int]]:
+    """Return the survey, and how many epochs were dropped for each reason.
+
+    A stop's phasors are averaged with the pose over its windows; those of an unsynchronised beacon
+    are first turned to one drive phase, which drifts.  ``sigma`` counts overlapping windows once.
+    """
+    known, exists = interpolate(poses, samples.time, MAX_GAP)
+    heard = samples.valid.any(axis=1)
+    still = np.ones(len(samples), dtype=bool)
+    if settings.points == "rests":
+        still = _at_rest(samples, log, site)
+    used = np.flatnonzero(exists & heard & still)
+    dropped = {
+        "outside the trajectory": int(np.sum(~exists)),
+        "no beacon heard": int(np.sum(exists & ~heard)),
+        "moving": int(np.sum(exists & heard & ~still)),
+    }
+    at = np.searchsorted(np.flatnonzero(exists), used)
+    position, attitude = known.position_world[at], known.world_from_body[at]
+    stop = np.arange(len(used))
+    if settings.points == "rests":
+        stop = _stops(samples.time[used], position)
+    found = [
+        _mean(samples, site, used[stop == s], position[stop == s], attitude[stop == s])
+        for s in range(int(np.max(stop, initial=-1)) + 1)
+    ]
+    kept = _spaced(np.array([p.position_world for p in found]).reshape(-1, 3), settings.spacing)
+    dropped["too close to another point"] = int(np.sum(~np.isin(stop, kept)))
+    chosen = [found[k] for k in kept]
+    shape = (len(chosen), len(samples.channels))
+    survey = Survey(
+        point=np.arange(len(chosen)),
+        position_world=np.array([p.position_world for p in chosen]).reshape(-1, 3),
+        world_from_body=np.array([p.world_from_body for p in chosen]).reshape(-1, 3, 3),
+        channels=samples.channels,
+        sigma=np.array([p.sigma for p in chosen]).reshape(shape),
+        phasor_sensor=np.array([p.phasor for p in chosen], complex).reshape(*shape, 3),
+    )
+    return survey, {reason: number for reason, number in dropped.items() if number}
+
+
+def _at_rest(samples: FieldSamples, log: Log, site: Site) -> BoolArray:
+    """Return during which windows every inertial sample is at rest."""
+    time = log.imu.time + site.platform.imu.time_offset
+    moving = ~resting(time, log.imu.gyro_body, log.imu.accel_body)
+    total = np.concatenate([[0], np.cumsum(moving)])
+    half = samples.window / 2.0
+    first = np.searchsorted(time, samples.time - half)
+    last = np.searchsorted(time, samples.time + half, side="right")
+    return np.asarray((last > first) & (total[last] == total[first]))
+
+
+def _stops(time: Array, position: Array) -> IntArray:
+    """Return the number of the stop to which each window at rest belongs, from 0 in time."""
+    number = np.zeros(len(time), dtype=np.int64)
+    usual = np.median(np.diff(time)) if len(time) > 1 else 0.0
+    first = 0
+    for i in range(1, len(time)):
+        moved = np.linalg.norm(position[i] - position[first]) > STILL
+        new = moved or time[i] - time[i - 1] > GAP * usual
+        first = i if new else first
+        number[i] = number[i - 1] + new
+    return number
+
+
+def _mean(
+    samples: FieldSamples, site: Site, rows: IntArray, position: Array, attitude: Array
+) -> _Point:
+    """Return the mean of the windows of one stop."""
+    valid = samples.valid[rows]
+    phasor = np.where(valid[..., None], samples.phasor_sensor[rows], 0.0)
+    free = [not b.synchronised for b in site.beacons for _ in b.tones]
+    first = np.take_along_axis(phasor, np.argmax(valid, axis=0)[None, :, None], axis=0)
+    lag = np.angle(np.sum(np.conj(first) * phasor, axis=-1))
+    phasor = phasor * np.exp(-1j * np.where(free, lag, 0.0))[..., None]
+    count = np.sum(valid, axis=0)
+    share = np.where(count > 0, 1.0 / np.maximum(count, 1), np.nan)
+    variance = np.trace(samples.phasor_cov[rows], axis1=2, axis2=3) / 3.0
+    variance = share * np.sum(np.where(valid, variance, 0.0), axis=0)
+    independent = np.minimum(_windows_beside(samples, rows), np.maximum(count, 1))
+    return _Point(
+        position_world=np.mean(position, axis=0),
+        world_from_body=Rotation.from_matrix(attitude).mean().as_matrix(),
+        phasor=share[:, None] * np.sum(phasor, axis=0),
+        sigma=np.sqrt(variance / independent),
+    )
+
+
+def _windows_beside(samples: FieldSamples, rows: IntArray) -> float:
+    """Return how many windows that do not overlap fit into a stop."""
+    time, window = samples.time[rows], samples.window[rows]
+    return float((time[-1] - time[0]) / np.median(window)) + 1.0
+
+
+def _spaced(position: Array, spacing: float) -> IntArray:
+    """Return the points, in their order, that no earlier one is nearer to than the spacing."""
+    if spacing == 0.0 or len(position) == 0:
+        return np.arange(len(position))
+    keep = np.ones(len(position), dtype=bool)
+    near = KDTree(position).query_pairs(spacing * (1.0 - 1e-9), output_type="ndarray")
+    for i, j in near[np.lexsort((near[:, 1], near[:, 0]))]:
+        if keep[i]:
+            keep[j] = False
+    return np.flatnonzero(keep)
+
+
+def _figures(log: Log, site: Site, survey: Survey, dropped: dict[str, int]) -> Figures:
+    heard = np.isfinite(survey.sigma)
+    own = np.array([name for name, _ in survey.channels])
+    by_beacon = {b.name: heard[:, own == b.name].any(axis=1) for b in site.beacons}
+    beacons = np.sum(list(by_beacon.values()), axis=0)
+    figures: Figures = {
+        "job": "survey",
+        "log": log.name,
+        "points": len(survey),
+        "beacons_per_point_least": int(np.min(beacons)),
+        "beacons_per_point_mean": float(np.mean(beacons)),
+        "epochs_dropped": sum(dropped.values()),
+    }
+    figures |= {f"points_hearing_{name}": int(np.sum(h)) for name, h in by_beacon.items()}
+    figures["noise_of_a_phasor_t"] = float(np.nanmedian(survey.sigma))
+    for reason, count in dropped.items():
+        figures["epochs_dropped_" + reason.replace(" ", "_")] = count
+    return figures
