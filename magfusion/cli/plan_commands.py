@@ -39,7 +39,8 @@ def simulate(
         bool, typer.Option(help="Draw the true calibration from the site's sigmas.")
     ] = True,
     iron: Annotated[
-        int, typer.Option(min=0, help="Steel spheres around the room, 0.5 m from it and more.")
+        int,
+        typer.Option(min=0, max=200, help="Steel spheres about the room, 0.5 m from it or more."),
     ] = 0,
     seed: Annotated[int, typer.Option(help="Of every random draw.")] = 0,
     as_json: AsJson = False,

@@ -11,7 +11,7 @@ from magfusion.units import Array, ComplexArray
 
 DAY = 86_400.0  # s
 CLEARANCE = 0.5  # m from the surface of drawn iron to where the body moves, and to every beacon
-REACH = 1.5  # m beyond that clearance within which iron is drawn where nothing is said
+REACH = 0.5  # m beyond that clearance within which iron is drawn where nothing is said
 STEEL_PERMEABILITY = 100.0
 STEEL_CONDUCTIVITY = 5e6  # S/m
 _ATTEMPTS = 200  # to place one sphere
