@@ -57,6 +57,12 @@ _WRITTEN = {
     "demodulate": _LOG,
     "survey": {"survey.parquet", "survey.png", "report.json"},
     "calibrate fieldmap": {"site.yaml", "site_field_map.parquet", "field_map.png", "report.json"},
+    "calibrate magnetometer": {
+        "site.yaml",
+        "site_field_map.parquet",
+        "magnetometer.png",
+        "report.json",
+    },
     "coverage": {"coverage.parquet", "coverage.png", "run.rrd", "report.json"},
 }
 

@@ -23,7 +23,7 @@ _ERRORS = {
 _COLUMNS = ("rms", "aligned", "survey held", "claimed sigma per axis")
 # Told in tables or sentences, or of interest only in report.json.
 _ELSEWHERE = re.compile(
-    r"job|log|ate_m|attitude_rmse_deg|aligned_.*|rpe_.*|held_.*|.*_sigma_median_.*|cost|failed|"
+    r"job|log|notes|ate_m|attitude_rmse_deg|aligned_.*|rpe_.*|held_.*|.*_sigma_median_.*|cost|failed|"
     r"nees_median|(position|attitude)_inside_3_sigma|start_.*|rival_.*|ambiguous|not_compared|"
     r"(windows|epochs)_dropped_.*|determined|undetermined|time_offset_s|passes|iterations|.*\..*"
 )
@@ -60,7 +60,8 @@ def show(figures: Figures, output: Path | None, console: Console | None = None) 
 
 def remarks(figures: Figures) -> list[str]:
     """Return in words what a reader of the figures must not overlook."""
-    epochs, out = figures.get("epochs"), []
+    epochs, told = figures.get("epochs"), figures.get("notes")
+    out = list(told) if isinstance(told, list) else []
     if "failed" in figures:
         out.append(f"The smoother failed ({figures['failed']}).")
     if figures.get("converged") is False:

@@ -19,7 +19,15 @@ FLOORS = (
     {"parameters", "weights"},
     {"refinement"},
     {"receiver", "simulation", "calibration", "fusion", "fixes", "evaluation"},
-    {"report", "job", "coverage_plot", "fieldmap_plot", "survey_plot", "view_coverage"},
+    {
+        "report",
+        "job",
+        "coverage_plot",
+        "fieldmap_plot",
+        "magnetometer_plot",
+        "survey_plot",
+        "view_coverage",
+    },
     {"pipeline", "jobs", "screen", "options"},
     {"demo"},
     {"cli"},
@@ -89,6 +97,7 @@ def test_only_the_plot_imports_matplotlib() -> None:
     assert _importers("matplotlib") <= {
         "magfusion/coverage_plot.py",
         "magfusion/fieldmap_plot.py",
+        "magfusion/magnetometer_plot.py",
         "magfusion/survey_plot.py",
     }
 

@@ -8,6 +8,7 @@ GTSAM's own factors hold the attitudes; field and specific force of all epochs a
 once and enter as Jacobian factors, because a Python factor is called with a copy of all values.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import gtsam
@@ -226,8 +227,10 @@ class _Problem:
         step = self.prior_root @ (self.declared - state.calibration)[self.active]
         unit = gtsam.noiseModel.Unit.Create(len(step))
         graph.push_back(gtsam.JacobianFactor(CALIBRATION_KEY, self.prior_root, step, unit))
-        try:
+        with suppress(RuntimeError):
             return graph.eliminateMultifrontal(self.ordering)
+        try:  # sharp fields and shaken verticals: QR needs half the digits
+            return graph.eliminateMultifrontal(self.ordering, gtsam.EliminateQR)
         except RuntimeError as failure:
             raise EstimationError(
                 "the calibration's graph cannot be solved: the attitudes are not determined"

@@ -5,8 +5,21 @@ from typing import Annotated
 
 import typer
 
-from magfusion.cli.app import AsJson, Output, calibrate, progress, show_result
+from magfusion.cli.app import (
+    AsJson,
+    End,
+    LogPath,
+    Output,
+    SitePath,
+    Start,
+    TopicNames,
+    calibrate,
+    log_job,
+    progress,
+    show_result,
+)
 from magfusion.jobs.calibrate_fieldmap import MapSource, run_calibrate_fieldmap
+from magfusion.jobs.calibrate_magnetometer import run_calibrate_magnetometer
 
 
 @calibrate.command()
@@ -33,3 +46,21 @@ def fieldmap(
             MapSource(source, site, trajectory, spacing), output, report=report
         )
     show_result(figures, output, as_json)
+
+
+@calibrate.command()
+def magnetometer(
+    log: LogPath,
+    output: Output = Path("magnetometer"),
+    site: SitePath = None,
+    positions: Annotated[
+        bool, typer.Option("--positions", help="Use only the stops of the log: twelve or more.")
+    ] = False,
+    start: Start = None,
+    end: End = None,
+    topics: TopicNames = None,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate the magnetometer on a log of slow turning by hand, in the Earth's field."""
+    job = log_job("magnetometer", log, site, output, None, None, 50.0, start, end, topics)
+    show_result(run_calibrate_magnetometer(job, positions=positions), output, as_json)

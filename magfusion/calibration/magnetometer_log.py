@@ -1,0 +1,273 @@
+"""A magnetometer calibrated from the log of slow turning by hand, or of stops all round."""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from magfusion.calibration.ellipsoid import fit_ellipsoid_gravity
+from magfusion.calibration.magnetometer import (
+    MagnetometerFit,
+    field_from_measured,
+    missing_orientations,
+    prior_cov,
+    refined,
+)
+from magfusion.calibration.magnetometer_graph import Epochs, GraphFit, Prior, fit_graph
+from magfusion.calibration.steady_field import LONGEST, SteadyField, average, steady_field
+from magfusion.calibration.stops import distinct, find_stops
+from magfusion.errors import EstimationError, InputError
+from magfusion.records.samples import ImuSamples, Waveform
+from magfusion.site import Magnetometer, Site
+from magfusion.units import DEGREE, Array
+
+POSITIONS = 12
+FEWEST_EPOCHS = 20  # of slow turning
+ONE_AXIS = 1.5 * DEGREE  # RMS; a field that wanders less in its second direction saw no turning
+KNOWN_DIP = 3.0 * DEGREE  # sigma; what steel in a building does to a reference field
+UNKNOWN_DIP = 1.0  # rad
+ACCEL_FLOOR = 0.03  # m/s^2; scale errors of MEMS accelerometers
+GYRO_SCALE = 0.001  # relative; errors of scale and axes of a calibrated MEMS gyro
+SHAKEN = 5  # epochs over which disturbed specific force is looked for
+# Of the sigma by which a motion disturbs the vertical: a hand tilts in step with its acceleration,
+# so that many shaken epochs tell no more than a few.
+IN_STEP = 4.0
+FIRST_SIGMA = 1e-3  # of the field, before its noise is measured
+LINEARITY = 2e-5  # of the field; a reading is no better than this, however long the window
+PASSES = 3
+
+
+@dataclass(frozen=True, eq=False)
+class LogCalibration:
+    """A calibration from a log, and what it rests on.
+
+    Parameters
+    ----------
+    magnetometer : Magnetometer
+        As calibrated.
+    graph : GraphFit
+    prior : Prior
+    readings : SteadyField
+        What the graph took.
+    field_sigma : float
+        Noise of a reading, measured (T).
+    missing : list of str
+        Orientations that were not there, in words.
+    scale_known : bool
+        Whether the site's Earth field set the scale; else the declared matrix did.
+    """
+
+    magnetometer: Magnetometer
+    graph: GraphFit
+    prior: Prior
+    readings: SteadyField
+    field_sigma: float
+    missing: list[str]
+    scale_known: bool
+
+
+def calibrate_log(
+    waveform: Waveform, imu: ImuSamples, site: Site, *, at_stops: bool = False
+) -> LogCalibration:
+    """Calibrate the magnetometer of a platform that was turned.
+
+    Parameters
+    ----------
+    waveform : Waveform
+        Beacons may transmit; their tones average out.
+    imu : ImuSamples
+    site : Site
+        Its sigmas of the magnetometer are the prior, its Earth field sets the scale.
+    at_stops : bool
+        Take only the stops, of which twelve are needed, each axis up and down among them.
+
+    Returns
+    -------
+    LogCalibration
+
+    Raises
+    ------
+    InputError
+        Where the platform was turned too little, or stood still too rarely for ``at_stops``.
+    EstimationError
+        Where the graph has no solution.
+    """
+    known = site.platform.magnetometer
+    readings = _readings(waveform, imu, site, known, at_stops)
+    up_sensor = readings.accel_body @ known.body_from_sensor
+    missing = missing_orientations(up_sensor)
+    _refuse_one_axis(readings, known, missing)
+    prior = _prior(site, readings)
+    turns = _turns(imu, site, readings.time)
+    start = _start(readings, up_sensor, prior, missing)
+    sigma = FIRST_SIGMA * float(np.linalg.norm(prior.field_world))
+    for _ in range(PASSES):
+        epochs = Epochs(
+            measured_sensor=readings.measured_sensor,
+            field_sigma=sigma,
+            accel_body=readings.accel_body,
+            accel_sigma=_accel_sigma(readings, site, at_stops),
+            turns=turns,
+        )
+        graph = fit_graph(epochs, prior, start)
+        start = graph.fit
+        found = replace(known, matrix=start.matrix, offset=start.offset)
+        readings = _readings(waveform, imu, site, found, at_stops)
+        sigma = _field_sigma(readings, found, prior)
+    if at_stops:
+        _refuse_few_stops(distinct(graph.world_from_body), missing)
+    if site.earth_field_world is None:
+        graph = replace(graph, fit=_with_unknown_scale(graph.fit, prior))
+    return LogCalibration(
+        magnetometer=refined(known, graph.fit),
+        graph=graph,
+        prior=prior,
+        readings=readings,
+        field_sigma=sigma,
+        missing=missing,
+        scale_known=site.earth_field_world is not None,
+    )
+
+
+def _readings(
+    waveform: Waveform, imu: ImuSamples, site: Site, known: Magnetometer, at_stops: bool
+) -> SteadyField:
+    if not at_stops:
+        readings = steady_field(waveform, imu, site, magnetometer=known)
+        if len(readings) < FEWEST_EPOCHS:
+            raise InputError(
+                f"magnetometer: the log gives {len(readings)} readings, and {FEWEST_EPOCHS} are"
+                " needed; turn the sensor slowly for a minute"
+            )
+        return readings
+    stops = find_stops(imu)
+    if len(stops) == 0:
+        raise InputError(
+            "imu: no rest was found; set the sensor down for three seconds in each of the twelve"
+            " positions, or leave --positions away"
+        )
+    if len(stops) < POSITIONS:
+        raise InputError(
+            f"imu: {len(stops)} stops were found and {POSITIONS} are needed; set the sensor down"
+            " for three seconds in each position, or leave --positions away"
+        )
+    offset = site.platform.imu.time_offset
+    window = np.minimum(stops.length, LONGEST)
+    return average(waveform, imu, offset, known, stops.centre + offset, window)
+
+
+def _refuse_one_axis(readings: SteadyField, known: Magnetometer, missing: list[str]) -> None:
+    field = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
+    unit = field / np.linalg.norm(field, axis=1, keepdims=True)
+    spreads = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(unit.T)), 0.0))
+    if spreads[1] < ONE_AXIS:
+        raise InputError(
+            "magnetometer: too few orientations to calibrate on: "
+            + (", ".join(missing) or "the field kept to one line in the sensor")
+            + "; turn it slowly about all its axes"
+        )
+
+
+def _refuse_few_stops(found: int, missing: list[str]) -> None:
+    if missing or found < POSITIONS:
+        raise InputError(
+            f"imu: the stops have {found} different orientations and {POSITIONS} are needed"
+            + "".join(f"; {sentence}" for sentence in missing)
+            + "; stop with each axis up and down, at two headings each"
+        )
+
+
+def _prior(site: Site, readings: SteadyField) -> Prior:
+    known, imu = site.platform.magnetometer, site.platform.imu
+    field, dip_sigma = site.earth_field_world, KNOWN_DIP
+    if field is None:
+        field_sensor = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
+        field_body = field_sensor @ known.body_from_sensor.T
+        size = float(np.median(np.linalg.norm(field_body, axis=1)))
+        up = readings.accel_body / np.linalg.norm(readings.accel_body, axis=1, keepdims=True)
+        vertical = float(np.clip(np.median(np.sum(up * field_body, axis=1)) / size, -0.99, 0.99))
+        field = size * np.array([0.0, np.sqrt(1.0 - vertical**2), vertical])
+        dip_sigma = UNKNOWN_DIP
+    return Prior(
+        body_from_sensor=known.body_from_sensor,
+        matrix=known.matrix,
+        offset=known.offset,
+        cov=prior_cov(known),
+        field_world=field,
+        dip_sigma=dip_sigma,
+        gravity=site.gravity,
+        accel_bias_sigma=imu.accel_bias_sigma,
+        gyro_bias_sigma=imu.gyro_bias_sigma,
+    )
+
+
+def _start(
+    readings: SteadyField, up_sensor: Array, prior: Prior, missing: list[str]
+) -> MagnetometerFit | None:
+    """Return where to begin: by the ellipsoid where the readings go all round."""
+    if missing:
+        return None
+    size = float(np.linalg.norm(prior.field_world))
+    try:
+        return fit_ellipsoid_gravity(readings.measured_sensor, up_sensor, size)
+    except (EstimationError, np.linalg.LinAlgError):
+        return None
+
+
+def _accel_sigma(readings: SteadyField, site: Site, at_rest: bool) -> Array:
+    """Return the noise of the specific force, with what the motion adds to gravity."""
+    imu = site.platform.imu
+    variance = 1.5 * imu.accel_noise**2 / readings.window + ACCEL_FLOOR**2
+    if not at_rest:
+        excess = np.linalg.norm(readings.accel_body, axis=1) - site.gravity
+        variance += IN_STEP**2 * uniform_filter1d(excess**2, SHAKEN, mode="nearest")
+    return np.asarray(np.sqrt(variance))
+
+
+def _field_sigma(readings: SteadyField, found: Magnetometer, prior: Prior) -> float:
+    """Return the noise of a reading by the field's size, which no attitude changes."""
+    field = field_from_measured(readings.measured_sensor, found.matrix, found.offset)
+    size = np.linalg.norm(prior.field_world)
+    left = np.linalg.norm(field, axis=1) - size
+    scatter = np.sqrt(np.sum(left**2) / max(len(left) - 9, 1))
+    return float(max(scatter, LINEARITY * size))
+
+
+def _turns(
+    imu: ImuSamples, site: Site, epoch: Array
+) -> tuple[gtsam.PreintegratedAhrsMeasurements | None, ...]:
+    """Return the gyro's turn over each interval; None where its stream has a gap."""
+    time = imu.time + site.platform.imu.time_offset
+    usual = float(np.median(np.diff(time)))
+    grid = np.union1d(time[(time > epoch[0]) & (time < epoch[-1])], epoch)
+    rate = np.stack([np.interp(grid, time, axis) for axis in imu.gyro_body.T], axis=1)
+    mean, step = 0.5 * (rate[:-1] + rate[1:]), np.diff(grid)
+    silent = time[:-1][np.diff(time) > 5.0 * usual]
+    first = np.searchsorted(grid, epoch)
+    out: list[gtsam.PreintegratedAhrsMeasurements | None] = []
+    for begin, end in pairwise(first):
+        if np.any((silent > grid[begin] - usual) & (silent < grid[end])):
+            out.append(None)
+            continue
+        part = slice(begin, end)
+        angle = float(np.sum(np.linalg.norm(mean[part], axis=1) * step[part]))
+        whole = float(grid[end] - grid[begin])
+        # The same error in every turn, told as an independent one that averages out no further.
+        systematic = GYRO_SCALE**2 * len(epoch) * angle**2
+        density = site.platform.imu.gyro_noise**2 + systematic / whole
+        parameters = gtsam.PreintegrationParams.MakeSharedU(site.gravity)
+        parameters.setGyroscopeCovariance(density * np.eye(3))
+        turn = gtsam.PreintegratedAhrsMeasurements(parameters, np.zeros(3))
+        for omega, dt in zip(mean[part], step[part], strict=True):
+            turn.integrateMeasurement(omega, dt)
+        out.append(turn)
+    return tuple(out)
+
+
+def _with_unknown_scale(fit: MagnetometerFit, prior: Prior) -> MagnetometerFit:
+    """Add the scale, which only the declared matrix tells, to the covariance."""
+    variance = float(np.mean(np.diagonal(prior.cov)[[0, 4, 8]])) / 3.0
+    direction = np.concatenate([fit.matrix.ravel(), np.zeros(3)])
+    return replace(fit, cov=fit.cov + variance * np.outer(direction, direction))
