@@ -4,7 +4,7 @@ Every solver predicts through `observe`; the simulator does not.
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, overload
 
 import numpy as np
 
@@ -49,6 +49,10 @@ class Observation:
     time_offset: ComplexArray | None
 
 
+@overload
+def skew(vector: Array) -> Array: ...
+@overload
+def skew(vector: ComplexArray) -> ComplexArray: ...
 def skew(vector: Array | ComplexArray) -> Array | ComplexArray:
     """Return the matrix of the cross product, shape (..., 3, 3), of vectors (..., 3)."""
     matrix = np.zeros((*vector.shape, 3), dtype=vector.dtype)
@@ -287,6 +291,11 @@ class _Seen(NamedTuple):
     mapped: _Mapped | None
 
 
+def _times(left: Array, right: Array) -> Array:
+    """Return ``left @ right`` of many and one: a single product is faster than as many small."""
+    return np.asarray((left.reshape(-1, 3) @ right).reshape(left.shape))
+
+
 def _seen(
     beacon: Beacon,
     magnetometer: Magnetometer,
@@ -297,9 +306,10 @@ def _seen(
     offset_beacon = _offset_beacon(beacon, magnetometer, world_from_body, position_world)
     offset, coils = _coil_fields(beacon, offset_beacon)
     tones_from_coils = np.swapaxes(_turned(beacon.excitation, phase), -1, -2)
-    body_from_beacon = np.swapaxes(world_from_body, -1, -2) @ beacon.world_from_beacon
+    body_from_beacon = _times(np.swapaxes(world_from_body, -1, -2), beacon.world_from_beacon)
     beacon_from_body = np.swapaxes(body_from_beacon, -1, -2)
-    sensor_from_body = magnetometer.matrix @ magnetometer.body_from_sensor.T
+    body_from_sensor = magnetometer.body_from_sensor @ magnetometer.matrix.T  # not a rotation
+    measured_from_beacon = np.swapaxes(_times(beacon_from_body, body_from_sensor), -1, -2)
     # Coil by coil all is real; only their sum in a tone is complex.
     gradients = dipole_gradient(offset, beacon.moments_beacon)
     mapped = _mapped(beacon, offset_beacon, coils)
@@ -307,10 +317,11 @@ def _seen(
         coils = (mapped.correction @ coils[..., None])[..., 0]
         gradients = mapped.correction @ gradients + mapped.slope
     in_body = coils @ beacon_from_body
-    by_body = (sensor_from_body @ body_from_beacon)[..., None, :, :] @ gradients
+    by_body = measured_from_beacon[..., None, :, :] @ gradients
     by_body = by_body @ beacon_from_body[..., None, :, :]
-    by_rotation = sensor_from_body @ skew(in_body) - by_body @ skew(magnetometer.position_body)
-    parts = (in_body @ sensor_from_body.T, by_rotation, by_body)
+    turning = -np.swapaxes(_times(skew(in_body), body_from_sensor), -1, -2)
+    by_rotation = turning - _times(by_body, skew(magnetometer.position_body))
+    parts = (_times(in_body, body_from_sensor), by_rotation, by_body)
     by_coil = np.concatenate([p.reshape(*coils.shape[:-1], -1) for p in parts], axis=-1)
     in_tones = tones_from_coils @ by_coil
     jacobian = in_tones[..., 3:].reshape(*in_tones.shape[:-1], 2, 3, 3)
