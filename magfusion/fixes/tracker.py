@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.antenna import Antenna, observe_antenna
 from magfusion.errors import EstimationError, InputError
 from magfusion.site import Beacon, Site
 from magfusion.units import MU0_OVER_4PI, Array, ComplexArray
@@ -322,3 +323,54 @@ def attitude_corrected(
     sign = np.linalg.det(left @ right)[..., None]
     last = np.concatenate([np.ones_like(sign), np.ones_like(sign), sign], axis=-1)
     return np.asarray((left * last[..., None, :]) @ right)
+
+
+def refine_poses(
+    antenna: Antenna,
+    coupling: Array,
+    beacon_from_sensor: Array,
+    position_beacon: Array,
+    iterations: int = 6,
+) -> tuple[Array, Array]:
+    """Return the poses of maximum likelihood in white noise, by Gauss and Newton.
+
+    The closed form knows no centres and weighs all directions alike; this takes its pose to the
+    optimum of the whole model.
+
+    Parameters
+    ----------
+    antenna : Antenna
+        Leading axes broadcast against those of the couplings.
+    coupling : ndarray, shape (..., 3, 3)
+        Rows are receiving coils (T).
+    beacon_from_sensor : ndarray, shape (..., 3, 3)
+    position_beacon : ndarray, shape (..., 3)
+        Start (m).
+    iterations : int
+        Each squares the error.
+
+    Returns
+    -------
+    beacon_from_sensor, position_beacon : ndarray
+        As given.
+
+    Raises
+    ------
+    EstimationError
+        Where a pose runs away.
+    """
+    rotation, position = beacon_from_sensor, position_beacon
+    for _ in range(iterations):
+        seen = observe_antenna(antenna, rotation, position)
+        jacobian = seen.pose.reshape(*seen.pose.shape[:-3], 9, 6)
+        scale = np.linalg.norm(jacobian, axis=-2, keepdims=True)
+        jacobian = jacobian / scale
+        rest = (coupling - seen.value).reshape(*jacobian.shape[:-1], 1)
+        turned = np.swapaxes(jacobian, -1, -2)
+        step = np.linalg.solve(turned @ jacobian, turned @ rest)[..., 0] / scale[..., 0, :]
+        moved = (rotation @ step[..., 3:, None])[..., 0]
+        turn = Rotation.from_rotvec(step[..., :3].reshape(-1, 3)).as_matrix()
+        rotation, position = rotation @ turn.reshape(rotation.shape), position + moved
+    if not np.all(np.linalg.norm(moved, axis=-1) < 1e-3 * np.linalg.norm(position, axis=-1)):
+        raise EstimationError("a tracker's pose does not converge: antenna and couplings disagree")
+    return rotation, position

@@ -1,0 +1,154 @@
+"""Trackers' antennas with errors, their bench and their surveys: what `tracker_table1` draws.
+
+The couplings are made from the dipole's field alone, not from the estimators' model.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.antenna import Antenna
+from magfusion.calibration.antenna import AntennaSurvey, prior_sigma
+from magfusion.calibration.antenna_bench import bench_points
+from magfusion.fixes.tracker import locate_by_svd, refine_poses, whitened
+from magfusion.physics.dipole import dipole_field
+from magfusion.units import DEGREE, MU0_OVER_4PI, Array
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of the coils of both antennas, one sigma."""
+
+    gain: float = 0.0
+    tilt_deg: float = 0.0  # about each of two axes
+    centre: float = 0.0  # m, each coil and component
+    common_centre: float = 0.0  # m, each component
+    mount_deg: float = 0.0  # about each axis, the antenna as a whole
+
+
+@dataclass(frozen=True)
+class Config:
+    """Which antennas, how measured, and how calibrated."""
+
+    errors: Errors = Errors(gain=0.005, tilt_deg=0.12, centre=0.5e-3)
+    snr_db: float = 60.0
+    antennas: int = 200
+    poses: int = 40
+    pose_deg: float = 0.02  # error of the poses of the joint fit
+    pose_m: float = 0.1e-3
+    bench_distance: float = 0.3  # m
+    bench_position: float = 50e-6  # m
+    bench_tilt_deg: float = 0.02
+    seed: int = 0
+
+
+def nominal(shape: tuple[int, ...] = ()) -> Antenna:
+    """Return ideal antennas: unit moments and sensitivities along the axes, one centre."""
+    eye, zero = np.broadcast_to(np.eye(3), (*shape, 3, 3)), np.zeros((*shape, 3, 3))
+    return Antenna(eye, zero, eye, zero)
+
+
+def turned(angle: Array) -> Array:
+    """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3) (rad)."""
+    matrix = Rotation.from_rotvec(angle.reshape(-1, 3)).as_matrix()
+    return np.asarray(matrix.reshape(*angle.shape, 3))
+
+
+def draw_antennas(errors: Errors, number: int, rng: np.random.Generator) -> Antenna:
+    """Return antennas with errors, leading axis (number,)."""
+
+    def coils() -> tuple[Array, Array]:
+        size = 1.0 + errors.gain * rng.standard_normal((number, 3, 1))
+        across = errors.tilt_deg * DEGREE * rng.standard_normal((number, 3, 3)) * (1 - np.eye(3))
+        axis = np.eye(3) + across
+        axis = axis / np.linalg.norm(axis, axis=-1, keepdims=True)
+        mount = turned(errors.mount_deg * DEGREE * rng.standard_normal((number, 3)))
+        common = errors.common_centre * rng.standard_normal((number, 1, 3))
+        centre = common + errors.centre * rng.standard_normal((number, 3, 3))
+        back = np.swapaxes(mount, -1, -2)
+        return size * axis @ back, centre @ back
+
+    return Antenna(*coils(), *coils())
+
+
+def couplings(antenna: Antenna, beacon_from_sensor: Array, position_beacon: Array) -> Array:
+    """Return what the coils sense, from the dipole's field alone and not the estimators' model."""
+    turn = np.swapaxes(beacon_from_sensor, -1, -2)
+    place = position_beacon[..., None, :] + antenna.centres_sensor @ turn
+    offset = place[..., :, None, :] - antenna.centres_beacon[..., None, :, :]
+    field = dipole_field(offset, antenna.moments_beacon[..., None, :, :])
+    in_sensor = field @ beacon_from_sensor[..., None, :, :]
+    return np.asarray(np.einsum("...ia,...ija->...ij", antenna.sensitivities_sensor, in_sensor))
+
+
+def noise_sigma(snr_db: float, distance: Array) -> Array:
+    """Return the noise of a coupling (T) at a distance (m), relative to ``K / R^3``."""
+    return np.asarray(10.0 ** (-snr_db / 20.0) * MU0_OVER_4PI / distance**3)
+
+
+def bench_readings(coils: Array, centres: Array, config: Config, rng: np.random.Generator) -> Array:
+    """Return the probe's readings of antennas at six points, with the errors of the bench (T)."""
+    points = bench_points(config.bench_distance)
+    shape = (len(coils), 3, *points.shape)
+    place = points + config.bench_position * rng.standard_normal(shape)
+    offset = place - centres[:, :, None, None, :]
+    field = dipole_field(offset, coils[:, :, None, None, :])
+    tilt = turned(config.bench_tilt_deg * DEGREE * rng.standard_normal(shape))
+    sigma = noise_sigma(config.snr_db, np.array(config.bench_distance))
+    return np.asarray((tilt @ field[..., None])[..., 0] + sigma * rng.standard_normal(shape))
+
+
+def random_poses(
+    shape: tuple[int, ...], rng: np.random.Generator, nearest: float = 0.3, farthest: float = 0.6
+) -> tuple[Array, Array]:
+    """Return attitudes and positions all around the beacon."""
+    attitude = Rotation.random(int(np.prod(shape)), rng=rng).as_matrix().reshape(*shape, 3, 3)
+    direction = rng.standard_normal((*shape, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    return attitude, direction * rng.uniform(nearest, farthest, (*shape, 1))
+
+
+def draw_survey(antenna: Antenna, config: Config, rng: np.random.Generator) -> AntennaSurvey:
+    """Return surveys of all antennas, whose stated poses err by what the configuration says."""
+    shape = (len(antenna.moments_beacon), config.poses)
+    attitude, position = random_poses(shape, rng)
+    sigma = noise_sigma(config.snr_db, np.linalg.norm(position, axis=-1))
+    seen = couplings(antenna.at(np.s_[:, None]), attitude, position)
+    noise = sigma[..., None, None] * rng.standard_normal(seen.shape)
+    off = turned(config.pose_deg * DEGREE * rng.standard_normal((*shape, 3)))
+    moved = position + config.pose_m * rng.standard_normal((*shape, 3))
+    return AntennaSurvey(attitude @ off, moved, seen + noise, sigma)
+
+
+def usual_prior(errors: Errors) -> Array:
+    """Return the prior of the joint fits: four times the errors that the antennas have."""
+    mount = errors.mount_deg
+    return prior_sigma(
+        nominal(),
+        gain=4.0 * errors.gain,
+        tilt=4.0 * float(np.hypot(errors.tilt_deg, mount)) * DEGREE,
+        centre=4.0 * float(np.hypot(errors.centre, errors.common_centre)),
+    )[:36]
+
+
+def locate(antenna: Antenna, seen: Array, guess_beacon: Array) -> tuple[Array, Array]:
+    """Return poses by closed form and maximum likelihood with an antenna (n,), couplings (n, m)."""
+    wide = antenna.at(np.s_[:, None])
+    transmitter = np.swapaxes(wide.moments_beacon, -1, -2)
+    free = whitened(seen, np.linalg.inv(wide.sensitivities_sensor), transmitter)
+    start = locate_by_svd(free).nearest(guess_beacon)
+    attitude = np.swapaxes(start.sensor_from_beacon, -1, -2)
+    return refine_poses(wide, seen, attitude, start.position_beacon[..., 0, :])
+
+
+def rms(error: Array) -> float:
+    """Return the root mean square of all."""
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def between_deg(found: Array, true: Array) -> Array:
+    """Return the angle of the rotation between attitudes (..., 3, 3) (deg)."""
+    turn = np.swapaxes(true, -1, -2) @ found
+    angle = Rotation.from_matrix(turn.reshape(-1, 3, 3)).magnitude() / DEGREE
+    return np.asarray(angle.reshape(turn.shape[:-2]))
