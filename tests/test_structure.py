@@ -25,6 +25,7 @@ FLOORS = (
         "coverage_plot",
         "fieldmap_plot",
         "magnetometer_plot",
+        "match_plot",
         "survey_plot",
         "view_coverage",
     },
@@ -32,7 +33,12 @@ FLOORS = (
     {"demo"},
     {"cli"},
 )
-DRAWN = {("fusion", "fixes"), ("fusion", "receiver")}
+DRAWN = {
+    ("calibration", "fixes"),
+    ("calibration", "receiver"),
+    ("fusion", "fixes"),
+    ("fusion", "receiver"),
+}
 
 
 def _floor(room: str) -> int:
@@ -98,6 +104,7 @@ def test_only_the_plot_imports_matplotlib() -> None:
         "magfusion/coverage_plot.py",
         "magfusion/fieldmap_plot.py",
         "magfusion/magnetometer_plot.py",
+        "magfusion/match_plot.py",
         "magfusion/survey_plot.py",
     }
 

@@ -1,0 +1,298 @@
+"""Where a beacon is, how it is turned, and its moments, from magnetometers at known poses.
+
+The exact method beside that of paper 002 (`magfusion.calibration.beacon_paper`).  The phasors are
+linear in the moments, so that of nine unknowns (centre and two moments, imbalance and angle
+between the coils included) only the centre has to be searched for: variable projection, from a
+grid, because from a single start one fit in two ends in a wrong minimum.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.ndimage
+
+from magfusion.calibration.least_squares import minimise
+from magfusion.errors import InputError
+from magfusion.observation import observe_from
+from magfusion.site import Beacon, Magnetometer
+from magfusion.units import Array, BoolArray, ComplexArray, IntArray
+
+SPACING = 0.5  # m; of the grid that seeds the search
+REACH = 1.5  # m; half the width of the grid
+CLEARANCE = 0.25  # m; nearer than this to a magnetometer no beacon is looked for
+STARTS = 4  # minima on the grid that are followed
+SAME = 0.01  # m; fits nearer to each other than this are one
+LARGEST_CONDITION = 1e7  # of the scaled Jacobian
+
+
+@dataclass(frozen=True, eq=False)
+class BeaconMeasurements:
+    """What magnetometers at known poses measured of one beacon.
+
+    Parameters
+    ----------
+    beacon : Beacon
+        As declared.
+    magnetometer : Magnetometer
+    world_from_body : ndarray, shape (points, 3, 3)
+    position_world : ndarray, shape (points, 3)
+        Origin of the body (m).
+    phasor_sensor : complex ndarray, shape (runs, points, tones, 3)
+        (T), measured axes; NaN where one is missing.
+    sigma : ndarray, shape (points, tones, 2)
+        Of each component of the real, and of the imaginary part, in all runs (T).
+    """
+
+    beacon: Beacon
+    magnetometer: Magnetometer
+    world_from_body: Array
+    position_world: Array
+    phasor_sensor: ComplexArray
+    sigma: Array
+
+    @property
+    def real_tones(self) -> tuple[bool, ...]:
+        """Which tones have one coil of known drive phase, hence a real moment."""
+        coils = np.count_nonzero(self.beacon.excitation, axis=0)
+        return tuple(bool(self.beacon.synchronised and count == 1) for count in coils)
+
+    @property
+    def weight(self) -> Array:
+        """One over sigma, shape (points, tones, 2); zero where a phasor is missing."""
+        return np.where(self.valid[..., None], 1.0 / self.sigma, 0.0)
+
+    @property
+    def valid(self) -> BoolArray:
+        """Which points and tones all runs hold, shape (points, tones)."""
+        return np.asarray(np.isfinite(self.phasor_sensor).all(axis=(0, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class BeaconFits:
+    """The best fit of each run, and its rivals.
+
+    Parameters
+    ----------
+    centre_world : ndarray, shape (runs, 3)
+        Of the beacon's origin (m).
+    moments_world : complex ndarray, shape (runs, tones, 3)
+        Of each tone, drive phase included (A m^2).
+    chi_square : ndarray, shape (runs,)
+    cov : ndarray, shape (runs, unknowns, unknowns)
+        Of the centre, then of each tone's moment: its real part, then its imaginary part unless
+        that is known (`BeaconMeasurements.real_tones`).
+    rivals_world : ndarray, shape (runs, rivals, 3)
+        Centres of other minima (m), best first; NaN where there are no more.
+    rival_chi_square : ndarray, shape (runs, rivals)
+    """
+
+    centre_world: Array
+    moments_world: ComplexArray
+    chi_square: Array
+    cov: Array
+    rivals_world: Array
+    rival_chi_square: Array
+
+
+def calibrate_beacon(measured: BeaconMeasurements, reach: float = REACH) -> BeaconFits:
+    """Find centre and moments of a beacon by variable projection, seeded on a grid.
+
+    Parameters
+    ----------
+    measured : BeaconMeasurements
+    reach : float
+        How far from the declared place the beacon may be (m).
+
+    Returns
+    -------
+    BeaconFits
+
+    Raises
+    ------
+    InputError
+        Where there are fewer than two magnetometers, or they do not determine the unknowns.
+    """
+    _refuse_too_few(measured)
+    seen = _whitened(measured)
+    starts = _grid_starts(measured, seen, reach)  # (runs, starts, 3)
+    runs, count = starts.shape[:2]
+    owner = np.repeat(np.arange(runs), count)
+
+    def model(rows: IntArray, centre: Array) -> tuple[Array, Array]:
+        return _projected(measured, seen[owner[rows]], centre)[:2]
+
+    found, cost = minimise(model, starts.reshape(-1, 3))
+    order = np.argsort(cost.reshape(runs, count), axis=1)
+    centres = np.take_along_axis(found.reshape(runs, count, 3), order[..., None], axis=1)
+    costs = np.take_along_axis(cost.reshape(runs, count), order, axis=1)
+    best = centres[:, 0]
+    _, _, moments, jacobian = _projected(measured, seen, best)
+    rival = np.linalg.norm(centres[:, 1:] - best[:, None], axis=-1) > SAME
+    return BeaconFits(
+        centre_world=best,
+        moments_world=_complex(measured, moments),
+        chi_square=costs[:, 0],
+        cov=_inverse(jacobian, reach),
+        rivals_world=np.where(rival[..., None], centres[:, 1:], np.nan),
+        rival_chi_square=np.where(rival, costs[:, 1:], np.nan),
+    )
+
+
+def _refuse_too_few(measured: BeaconMeasurements) -> None:
+    name, valid = measured.beacon.name, measured.valid
+    points = int(np.count_nonzero(valid.any(axis=1)))
+    if points < 2:
+        raise InputError(
+            f"beacon {name} was measured at {points} point{'s' * (points != 1)}; the range and the"
+            " moments of a beacon need two magnetometers at least"
+        )
+    silent = np.flatnonzero(~valid.any(axis=0))
+    if len(silent):
+        raise InputError(f"beacon {name}: tone {silent[0]} was not measured; measure every coil")
+    beacon = measured.beacon
+    for tone in range(len(beacon.tones)):
+        centres = beacon.centres_beacon[beacon.excitation[:, tone] != 0.0]
+        if np.any(np.ptp(centres, axis=0) > 0.0):
+            raise InputError(
+                f"beacon {name}: the coils of tone {tone} have centres of their own; drive them in"
+                " tones or slots of their own to calibrate them"
+            )
+
+
+def _whitened(measured: BeaconMeasurements) -> Array:
+    """Return the phasors as real numbers of variance one, shape (runs, numbers)."""
+    return _real(measured, np.nan_to_num(measured.phasor_sensor)[..., None])[..., 0]
+
+
+def _real(measured: BeaconMeasurements, columns: ComplexArray) -> Array:
+    """Stack columns (..., points, tones, 3, n) as (..., numbers, n), weighted; zero if missing."""
+    weight = measured.weight[..., None, None]
+    parts = np.stack([columns.real * weight[:, :, 0], columns.imag * weight[:, :, 1]], axis=-5)
+    return parts.reshape(*columns.shape[:-4], -1, columns.shape[-1])
+
+
+def _columns(measured: BeaconMeasurements, centre: Array) -> tuple[Array, Array]:
+    """Return the whitened phasors of unit moments, world axes, and their slope by the centre.
+
+    Parameters
+    ----------
+    centre : ndarray, shape (k, 3)
+
+    Returns
+    -------
+    value : ndarray, shape (k, numbers, moments)
+    by_centre : ndarray, shape (k, numbers, moments, 3)
+    """
+    beacon, turned = measured.beacon, measured.world_from_body
+    offset = measured.position_world - centre[:, None]
+    bodies = np.broadcast_to(turned, (*offset.shape[:2], 3, 3))
+    shape = (*offset.shape[:2], len(beacon.tones), 3)
+    values, slopes = [], []
+    for tone, real in enumerate(measured.real_tones):
+        coil = beacon.coils[int(np.flatnonzero(beacon.excitation[:, tone])[0])]
+        phase = coil.phase if real else 0.0
+        for axis in beacon.world_from_beacon:  # a row: one axis of the world in beacon axes
+            unit = replace(coil, moment_beacon=axis, phase=phase)
+            alone = replace(beacon, position_world=np.zeros(3), coils=(unit,), field_map=None)
+            seen, by_pose = observe_from(alone, measured.magnetometer, bodies, offset)
+            value = np.zeros(shape, dtype=np.complex128)
+            slope = np.zeros((*shape, 3), dtype=np.complex128)
+            value[..., tone, :] = seen[..., 0, :]
+            slope[..., tone, :, :] = -by_pose[..., 0, :, 3:] @ np.swapaxes(turned, -1, -2)
+            turns = (1.0,) if real else (1.0, 1j)
+            values += [value * turn for turn in turns]
+            slopes += [slope * turn for turn in turns]
+    order = _order(measured)
+    stacked = _real(measured, np.stack([values[i] for i in order], axis=-1))
+    by_centre = [_real(measured, slopes[i]) for i in order]
+    return stacked, np.stack(by_centre, axis=-2)
+
+
+def _order(measured: BeaconMeasurements) -> list[int]:
+    """Return the real parts of a tone's moment, then its imaginary parts."""
+    out: list[int] = []
+    for real in measured.real_tones:
+        at = len(out)
+        out += [at, at + 1, at + 2] if real else [at, at + 2, at + 4, at + 1, at + 3, at + 5]
+    return out
+
+
+def _projected(
+    measured: BeaconMeasurements, seen: Array, centre: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Return what the best moments leave, its slope by the centre, the moments, all slopes."""
+    design, by_centre = _columns(measured, centre)
+    basis, upper = np.linalg.qr(design)
+    across = np.swapaxes(basis, -1, -2) @ seen[..., None]
+    moments = np.linalg.solve(upper, across)[..., 0]
+    slope = -np.einsum("kdmc,km->kdc", by_centre, moments)
+    residual = seen - (basis @ across)[..., 0]
+    # Kaufman: the slope without what a change of the moments takes up.
+    kept = slope - basis @ (np.swapaxes(basis, -1, -2) @ slope)
+    return residual, kept, moments, np.concatenate([slope, -design], axis=-1)
+
+
+def _complex(measured: BeaconMeasurements, moments: Array) -> ComplexArray:
+    out, at = [], 0
+    for tone, real in enumerate(measured.real_tones):
+        vector = moments[..., at : at + 3].astype(np.complex128)
+        if real:
+            phase = measured.beacon.excitation[:, tone].sum()
+            out.append(vector * phase)
+        else:
+            out.append(vector + 1j * moments[..., at + 3 : at + 6])
+        at += 3 if real else 6
+    return np.stack(out, axis=-2)
+
+
+def _grid_starts(measured: BeaconMeasurements, seen: Array, reach: float) -> Array:
+    steps = int(np.ceil(reach / SPACING))
+    line = np.linspace(-reach, reach, 2 * steps + 1)
+    cube = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1)
+    places = (measured.beacon.position_world + cube).reshape(-1, 3)
+    lever = measured.world_from_body @ measured.magnetometer.position_body
+    gap = np.linalg.norm(places[:, None] - measured.position_world - lever, axis=-1)
+    clear = np.min(gap, axis=1) > CLEARANCE
+    if not clear.any():
+        raise InputError(
+            f"beacon {measured.beacon.name}: every magnetometer is at its declared place; correct"
+            " position_m"
+        )
+    cost = np.full((len(seen), len(places)), np.inf)
+    basis, _ = np.linalg.qr(_columns(measured, places[clear])[0])
+    explained = np.einsum("gdm,rd->rgm", basis, seen)
+    cost[:, clear] = np.sum(seen**2, axis=-1)[:, None] - np.sum(explained**2, axis=-1)
+    box = cost.reshape(len(seen), *cube.shape[:3])
+    lowest = scipy.ndimage.minimum_filter(box, size=(1, 3, 3, 3), mode="nearest")
+    ranked = np.where(box == lowest, box, np.inf).reshape(cost.shape)
+    # Where there are fewer minima, the next lowest places.
+    order = np.lexsort((cost, ranked), axis=-1)[:, :STARTS]
+    return places[order]
+
+
+def _inverse(jacobian: Array, reach: float) -> Array:
+    """Return the covariance of all unknowns of each run.
+
+    Raises
+    ------
+    InputError
+        Where a combination of unknowns, or the place itself, is not determined.
+    """
+    scale = np.linalg.norm(jacobian, axis=-2)
+    safe = np.where(scale > 0.0, scale, 1.0)
+    _, size, right = np.linalg.svd(jacobian / safe[..., None, :], full_matrices=False)
+    short = jacobian.shape[-2] < jacobian.shape[-1]
+    if short or np.any(size[..., -1] * LARGEST_CONDITION < size[..., 0]):
+        raise InputError(
+            "the magnetometers do not determine the centre and the moments of the beacon; measure"
+            " at more points, not along one line from it"
+        )
+    root = right / size[..., :, None] / safe[..., None, :]
+    cov = np.swapaxes(root, -1, -2) @ root
+    worst = np.sqrt(np.max(np.linalg.eigvalsh(cov[..., :3, :3]), axis=-1))
+    if np.any(worst > reach):
+        raise InputError(
+            f"the magnetometers determine the centre of the beacon to {np.max(worst):.2g} m only;"
+            " measure nearer to it, or at more points"
+        )
+    return np.asarray(cov)

@@ -1,0 +1,220 @@
+"""From fitted moments to a beacon: its attitude, its coils, and how well each is known."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.calibration.beacon import BeaconFits, BeaconMeasurements
+from magfusion.calibration.least_squares import minimise
+from magfusion.fixes.candidates import wahba
+from magfusion.observation import observe
+from magfusion.site import Beacon, BeaconSigma
+from magfusion.units import Array, ComplexArray, IntArray
+
+OPEN = 0.1  # of the moment that a turn moves, below which it goes with the drive phase
+
+
+@dataclass(frozen=True, eq=False)
+class RefinedBeacon:
+    """One beacon after its calibration.
+
+    Parameters
+    ----------
+    beacon : Beacon
+        With the posterior sigmas; it predicts what was fitted, but for the drive phase of an
+        unsynchronised beacon.
+    phase : ndarray, shape (tones,)
+        Drive phase that was found beyond the coils' own (rad); zero where it is known.
+    open_beacon : ndarray, shape (n, 3)
+        Axes, declared beacon axes, about which the field tells no rotation: there the declared
+        attitude and its sigma are kept.
+    """
+
+    beacon: Beacon
+    phase: Array
+    open_beacon: Array
+
+
+def attitudes(beacon: Beacon, moments_world: ComplexArray) -> tuple[Array, Array]:
+    """Return the attitude in which the declared moments fit the found ones best.
+
+    The polar decomposition of paper 002's problem: imbalance and angle between the coils are
+    split evenly.  Of rotations that fit alike, the one nearest to the declared.
+
+    Parameters
+    ----------
+    beacon : Beacon
+        As declared.
+    moments_world : complex ndarray, shape (runs, tones, 3)
+        (A m^2)
+
+    Returns
+    -------
+    world_from_beacon : ndarray, shape (runs, 3, 3)
+    phase : ndarray, shape (runs, tones)
+        Of the drive beyond the declared (rad); zero for a synchronised beacon.
+    """
+    declared = _drive(beacon)
+    unit = declared / np.linalg.norm(declared, axis=-1, keepdims=True) ** 2
+    rotation = np.broadcast_to(beacon.world_from_beacon, (len(moments_world), 3, 3))
+    phase = np.zeros(moments_world.shape[:2])
+    for _ in range(1 if beacon.synchronised else 50):
+        if not beacon.synchronised:
+            in_world = declared @ np.swapaxes(rotation, -1, -2)
+            phase = np.angle(np.sum(moments_world * in_world.conj(), axis=-1))
+        turned = moments_world * np.exp(-1j * phase)[..., None]
+        correlation = np.einsum("rki,kj->rij", turned, unit.conj()).real
+        rotation = wahba(correlation + 1e-9 * beacon.world_from_beacon)
+    return rotation, phase
+
+
+def _drive(beacon: Beacon) -> ComplexArray:
+    """Return the declared complex moment of each tone, shape (tones, 3), beacon axes."""
+    return np.asarray(beacon.excitation.T @ beacon.moments_beacon)
+
+
+def coil_moments(
+    beacon: Beacon, moments_world: ComplexArray, world_from_beacon: Array, phase: Array
+) -> Array:
+    """Return the moments of the coils in beacon axes, shape (runs, coils, 3) (A m^2).
+
+    Where a tone drives more coils than its field can tell apart, they change least.
+    """
+    turned = (moments_world * np.exp(-1j * phase)[..., None]) @ world_from_beacon
+    change = turned - _drive(beacon)
+    drive = np.concatenate([beacon.excitation.real, beacon.excitation.imag], axis=1).T
+    parts = np.concatenate([change.real, change.imag], axis=-2)
+    return np.asarray(beacon.moments_beacon + np.linalg.pinv(drive) @ parts)
+
+
+def open_axes(beacon: Beacon) -> Array:
+    """Return the axes, beacon frame, about which a turn cannot be told, shape (n, 3).
+
+    A coil's own axis, and, where the drive phase is unknown, the axis of a rotating field.
+    """
+    drive = _drive(beacon)
+    turns = np.stack([np.cross(axis, drive).ravel() for axis in np.eye(3)], axis=-1)
+    if not beacon.synchronised:
+        phases = np.einsum("kl,ki->kil", np.eye(len(drive)), 1j * drive).reshape(drive.size, -1)
+        turns = turns - phases @ np.linalg.lstsq(_parts(phases), _parts(turns), rcond=None)[0]
+    _, size, axes = np.linalg.svd(_parts(turns))
+    return np.asarray(axes[size < OPEN * np.linalg.norm(drive)])
+
+
+def _parts(columns: ComplexArray) -> Array:
+    return np.concatenate([columns.real, columns.imag])
+
+
+def refine(measured: BeaconMeasurements, fits: BeaconFits, run: int = 0) -> RefinedBeacon:
+    """Return the beacon as one run of the calibration found it, with posterior sigmas.
+
+    Parameters
+    ----------
+    measured : BeaconMeasurements
+    fits : BeaconFits
+    run : int
+    """
+    declared, moments = measured.beacon, fits.moments_world[run : run + 1]
+    rotation, phase = attitudes(declared, moments)
+    coils = coil_moments(declared, moments, rotation, phase)[0]
+    spread = _spread(measured, moments[0], rotation[0], coils)
+    cov = spread @ fits.cov[run, 3:, 3:] @ spread.T
+    free = open_axes(declared)
+    known = np.eye(3) - free.T @ free
+    turn = known @ cov[:3, :3] @ known
+    prior = free @ np.diag(declared.sigma.rotation_beacon**2) @ free.T
+    sigma = BeaconSigma(
+        position_world=np.sqrt(np.diag(fits.cov[run, :3, :3])),
+        rotation_beacon=np.sqrt(np.diag(turn + free.T @ prior @ free)),
+        log_moment=np.sqrt(np.diag(cov[3:, 3:])),
+    )
+    found = replace(
+        declared,
+        position_world=fits.centre_world[run],
+        world_from_beacon=rotation[0],
+        coils=tuple(
+            replace(coil, moment_beacon=moment)
+            for coil, moment in zip(declared.coils, coils, strict=True)
+        ),
+        sigma=sigma,
+        field_map=None,  # it corrected the beacon as it was declared
+    )
+    return RefinedBeacon(found, phase[0], free)
+
+
+def _spread(
+    measured: BeaconMeasurements, moments: ComplexArray, rotation: Array, coils: Array
+) -> Array:
+    """Return how attitude and log-moments follow the fitted moments, by central differences."""
+    units = []
+    for tone, real in enumerate(measured.real_tones):
+        drive = measured.beacon.excitation[:, tone].sum() if real else 1.0
+        for turn in (drive,) if real else (1.0, 1j):
+            for axis in np.eye(3):
+                unit = np.zeros(moments.shape, dtype=np.complex128)
+                unit[tone] = turn * axis
+                units.append(unit)
+    step = 1e-5 * float(np.max(np.abs(moments)))
+    sides = np.array([sign * step * unit for sign in (1.0, -1.0) for unit in units])
+    turned, phase = attitudes(measured.beacon, moments + sides)
+    sizes = np.linalg.norm(coil_moments(measured.beacon, moments + sides, turned, phase), axis=-1)
+    angle = Rotation.from_matrix(rotation.T @ turned).as_rotvec()
+    value = np.hstack([angle, np.log(sizes / np.linalg.norm(coils, axis=-1))])
+    count = len(units)
+    return np.asarray((value[:count] - value[count:]).T / (2.0 * step))
+
+
+def fit_known_moments(
+    measured: BeaconMeasurements, centre_world: Array, world_from_beacon: Array
+) -> tuple[Array, Array, Array]:
+    """Find centre and attitude of a synchronised beacon whose moments are as declared.
+
+    Parameters
+    ----------
+    measured : BeaconMeasurements
+    centre_world : ndarray, shape (runs, 3)
+        Where to start (m), e.g. `calibrate_beacon`.
+    world_from_beacon : ndarray, shape (runs, 3, 3)
+
+    Returns
+    -------
+    centre_world : ndarray, shape (runs, 3)
+    world_from_beacon : ndarray, shape (runs, 3, 3)
+    cov : ndarray, shape (runs, 6, 6)
+        Of rotation and position, beacon axes: the Cramér-Rao bound.
+    """
+    weight = measured.weight[..., None, None]
+    seen = np.nan_to_num(measured.phasor_sensor)
+
+    def model(rows: IntArray, pose: Array) -> tuple[Array, Array]:
+        centre, rotation = pose[:, :3], pose[:, 3:].reshape(-1, 3, 3)
+        # The beacon stays; magnetometers move with the frame in which it has the asked pose.
+        back = measured.beacon.world_from_beacon @ np.swapaxes(rotation, -1, -2)
+        position = (measured.position_world - centre[:, None]) @ np.swapaxes(back, -1, -2)
+        found = observe(
+            replace(measured.beacon, field_map=None),
+            measured.magnetometer,
+            back[:, None] @ measured.world_from_body,
+            position + measured.beacon.position_world,
+        )
+        error = (found.phasor_sensor - seen[rows])[..., None]
+        return _halves(error, weight)[..., 0], _halves(found.beacon_pose, weight)
+
+    start = np.concatenate([centre_world, world_from_beacon.reshape(-1, 9)], axis=-1)
+    pose, _ = minimise(model, start, _moved)
+    slope = model(np.arange(len(pose)), pose)[1]
+    cov = np.linalg.inv(np.swapaxes(slope, -1, -2) @ slope)
+    return pose[:, :3], pose[:, 3:].reshape(-1, 3, 3), np.asarray(cov)
+
+
+def _halves(columns: ComplexArray, weight: Array) -> Array:
+    parts = np.stack([columns.real * weight[:, :, 0], columns.imag * weight[:, :, 1]], axis=1)
+    return parts.reshape(len(columns), -1, columns.shape[-1])
+
+
+def _moved(pose: Array, step: Array) -> Array:
+    rotation = pose[:, 3:].reshape(-1, 3, 3)
+    turned = rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
+    centre = pose[:, :3] + (rotation @ step[:, 3:, None])[..., 0]
+    return np.concatenate([centre, turned.reshape(-1, 9)], axis=-1)
