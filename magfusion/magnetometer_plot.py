@@ -78,4 +78,6 @@ def _plane(
         flat = drawn[:, plane] / np.linalg.norm(field[:, plane] / size, axis=1, keepdims=True)
         axes.plot(*flat[near].T, ".", ms=4, c=colour)
     first, second = (_AXES[i] for i in plane)
-    axes.set(xlabel=f"sensor {first} (µT)", ylabel=f"sensor {second} (µT)", aspect="equal")
+    reach = (-1.3 * radius, 1.3 * radius)
+    axes.set(xlim=reach, ylim=reach, aspect="equal")
+    axes.set(xlabel=f"sensor {first} (µT)", ylabel=f"sensor {second} (µT)")

@@ -80,7 +80,7 @@ def fit_ellipsoid_gravity(measured: Array, up_sensor: Array, field_size: float) 
     scaled = measured / field_size
     up = up_sensor / np.linalg.norm(up_sensor, axis=-1, keepdims=True)
     start = fit_ellipsoid(scaled, 1.0)
-    inverse, centre = np.linalg.inv(start.matrix), start.offset
+    inverse, centre = np.asarray(np.linalg.inv(start.matrix)), start.offset
     basis = np.eye(9).reshape(9, 3, 3)
     along = np.sum(up * _field(scaled, inverse, centre), axis=-1)
     vertical = np.mean(along, axis=-1)
@@ -135,7 +135,7 @@ def _algebraic(points: Array) -> tuple[Array, Array]:
             "the readings lie on no ellipsoid; turn the sensor all round, away from iron"
         )
     root = np.sqrt(values)[..., None, :] * vectors @ np.swapaxes(vectors, -1, -2)
-    return root, middle[..., 0] + mean[..., 0, :]
+    return np.asarray(root), np.asarray(middle[..., 0] + mean[..., 0, :])
 
 
 def _size_rows(measured: Array, inverse: Array, centre: Array, basis: Array) -> tuple[Array, Array]:
@@ -176,11 +176,12 @@ def _rows(
 def _fit(
     inverse: Array, centre: Array, cov: Array, basis: Array, field_size: float
 ) -> MagnetometerFit:
-    matrix = np.linalg.inv(inverse)
+    matrix = np.asarray(np.linalg.inv(inverse))
     count = len(basis)
     by_inverse = -matrix[..., None, :, :] @ basis @ matrix[..., None, :, :]
     change = np.zeros((*matrix.shape[:-2], 12, count + 3))
     flat = by_inverse.reshape(*matrix.shape[:-2], count, 9)
     change[..., :9, :count] = np.swapaxes(flat, -1, -2)
     change[..., 9:, count:] = field_size * np.eye(3)
-    return MagnetometerFit(matrix, field_size * centre, change @ cov @ np.swapaxes(change, -1, -2))
+    found = np.asarray(change @ cov @ np.swapaxes(change, -1, -2))
+    return MagnetometerFit(matrix, field_size * centre, found)

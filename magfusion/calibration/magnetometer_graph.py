@@ -187,7 +187,7 @@ class _Problem:
         matrix, field_sensor = c[:9].reshape(3, 3), field_body @ mounting
         sensor_from_body = matrix @ mounting.T
         error = field_sensor @ matrix.T + c[9:12] - self.measured
-        by_attitude = sensor_from_body @ skew(field_body)
+        by_attitude = np.real(sensor_from_body @ skew(field_body))
         by_calibration = np.zeros((self.n, 3, COLUMNS))
         for row in range(3):
             by_calibration[:, row, 3 * row : 3 * row + 3] = field_sensor
@@ -202,7 +202,7 @@ class _Problem:
         own = self.force_weight
         return (
             np.concatenate([weight * error, own * (up_body + c[13:] - self.force)], axis=1),
-            np.concatenate([weight * by_attitude, own[..., None] * skew(up_body)], axis=1),
+            np.concatenate([weight * by_attitude, own[..., None] * np.real(skew(up_body))], axis=1),
             np.concatenate([weight * by_calibration, own[..., None] * by_bias], axis=1),
         )
 
