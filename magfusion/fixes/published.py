@@ -22,6 +22,8 @@ from magfusion.fixes.fingerprint import (
     nearest,
 )
 from magfusion.fixes.rssi import (
+    BlockLines,
+    RssiLines,
     distances,
     fit_block_lines,
     fit_lines,
@@ -124,17 +126,24 @@ def fix_as_published(
 def _located(
     known: FingerprintDatabase, amplitude: Array, method: Method, block: float | None
 ) -> Array:
-    if method == "paper-lines":
-        return locate_by_lines(known, amplitude, block)
     if method == "paper-fingerprint":
         return locate_by_differential_range(known, amplitude)
-    return locate_by_neighbours(known, amplitude, logarithmic=method == "paper-knn")
+    if method != "paper-lines":
+        return locate_by_neighbours(known, amplitude, logarithmic=method == "paper-knn")
+    place, beacons = known.position_world, known.beacons_world
+    if block is None:
+        return locate_by_lines(
+            known, amplitude, fit_lines(distances(place, beacons), known.amplitude)
+        )
+    return locate_by_lines(
+        known, amplitude, fit_block_lines(place, beacons, known.amplitude, block)
+    )
 
 
 def locate_by_lines(
-    known: FingerprintDatabase, amplitude: Array, block: float | None = None
+    known: FingerprintDatabase, amplitude: Array, lines: RssiLines | BlockLines
 ) -> Array:
-    """Return the positions of algorithm 1: ranges from the survey's lines, then trilateration.
+    """Return the positions of algorithm 1: ranges from lines, then trilateration.
 
     Started where the fingerprints are most alike, which also tells the side of the beacons' plane
     and the first block.
@@ -145,8 +154,7 @@ def locate_by_lines(
         Complete.
     amplitude : ndarray, shape (n, beacons)
         (T)
-    block : float, optional
-        As `fix_as_published`.
+    lines : RssiLines or BlockLines
 
     Returns
     -------
@@ -159,16 +167,12 @@ def locate_by_lines(
         Where the trilateration does not converge.
     """
     _, point = nearest(known, amplitude, NEIGHBOURS)
-    position = np.mean(known.position_world[point], axis=1)
-    if block is None:
-        lines = fit_lines(distances(known.position_world, known.beacons_world), known.amplitude)
-        ranges = ranges_from_lines(lines, amplitude)
-        return trilaterate_from_both_sides(ranges, known.beacons_world, position)
-    by_block = fit_block_lines(known.position_world, known.beacons_world, known.amplitude, block)
-    for _ in range(BLOCK_PASSES):
-        ranges = ranges_from_lines(by_block.at(position), amplitude)
+    position = np.asarray(np.mean(known.position_world[point], axis=1))
+    for _ in range(BLOCK_PASSES if isinstance(lines, BlockLines) else 1):
+        here = lines.at(position) if isinstance(lines, BlockLines) else lines
+        ranges = ranges_from_lines(here, amplitude)
         position = trilaterate_from_both_sides(ranges, known.beacons_world, position)
-    return np.asarray(position)
+    return position
 
 
 def attitude_as_published(

@@ -175,8 +175,10 @@ def trilaterate(ranges: Array, beacons_world: Array, start_world: Array) -> Arra
     Raises
     ------
     EstimationError
-        Where an iteration does not converge.
+        Where a range is not finite, or an iteration does not converge.
     """
+    if not np.all(np.isfinite(ranges)):
+        raise EstimationError("trilateration needs the range to every beacon")
     shape = (*ranges.shape[:-1], 3)
     start = np.broadcast_to(start_world, shape).reshape(-1, 3)
     position = _converged(start, beacons_world, ranges.reshape(-1, ranges.shape[-1]))

@@ -70,7 +70,7 @@ def run_published_fix(
     began = time.perf_counter()
     with named(job.log_path):
         samples, windows_dropped = phasors(log, site, job.lockin)
-    fields = _rotating_fields(samples, site, database, axis_world)
+    fields = rotating_fields(samples, site, database.beacons, axis_world)
     fixes = fix_as_published(database, fields, method, block)
     if len(fixes.epoch) == 0:
         reasons = ", ".join(f"{count} {reason}" for reason, count in fixes.dropped.items())
@@ -146,10 +146,11 @@ def rotation_axis_world(beacon: Beacon) -> Array:
     return np.asarray(beacon.world_from_beacon @ normal / size)
 
 
-def _rotating_fields(
-    samples: FieldSamples, site: Site, database: FingerprintDatabase, axis_world: Array
+def rotating_fields(
+    samples: FieldSamples, site: Site, beacons: tuple[str, ...], axis_world: Array
 ) -> RotatingFields:
-    own = [site.channels.index((name, 0)) for name in database.beacons]
+    """Return the amplitudes and normals of rotating beacons (`rotation_axis_world`)."""
+    own = [site.channels.index((name, 0)) for name in beacons]
     phasor = calibrated(samples.phasor_sensor[:, own], site)
     body_from_sensor = site.platform.magnetometer.body_from_sensor
     return RotatingFields(
