@@ -23,7 +23,7 @@ from magfusion.weights import block_diagonal, measurement_cov, stacked, whitenin
 
 FREE = ("phase", "gain")  # what may be found beside the pose, whatever the site says of it
 GAIN_SIGMA = 0.2  # of a log-gain; smooth errors of real installations (paper 004, Table 1)
-CHUNK = 500  # epochs solved at once: they fit into the cache
+CHUNK = 1000  # epochs solved at once: they fit into the cache
 Chosen = IntArray | BoolArray | slice
 ITERATIONS = 100  # a bound; the few that creep along a valley need more than 25
 
