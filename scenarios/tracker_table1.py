@@ -24,8 +24,8 @@ import numpy as np
 from tracker_antennas import (
     Config,
     Errors,
-    between_deg,
     bench_readings,
+    between_deg,
     couplings,
     draw_antennas,
     draw_survey,
