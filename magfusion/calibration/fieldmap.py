@@ -26,8 +26,10 @@ from magfusion.units import Array, ComplexArray, IntArray
 
 FEWEST_POINTS = 8
 LEARNT_FROM = 100  # points, at most, that decide on the process; the map itself takes all
-RELINEARISATIONS = 3
-_START = (1.0, 0.1, 0.05, 0.01)  # length scale (m), gain, rotation (rad), residual
+RELINEARISATIONS = 2
+FOLDS = 5  # parts of the survey, each predicted from the others
+_FREEDOM = 4.0  # of Student's t
+_START = (1.0, 0.07, 0.05, 0.02)  # length scale (m), gain, rotation (rad), residual
 _LIMITS = ((0.1, 30.0), (1e-4, 2.0), (1e-4, 0.6), (1e-4, 0.3))
 
 
@@ -110,16 +112,14 @@ class _Process(NamedTuple):
         return np.array([self.gain_sigma, *[self.rotation_sigma] * 3])
 
 
-def learn_field_map(site: Site, points: MapPoints, folds: int = 5) -> MapFit:
-    """Learn the map of every beacon; its process is common to all and of greatest likelihood.
+def learn_field_map(site: Site, points: MapPoints) -> MapFit:
+    """Learn the map of every beacon; the process is common to all.
 
     Parameters
     ----------
     site : Site
         Maps that it has already are replaced.
     points : MapPoints
-    folds : int
-        Parts into which the points fall to tell what the map is worth.
 
     Returns
     -------
@@ -137,11 +137,11 @@ def learn_field_map(site: Site, points: MapPoints, folds: int = 5) -> MapFit:
                 f"beacon {beacon.name} was heard at {len(found.sensor_world)} points, and a map"
                 f" needs {FEWEST_POINTS}; survey more of the room"
             )
-    process = _likeliest_process(heard)
+    process = _best_process(heard)
     maps = [_conditioned(found, process) for found in heard]
     beacons = tuple(replace(b, field_map=m) for b, m in zip(site.beacons, maps, strict=True))
     names = [b.name for b in site.beacons]
-    errors = [_cross_validated(found, process, folds) for found in heard]
+    errors = [_cross_validated(found, process) for found in heard]
     return MapFit(
         site=replace(site, beacons=beacons),
         error_without={n: e[0] for n, e in zip(names, errors, strict=True)},
@@ -194,8 +194,8 @@ def _stacked(phasor: ComplexArray) -> Array:
     return np.concatenate([phasor.real, phasor.imag], axis=1)
 
 
-def _reduced(heard: _Heard, state: Array, residual: float) -> tuple[Array, Array, float]:
-    """Return information (m, 4, 4), its vector (m, 4), and the rest of the log-likelihood.
+def _reduced(heard: _Heard, state: Array, residual: float) -> tuple[Array, Array]:
+    """Return what each point knows of gain and rotation: information (m, 4, 4), vector (m, 4).
 
     Linear about ``state`` (m, 4): gain and rotation at each point.
     """
@@ -210,41 +210,77 @@ def _reduced(heard: _Heard, state: Array, residual: float) -> tuple[Array, Array
     weighted = design * weight[..., None, None]
     information = np.einsum("mtia,mtib->mab", weighted, design)
     vector = np.einsum("mtia,mti->ma", weighted, error)
-    rest = -0.5 * np.sum(weight[..., None] * error**2) + 1.5 * np.sum(np.log(weight))
-    return information, vector, float(rest)
+    return information, vector
 
 
-def _solved(heard: _Heard, process: _Process) -> tuple[Array, Array, float]:
-    """Return weights (m, 4), information (m, 4, 4) and the log-likelihood."""
+def _conditioned(heard: _Heard, process: _Process) -> FieldMap:
     count = len(heard.sensor_world)
     kernel = process_covariance(heard.sensor_world, process.length_scale, process.sigma)
     state = np.zeros((count, COMPONENTS))
     for _ in range(RELINEARISATIONS):
-        information, vector, rest = _reduced(heard, state, process.residual)
+        information, vector = _reduced(heard, state, process.residual)
         system = np.eye(len(kernel)) + spread_blocks(information) @ kernel
         weights = np.linalg.solve(system, vector.ravel())
-        pulled = kernel @ weights
-        state = pulled.reshape(count, COMPONENTS)
-    _, volume = np.linalg.slogdet(system)
-    likelihood = rest + 0.5 * float(vector.ravel() @ pulled) - 0.5 * float(volume)
-    return np.asarray(weights.reshape(count, COMPONENTS)), information, likelihood
+        state = (kernel @ weights).reshape(count, COMPONENTS)
+    return FieldMap(
+        points_world=heard.sensor_world,
+        weights=np.asarray(weights.reshape(count, COMPONENTS)),
+        information=information,
+        length_scale=process.length_scale,
+        gain_sigma=process.gain_sigma,
+        rotation_sigma=process.rotation_sigma,
+        residual=process.residual,
+    )
 
 
-def _likeliest_process(heard: Sequence[_Heard]) -> _Process:
-    thinned = [_evenly(h, LEARNT_FROM) for h in heard]
+def _best_process(heard: Sequence[_Heard]) -> _Process:
+    """Return the process that predicts points left out best, by Student's t.
+
+    The greatest likelihood would let the few points beside iron decide: it explains all by noise.
+    """
+    parts = [_folds(_evenly(h, LEARNT_FROM), FOLDS) for h in heard]
+    count = sum(asked.model.size for folds in parts for _, asked in folds)
 
     def cost(log_process: Array) -> float:
         process = _Process(*np.exp(log_process))
-        return -sum(_solved(h, process)[2] for h in thinned)
+        return sum(_surprise(*fold, process) for folds in parts for fold in folds) / count
 
     found = minimize(
         cost,
         np.log(_START),
         method="L-BFGS-B",
         bounds=np.log(_LIMITS),
-        options={"maxiter": 40, "ftol": 1e-6},
+        options={"maxiter": 20, "ftol": 1e-4},
     )
     return _Process(*(float(v) for v in np.exp(found.x)))
+
+
+def _folds(heard: _Heard, folds: int) -> list[tuple[_Heard, _Heard]]:
+    """Return pairs of points that are known and points that are asked for."""
+    fold = np.arange(len(heard.sensor_world)) % folds
+    return [
+        (_Heard(*(p[fold != k] for p in heard)), _Heard(*(p[fold == k] for p in heard)))
+        for k in range(folds)
+    ]
+
+
+def _surprise(known: _Heard, asked: _Heard, process: _Process) -> float:
+    """Return minus the log-score of what a map predicts, but for a constant."""
+    found = _conditioned(known, process)
+    strength = np.mean(np.sum(asked.model**2, axis=2), axis=1)
+    error = found.relative_variance(asked.sensor_world)
+    variance = np.mean(asked.variance, axis=1) + error * strength / 3.0
+    square = np.sum((asked.measured - _mapped(found, asked)) ** 2, axis=(1, 2)) / variance
+    size = asked.model[0].size
+    spread = 0.5 * size * np.log(variance / strength)
+    tail = 0.5 * (_FREEDOM + size) * np.log1p(square / _FREEDOM)
+    return float(np.sum(spread + tail))
+
+
+def _mapped(found: FieldMap, asked: _Heard) -> Array:
+    value, _ = found.mean(asked.sensor_world)
+    turned = asked.model + np.cross(value[:, None, 1:], asked.model)
+    return np.asarray(np.exp(value[:, :1, None]) * turned)
 
 
 def _evenly(heard: _Heard, most: int) -> _Heard:
@@ -255,31 +291,12 @@ def _evenly(heard: _Heard, most: int) -> _Heard:
     return _Heard(*(part[rows] for part in heard))
 
 
-def _conditioned(heard: _Heard, process: _Process) -> FieldMap:
-    weights, information, _ = _solved(heard, process)
-    return FieldMap(
-        points_world=heard.sensor_world,
-        weights=weights,
-        information=information,
-        length_scale=process.length_scale,
-        gain_sigma=process.gain_sigma,
-        rotation_sigma=process.rotation_sigma,
-        residual=process.residual,
-    )
-
-
-def _cross_validated(heard: _Heard, process: _Process, folds: int) -> tuple[float, float]:
+def _cross_validated(heard: _Heard, process: _Process) -> tuple[float, float]:
     """Return the relative error at points left out, without the map and with it."""
-    fold = np.arange(len(heard.sensor_world)) % folds
     without, left = [], []
-    for k in range(folds):
-        known = _Heard(*(part[fold != k] for part in heard))
-        asked = _Heard(*(part[fold == k] for part in heard))
-        value, _ = _conditioned(known, process).mean(asked.sensor_world)
-        turned = asked.model + np.cross(value[:, None, 1:], asked.model)
-        mapped = np.exp(value[:, :1, None]) * turned
+    for known, asked in _folds(heard, FOLDS):
         without.append(_relative(asked.model, asked.measured))
-        left.append(_relative(mapped, asked.measured))
+        left.append(_relative(_mapped(_conditioned(known, process), asked), asked.measured))
     return _rms(np.concatenate(without)), _rms(np.concatenate(left))
 
 
