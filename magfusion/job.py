@@ -56,6 +56,7 @@ _WRITTEN = {
     "simulate": _LOG,
     "demodulate": _LOG,
     "survey": {"survey.parquet", "survey.png", "report.json"},
+    "calibrate beacon": {"site.yaml", "site_field_map.parquet", "beacon.png", "report.json"},
     "calibrate fieldmap": {"site.yaml", "site_field_map.parquet", "field_map.png", "report.json"},
     "calibrate magnetometer": {
         "site.yaml",
@@ -63,6 +64,8 @@ _WRITTEN = {
         "magnetometer.png",
         "report.json",
     },
+    "calibrate attitude-database": {"attitudes.parquet", "attitudes.png", "report.json"},
+    "match": {"attitude.parquet", "attitude.png", "report.json"},
     "coverage": {"coverage.parquet", "coverage.png", "run.rrd", "report.json"},
 }
 

@@ -6,13 +6,20 @@ from typing import NoReturn
 
 import typer
 
-from magfusion.cli import calibrate_commands, log_commands, plan_commands, result_commands
+from magfusion.cli import (
+    calibrate_commands,
+    log_commands,
+    match_commands,
+    plan_commands,
+    result_commands,
+)
 from magfusion.cli.app import app
 from magfusion.errors import EstimationError, InputError
 
 COMMANDS = (
     calibrate_commands,
     log_commands,
+    match_commands,
     plan_commands,
     result_commands,
 )  # imported, they are registered

@@ -20,6 +20,7 @@ from magfusion.units import DEGREE, Array, BoolArray
 
 UNDETERMINED = 10.0 * DEGREE  # rad, one sigma
 LEAST_SHARE = 0.05  # of the field across an axis; below it an error of the field grows twentyfold
+RESTING = 0.05  # of gravity; a specific force that differs by more is not that of a body at rest
 
 THREE_ANGLES = (
     "one field vector tells two of three angles; give the yaw and ask for roll and pitch, or add a"
@@ -271,6 +272,60 @@ def attitude_with_gravity(
     up = np.array([0.0, 0.0, 1.0])
     outer = direction[:, None] * unit_field[..., None, :] / field_share**2
     return wahba(outer + up[:, None] * unit_force[..., None, :] / force_share**2)
+
+
+def match_with_gravity(
+    field_body: Array,
+    force_body: Array,
+    field_world: Array,
+    gravity: float,
+    sigma: float,
+    force_sigma: float,
+) -> Matches:
+    """Return all three angles from the field and the specific force of a body at rest.
+
+    Parameters
+    ----------
+    field_body : ndarray, shape (n, 3)
+        (T)
+    force_body : ndarray, shape (n, 3)
+        (m/s^2); one whose length is not that of gravity leaves the attitude undetermined.
+    field_world : ndarray, shape (3,)
+        (T)
+    gravity : float
+        (m/s^2)
+    sigma, force_sigma : float
+        Noise of each component (T, m/s^2).
+
+    Raises
+    ------
+    InputError
+        As `attitude_with_gravity`.
+    """
+    shares = (sigma / float(np.linalg.norm(field_world)), force_sigma / gravity)
+    turn = attitude_with_gravity(field_body, force_body, field_world, *shares)
+    pitch = -np.arcsin(np.clip(turn[:, 2, 0], -1.0, 1.0))
+    roll = np.arctan2(turn[:, 2, 1], turn[:, 2, 2])
+    rpy = np.stack([roll, pitch, np.arctan2(turn[:, 1, 0], turn[:, 0, 0])], axis=-1)
+    # Each direction tells the two turns across it.
+    known = np.stack([field_world / np.linalg.norm(field_world), [0.0, 0.0, 1.0]]) @ turn
+    across = np.eye(3) - known[..., :, None] * known[..., None, :]
+    cov_body = np.linalg.inv(np.einsum("nkij,k->nij", across, 1.0 / np.square(shares)))
+    by_angles = np.stack(
+        [
+            np.broadcast_to([1.0, 0.0, 0.0], rpy.shape),
+            np.stack([np.zeros_like(roll), np.cos(roll), -np.sin(roll)], axis=-1),
+            turn[:, 2],
+        ],
+        axis=-1,
+    )
+    to_angles = np.linalg.pinv(by_angles)
+    cov = to_angles @ cov_body @ np.swapaxes(to_angles, 1, 2)
+    spread = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    shaken = np.abs(np.linalg.norm(force_body, axis=1) / gravity - 1.0) > RESTING
+    residual = np.linalg.norm(predict_field(rpy, field_world) - field_body, axis=1)
+    determined = ~shaken & (np.max(spread, axis=1) < UNDETERMINED)
+    return Matches(rpy[:, None], spread[:, None], residual[:, None], determined[:, None])
 
 
 def _in_heading(yaw: Array | float, field_world: Array) -> tuple[Array, Array, Array]:

@@ -253,7 +253,10 @@ def _angles_of(world_from_body: Array, angles: str | None) -> tuple[Angles, Arra
                 f"the axis of roll turns by {np.max(turning) / DEGREE:.3g} degrees from its mean,"
                 f" and may by {HELD / DEGREE:g}; hold pitch and yaw, or ask for roll and pitch"
             )
-        return "roll", _held(world_from_body, mean, None)
+        level = float(np.hypot(mean[0], mean[1]))
+        # On a vertical axis yaw and roll are one: roll then counts from world x.
+        yaw = float(np.arctan2(mean[1], mean[0])) if level > np.sin(HELD) else 0.0
+        return "roll", angles_about(world_from_body, yaw, -float(np.arctan2(mean[2], level)))
     heading = np.arctan2(axis[:, 1], axis[:, 0])
     yaw = float(np.angle(np.mean(np.exp(1j * heading))))
     turning = np.abs(wrap(heading - yaw))
@@ -262,26 +265,36 @@ def _angles_of(world_from_body: Array, angles: str | None) -> tuple[Angles, Arra
             f"the yaw turns by {np.max(turning) / DEGREE:.3g} degrees from its mean, and may by"
             f" {HELD / DEGREE:g}; {THREE_ANGLES}"
         )
-    return "roll-pitch", _held(world_from_body, None, yaw)
+    return "roll-pitch", angles_about(world_from_body, yaw)
 
 
-def _held(world_from_body: Array, axis: Array | None, yaw: float | None) -> Array:
-    """Return roll, pitch and yaw (n, 3), those that are held at the value given."""
+def angles_about(world_from_body: Array, yaw: Array | float, pitch: float | None = None) -> Array:
+    """Return roll, pitch and yaw of attitudes, those that are held at the values given.
+
+    Parameters
+    ----------
+    world_from_body : ndarray, shape (n, 3, 3)
+    yaw : float or ndarray, shape (n,)
+        (rad)
+    pitch : float, optional
+        (rad); that of each attitude where it is not given.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        (rad); defined at a vertical x axis too, where roll and yaw are one.
+    """
     n = len(world_from_body)
-    if axis is not None:
-        level = float(np.hypot(axis[0], axis[1]))
-        # On a vertical axis yaw and roll are one: roll counts from world x.
-        yaw = float(np.arctan2(axis[1], axis[0])) if level > np.sin(HELD) else 0.0
-        pitch = np.full(n, -np.arctan2(axis[2], level))
+    if pitch is None:
+        tilt = -np.arcsin(np.clip(world_from_body[:, 2, 0], -1.0, 1.0))
     else:
-        assert yaw is not None
-        pitch = -np.arcsin(np.clip(world_from_body[:, 2, 0], -1.0, 1.0))
+        tilt = np.full(n, pitch)
     # The image of body y in the axes of the pitched frame is (0, cos roll, sin roll).
     y_axis = world_from_body[:, :, 1]
-    level_y = -np.sin(yaw) * y_axis[:, 0] + np.cos(yaw) * y_axis[:, 1]
     level_x = np.cos(yaw) * y_axis[:, 0] + np.sin(yaw) * y_axis[:, 1]
-    up = np.sin(pitch) * level_x + np.cos(pitch) * y_axis[:, 2]
-    return np.stack([np.arctan2(up, level_y), pitch, np.full(n, yaw)], axis=1)
+    level_y = np.cos(yaw) * y_axis[:, 1] - np.sin(yaw) * y_axis[:, 0]
+    up = np.sin(tilt) * level_x + np.cos(tilt) * y_axis[:, 2]
+    return np.stack([np.arctan2(up, level_y), tilt, np.broadcast_to(yaw, n)], axis=1)
 
 
 def _thin(field_body: Array, rpy: Array, step: float) -> tuple[Array, Array]:

@@ -1,0 +1,268 @@
+"""The job that finds attitudes from the Earth's field: a log in, a table of angles out."""
+
+import datetime
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.fixes.matching import (
+    THREE_ANGLES,
+    Matches,
+    match_roll,
+    match_roll_pitch,
+    match_with_gravity,
+    wrap,
+)
+from magfusion.fixes.matching_database import (
+    angles_about,
+    match_interpolated,
+    match_nearest,
+    prepare,
+)
+from magfusion.job import Job, claim, named, read_job
+from magfusion.jobs.attitude_database import MAX_GAP, TABLE, Sampling, Steady, steady
+from magfusion.match_plot import write_match_plot
+from magfusion.physics.earth import earth_field_world
+from magfusion.records.attitude_table import read_database, write_attitudes
+from magfusion.records.samples import Log
+from magfusion.report import Figures, write_report
+from magfusion.site import Site
+from magfusion.trajectory import Trajectory, interpolate
+from magfusion.units import DEGREE, Array, BoolArray
+
+Method = Literal["nearest", "interpolated", "closed-form"]
+_NAMES = ("roll", "pitch", "yaw")
+_BY = " (--yaw-deg; --gravity; magfusion smooth)"
+
+
+@dataclass(frozen=True)
+class MatchSettings:
+    """How attitudes are found, and what is given for it.
+
+    Parameters
+    ----------
+    database : Path, optional
+        File, or the result's directory; without one the site's Earth field is the model.
+    method : {"nearest", "interpolated", "closed-form"}, optional
+        Default: interpolated with a database, the closed form without.
+    angles : str, optional
+        What is asked: "roll", "roll-pitch" or "roll-pitch-yaw"; default: what the database tells,
+        or what is not given.
+    pitch_deg, yaw_deg : float, optional
+        Given, where there is no database.
+    gravity : bool
+        Take the specific force of a body at rest as the second vector.
+    sampling : Sampling
+    """
+
+    database: Path | None = None
+    method: Method | None = None
+    angles: str | None = None
+    pitch_deg: float | None = None
+    yaw_deg: float | None = None
+    gravity: bool = False
+    sampling: Sampling = field(default_factory=Sampling)
+
+
+class _Found(NamedTuple):
+    matches: Matches
+    method: str
+    angles: tuple[int, ...]  # found, of roll, pitch, yaw
+
+
+def run_match(job: Job, settings: MatchSettings) -> Figures:
+    """Find the attitude of every epoch from the Earth's field: table, picture and report.
+
+    Returns
+    -------
+    dict
+        The figures of ``report.json``, with the errors against the log's truth if it has one.
+
+    Raises
+    ------
+    InputError
+        Where more angles are asked than the vectors tell, in one sentence that says what is
+        lacking; where a file cannot be read, or ``output`` is in the way.
+    """
+    _check(settings)
+    claimed = claim(job.output, "match")
+    log, site = read_job(job)
+    with named(job.log_path):
+        taken = steady(log, site, settings.sampling)
+    found = _match(job, site, taken, settings)
+    first = found.matches.determined[:, 0]
+    figures: Figures = {
+        "job": "match",
+        "log": log.name,
+        "method": found.method,
+        "angles": "-".join(_NAMES[k] for k in found.angles),
+        "epochs": len(taken.time),
+        "ambiguous_epochs": int(np.sum(found.matches.ambiguous)),
+        "undetermined_epochs": int(np.sum(~first)),
+        "window_s": taken.length,
+    }
+    for k in range(3):
+        if k not in found.angles:
+            figures[f"given_{_NAMES[k]}_deg"] = float(found.matches.rpy[0, 0, k] / DEGREE)
+        elif np.any(first):
+            sigma = float(np.median(found.matches.sigma[first, 0, k]))
+            figures[f"{_NAMES[k]}_sigma_median_deg"] = sigma / DEGREE
+    true_rpy, compared = _compared(log, taken.time, found)
+    with claimed as directory:
+        parts = (found.matches.rpy, found.matches.sigma, found.matches.residual)
+        path = directory / "attitude.parquet"
+        write_attitudes(path, log.epoch_ns, taken.time, *parts, found.matches.determined)
+        picture = directory / "attitude.png"
+        write_match_plot(picture, taken.time, found.matches, found.angles, true_rpy)
+        write_report(directory, figures | compared)
+    return figures | compared
+
+
+def _check(settings: MatchSettings) -> None:
+    """Refuse what cannot be asked together, and more than the vectors tell."""
+    if settings.gravity:
+        _check_gravity(settings)
+        return
+    if settings.angles == "roll-pitch-yaw":
+        raise InputError(f"--angles roll-pitch-yaw: {THREE_ANGLES}{_BY}")
+    if settings.database is None:
+        _check_given(settings)
+    elif settings.pitch_deg is not None or settings.yaw_deg is not None:
+        raise InputError(
+            "--pitch-deg and --yaw-deg are those of the database; give them without --database"
+        )
+
+
+def _check_gravity(settings: MatchSettings) -> None:
+    if settings.angles not in (None, "roll-pitch-yaw") or _given(settings):
+        raise InputError(
+            "--gravity tells all three angles; leave out --angles, --pitch-deg, --yaw-deg,"
+            " --database and --method"
+        )
+    if settings.sampling.raw:
+        raise InputError("--gravity needs the specific force of each epoch; leave out --raw")
+
+
+def _check_given(settings: MatchSettings) -> None:
+    for name, value, limit in (
+        ("--pitch-deg", settings.pitch_deg, 90.0),
+        ("--yaw-deg", settings.yaw_deg, 360.0),
+    ):
+        if value is not None and not abs(value) <= limit:
+            raise InputError(f"{name} must lie within {limit:g} degrees of zero; got {value:g}")
+    if settings.method not in (None, "closed-form"):
+        raise InputError(f"--method {settings.method} looks up a database; name it by --database")
+    if settings.yaw_deg is None:
+        raise InputError(f"without a database {THREE_ANGLES}{_BY}")
+    asked = "roll-pitch" if settings.pitch_deg is None else "roll"
+    if settings.angles not in (None, asked):
+        raise InputError(
+            "--angles roll needs --pitch-deg beside --yaw-deg, and --angles roll-pitch has none"
+        )
+
+
+def _given(settings: MatchSettings) -> bool:
+    values = (settings.pitch_deg, settings.yaw_deg, settings.database, settings.method)
+    return any(value is not None for value in values)
+
+
+def _match(job: Job, site: Site, taken: Steady, settings: MatchSettings) -> _Found:
+    if settings.database is not None:
+        return _by_database(settings.database, taken, settings)
+    field_world = _earth_field(job, site)
+    with named(job.log_path):
+        if settings.gravity:
+            assert taken.force_body is not None
+            bias = site.platform.imu.accel_bias_sigma
+            force_sigma = float(np.hypot(taken.force_sigma, bias))
+            vectors = (taken.field_body, taken.force_body, field_world, site.gravity)
+            matches = match_with_gravity(*vectors, taken.sigma, force_sigma)
+            return _Found(matches, "gravity", (0, 1, 2))
+        assert settings.yaw_deg is not None
+        yaw = float(wrap(np.asarray(settings.yaw_deg * DEGREE)))
+        if settings.pitch_deg is None:
+            matches = match_roll_pitch(taken.field_body, yaw, field_world, taken.sigma)
+            return _Found(matches, "closed-form", (0, 1))
+        pitch = settings.pitch_deg * DEGREE
+        matches = match_roll(taken.field_body, pitch, yaw, field_world, taken.sigma)
+        return _Found(matches, "closed-form", (0,))
+
+
+def _by_database(place: Path, taken: Steady, settings: MatchSettings) -> _Found:
+    path = place / TABLE if place.is_dir() else place
+    database = read_database(path)
+    if settings.angles not in (None, database.angles):
+        raise InputError(
+            f"--angles {settings.angles}: {path} tells {database.angles}; build another by"
+            " magfusion calibrate attitude-database"
+        )
+    with named(path):
+        index = prepare(database)
+    found = (0,) if database.angles == "roll" else (0, 1)
+    method: Method = settings.method or "interpolated"
+    if method == "nearest":
+        return _Found(match_nearest(index, taken.field_body, taken.sigma), method, found)
+    if method == "interpolated":
+        return _Found(match_interpolated(index, taken.field_body, taken.sigma), method, found)
+    _, pitch, yaw = database.rpy[0]
+    known = (index.field_world, float(np.hypot(taken.sigma, index.sigma)))
+    if database.angles == "roll":
+        return _Found(match_roll(taken.field_body, pitch, yaw, *known), method, found)
+    matches = match_roll_pitch(taken.field_body, yaw, *known, side=index.side)
+    return _Found(matches, method, found)
+
+
+def _earth_field(job: Job, site: Site) -> Array:
+    if site.earth_field_world is not None:
+        return site.earth_field_world
+    place = site.location
+    if place is None:
+        name = job.log_path / "site.yaml" if job.site_path is None else job.site_path
+        raise InputError(
+            f"{name}: tells no Earth field; add world.earth_field_t or world.location, or give a"
+            " database by --database"
+        )
+    day = datetime.date.fromisoformat(place.date)
+    return earth_field_world(place.latitude_deg, place.longitude_deg, place.height_m, day)
+
+
+def _compared(log: Log, time: Array, found: _Found) -> tuple[Array | None, Figures]:
+    """Return the true angles (NaN where there are none) and the errors against them."""
+    if log.truth is None:
+        return None, {}
+    poses, exists = interpolate(log.truth, time, MAX_GAP)
+    used = exists & found.matches.determined[:, 0]
+    if not np.any(used):
+        return None, {"not_compared": "the truth covers no epoch whose attitude is determined"}
+    rpy = found.matches.rpy
+    true_rpy = np.full((len(time), 3), np.nan)
+    true_rpy[exists] = _true_angles(poses.world_from_body, rpy[0, 0], found.angles)
+    figures: Figures = {"compared_epochs": int(np.sum(used))}
+    for k in found.angles:
+        either = np.abs(wrap(rpy[..., k] - true_rpy[:, None, k]))[used] / DEGREE
+        figures[f"{_NAMES[k]}_rms_deg"] = float(np.sqrt(np.mean(either[:, 0] ** 2)))
+        figures[f"{_NAMES[k]}_max_deg"] = float(np.max(either[:, 0]))
+    if found.matches.ambiguous[used].any():
+        worst = np.max(np.abs(wrap(rpy - true_rpy[:, None]))[used], axis=2)
+        figures["max_of_nearer_solution_deg"] = float(np.nanmin(worst, axis=1).max() / DEGREE)
+    figures |= _whole_attitude(poses, rpy[exists, 0], used[exists])
+    return true_rpy, figures
+
+
+def _whole_attitude(poses: Trajectory, rpy: Array, used: BoolArray) -> Figures:
+    """Return the error of the attitude with the angles that were given, and of what was given."""
+    true = Rotation.from_matrix(poses.world_from_body[used])
+    turn = true.inv() * Rotation.from_euler("xyz", rpy[used])
+    return {"attitude_rmse_deg": float(np.sqrt(np.mean(turn.magnitude() ** 2)) / DEGREE)}
+
+
+def _true_angles(world_from_body: Array, given: Array, angles: tuple[int, ...]) -> Array:
+    """Return the true angles about those that were given."""
+    if 2 in angles:
+        heading = np.arctan2(world_from_body[:, 1, 0], world_from_body[:, 0, 0])
+        return angles_about(world_from_body, heading)
+    return angles_about(world_from_body, float(given[2]), None if 1 in angles else float(given[1]))
