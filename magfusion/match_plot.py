@@ -37,9 +37,10 @@ def write_match_plot(
     sure = matches.determined[:, 0]
     for row, k in zip(panels, found, strict=True):
         angle = matches.rpy[..., k] / DEGREE
-        if angle.shape[1] > 1:
+        if matches.ambiguous.any():
             row[0].plot(time, angle[:, 1], ".", ms=2, color="0.75", label="other solution")
-        row[0].plot(time[~sure], angle[~sure, 0], "x", ms=4, color="red", label="not determined")
+        if not sure.all():
+            row[0].plot(time[~sure], angle[~sure, 0], "x", color="red", label="not determined")
         row[0].plot(time[sure], angle[sure, 0], ".", ms=3, label="found")
         row[0].set(ylabel=f"{_NAMES[k]} (deg)")
         if true_rpy is not None:

@@ -209,7 +209,12 @@ def match_interpolated(index: Index, field_body: Array, sigma: float) -> Matches
     moved = mean + ((asked - centre)[:, None] @ across @ slope)[:, 0]
     rpy = known[:, 0] + moved
     rpy[:, 0] = wrap(rpy[:, 0])
-    return _matches(index, field_body, rpy, distance[:, 0], sigma, interpolated=True)
+    found = _matches(index, field_body, rpy, distance[:, 0], sigma, interpolated=True)
+    # What an affine map leaves of the neighbours, it leaves of the angles between them too.
+    left = turned - mean[:, None] - spread @ slope
+    free = left.shape[1] - (2 if kind == "roll" else 3)
+    found.sigma[:, 0] = np.hypot(found.sigma[:, 0], np.sqrt(np.sum(left**2, axis=1) / free))
+    return found
 
 
 def _matches(

@@ -101,8 +101,8 @@ def run_match(job: Job, settings: MatchSettings) -> Figures:
         "method": found.method,
         "angles": "-".join(_NAMES[k] for k in found.angles),
         "epochs": len(taken.time),
-        "ambiguous_epochs": int(np.sum(found.matches.ambiguous)),
-        "undetermined_epochs": int(np.sum(~first)),
+        "epochs_with_two_pitches": int(np.sum(found.matches.ambiguous)),
+        "epochs_not_determined": int(np.sum(~first)),
         "window_s": taken.length,
     }
     for k in range(3):
