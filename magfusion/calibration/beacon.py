@@ -21,6 +21,7 @@ SPACING = 0.5  # m; of the grid that seeds the search
 REACH = 1.5  # m; half the width of the grid
 CLEARANCE = 0.25  # m; nearer than this to a magnetometer no beacon is looked for
 STARTS = 4  # minima on the grid that are followed
+MOST_NUMBERS = 100_000  # of grid and phasors that are worked on at once
 SAME = 0.01  # m; fits nearer to each other than this are one
 LARGEST_CONDITION = 1e7  # of the scaled Jacobian
 
@@ -259,9 +260,11 @@ def _grid_starts(measured: BeaconMeasurements, seen: Array, reach: float) -> Arr
             " position_m"
         )
     cost = np.full((len(seen), len(places)), np.inf)
-    basis, _ = np.linalg.qr(_columns(measured, places[clear])[0])
-    explained = np.einsum("gdm,rd->rgm", basis, seen)
-    cost[:, clear] = np.sum(seen**2, axis=-1)[:, None] - np.sum(explained**2, axis=-1)
+    indices = np.flatnonzero(clear)
+    for some in np.array_split(indices, 1 + len(indices) * seen.shape[1] // MOST_NUMBERS):
+        basis, _ = np.linalg.qr(_columns(measured, places[some])[0])
+        explained = np.einsum("gdm,rd->rgm", basis, seen)
+        cost[:, some] = np.sum(seen**2, axis=-1)[:, None] - np.sum(explained**2, axis=-1)
     box = cost.reshape(len(seen), *cube.shape[:3])
     lowest = scipy.ndimage.minimum_filter(box, size=(1, 3, 3, 3), mode="nearest")
     ranked = np.where(box == lowest, box, np.inf).reshape(cost.shape)

@@ -18,9 +18,29 @@ from magfusion.cli.app import (
     progress,
     show_result,
 )
+from magfusion.jobs.calibrate_beacon import run_calibrate_beacon
 from magfusion.jobs.calibrate_fieldmap import MapSource, run_calibrate_fieldmap
 from magfusion.jobs.calibrate_magnetometer import run_calibrate_magnetometer
 
+
+
+@calibrate.command()
+def beacon(
+    survey: Annotated[
+        Path, typer.Argument(help="Survey: what magnetometers at known poses measured.")
+    ],
+    site: Annotated[Path, typer.Option("--site", help="Site file with the declared beacons.")],
+    output: Output = Path("beacon"),
+    beacon: Annotated[
+        list[str] | None,
+        typer.Option(help="Name of a beacon; repeatable; default: all that were surveyed."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find the magnetic centre, attitude and moments of beacons from a survey around them."""
+    with progress() as report:
+        figures = run_calibrate_beacon(survey, site, tuple(beacon or ()), output, report=report)
+    show_result(figures, output, as_json)
 
 @calibrate.command()
 def fieldmap(
