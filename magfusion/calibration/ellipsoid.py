@@ -13,6 +13,7 @@ from magfusion.units import Array
 
 FEWEST_READINGS = 9
 _STEPS = 8  # of Gauss-Newton; three are enough where the readings go all round
+_NO_ELLIPSOID = "the readings lie on no ellipsoid; turn the sensor all round, away from iron"
 _SYMMETRIC = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
 
 
@@ -92,11 +93,12 @@ def fit_ellipsoid_gravity(measured: Array, up_sensor: Array, field_size: float) 
     error, jacobian = _both_rows(scaled, up, inverse, centre, vertical)
     n = scaled.shape[-2]
     variance = np.sum(error**2, axis=-1)[..., None, None] / max(2 * n - 13, 1)
-    gain = np.linalg.pinv(jacobian)
-    noise = np.broadcast_to(np.eye(2 * n), (*gain.shape[:-2], 2 * n, 2 * n)).copy()
-    index = np.arange(n)
-    noise[..., index, n + index] = noise[..., n + index, index] = vertical[..., None]
-    cov = variance * (gain @ noise @ np.swapaxes(gain, -1, -2))
+    transposed = np.swapaxes(jacobian, -1, -2)
+    square = transposed @ jacobian
+    shared = transposed[..., :n] @ jacobian[..., n:, :]
+    noise = square + vertical[..., None, None] * (shared + np.swapaxes(shared, -1, -2))
+    unit = np.linalg.inv(square)
+    cov = variance * (unit @ noise @ unit)
     return _fit(inverse, centre, cov[..., :12, :12], basis, field_size)
 
 
@@ -106,7 +108,11 @@ def _field(measured: Array, inverse: Array, centre: Array) -> Array:
 
 def _solve(jacobian: Array, error: Array) -> Array:
     transposed = np.swapaxes(jacobian, -1, -2)
-    return np.linalg.solve(transposed @ jacobian, transposed @ error[..., None])[..., 0]
+    try:
+        step = np.linalg.solve(transposed @ jacobian, transposed @ error[..., None])
+    except np.linalg.LinAlgError as failure:
+        raise EstimationError(_NO_ELLIPSOID) from failure
+    return np.asarray(step[..., 0])
 
 
 def _algebraic(points: Array) -> tuple[Array, Array]:
@@ -131,9 +137,7 @@ def _algebraic(points: Array) -> tuple[Array, Array]:
     size = 1.0 + np.sum(middle[..., 0] * (shape @ middle)[..., 0], axis=-1)
     values, vectors = np.linalg.eigh(shape / size[..., None, None])
     if not np.all(values > 0.0):
-        raise EstimationError(
-            "the readings lie on no ellipsoid; turn the sensor all round, away from iron"
-        )
+        raise EstimationError(_NO_ELLIPSOID)
     root = np.sqrt(values)[..., None, :] * vectors @ np.swapaxes(vectors, -1, -2)
     return np.asarray(root), np.asarray(middle[..., 0] + mean[..., 0, :])
 
