@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.fixes.refine import FREE
 from magfusion.parameters import GROUPS
 from magfusion.receiver.windows import LockinSettings
 from magfusion.records.rosbag import Topics
@@ -62,8 +63,24 @@ def groups_option(estimate: str | None) -> tuple[str, ...] | None:
     return chosen
 
 
-def check_fix(method: str, survey: Path | None, block: float | None) -> None:
+def free_option(text: str | None) -> tuple[str, ...]:
+    """Read ``phase,gain`` or either."""
+    chosen = () if text is None else tuple(part.strip() for part in text.split(","))
+    unknown = [part for part in chosen if part not in FREE]
+    if unknown:
+        raise InputError(
+            f"--free {text!r}: {unknown[0] or 'nothing'} is not among what a fix may find beside"
+            f" the pose; choose from {', '.join(FREE)}"
+        )
+    return chosen
+
+
+def check_fix(
+    method: str, survey: Path | None, block: float | None, free: str | None = None
+) -> None:
     """Refuse options of ``fix`` that the method does not take, or lacks."""
+    if method != "likelihood" and free is not None:
+        raise InputError("--free belongs to --method likelihood; leave one of the two out")
     if method == "likelihood" and survey is not None:
         raise InputError("--survey belongs to the methods of paper 004; choose one with --method")
     if method != "paper-lines" and block is not None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.evaluation.errors import trajectory_errors
+from magfusion.fixes.ambiguity import relations
 from magfusion.fixes.fix import Fixes
 from magfusion.fusion.batch import Smoothed, SmootherSettings, smooth
 from magfusion.fusion.inertial import motion_at
@@ -189,7 +190,7 @@ def _save_fixes_instead(directory: Path, job: Job, log: Log, site: Site, reason:
     samples, dropped = phasors(log, site, job.lockin)
     fixes = first_fixes(samples, log, initial_calibration(site, float(np.mean(samples.time))))
     figures: Figures = {"job": "smooth", "log": log.name, "failed": reason}
-    figures |= fix_figures(fixes) | dropped_figures(dropped)
+    figures |= fix_figures(fixes, site) | dropped_figures(dropped)
     _write_fix_result(directory, log, site, fixes, figures)
 
 
@@ -210,14 +211,23 @@ def _write_fix_result(
         fixes.cost,
         fixes.probability,
         fixes.determined,
+        relations(fixes, site).label,
     )
     write_recording(directory / "run.rrd", site, best, truth=log.truth, errors=errors)
     write_report(directory, figures | compared)
     return figures | compared
 
 
-def run_fix(job: Job, *, report: Report = quiet) -> Figures:
+def run_fix(job: Job, *, free: tuple[str, ...] = (), report: Report = quiet) -> Figures:
     """Fix the pose at every epoch on its own: every hypothesis, best first.
+
+    Parameters
+    ----------
+    job : Job
+    free : tuple of str
+        What is found beside the pose, as in `magfusion.fixes.likelihood.fix_epochs`.
+    report : callable
+        Told stage, steps done and steps in all.
 
     Raises
     ------
@@ -230,10 +240,11 @@ def run_fix(job: Job, *, report: Report = quiet) -> Figures:
     with named(job.log_path):
         samples, dropped = phasors(log, site, job.lockin)
     report("fixing", 1, 2)
-    fixes = first_fixes(samples, log, initial_calibration(site, float(np.mean(samples.time))))
+    calibration = initial_calibration(site, float(np.mean(samples.time)))
+    fixes = first_fixes(samples, log, calibration, free)
     report("done", 2, 2)
     figures: Figures = {"job": "fix", "log": log.name}
-    figures |= fix_figures(fixes) | dropped_figures(dropped)
+    figures |= fix_figures(fixes, site) | dropped_figures(dropped)
     figures["elapsed_s"] = time.perf_counter() - began
     with claimed as directory:
         return _write_fix_result(directory, log, site, fixes, figures)

@@ -8,10 +8,12 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.evaluation.errors import TrajectoryErrors, trajectory_errors
+from magfusion.fixes.ambiguity import ambiguity_figures, relations
 from magfusion.fixes.fix import Fixes
 from magfusion.fusion.batch import Smoothed
 from magfusion.records.samples import Log
 from magfusion.refinement import findings
+from magfusion.site import Site
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array
 
@@ -102,8 +104,8 @@ def smoothed_figures(result: Smoothed) -> Figures:
     return figures
 
 
-def fix_figures(fixes: Fixes) -> Figures:
-    """Return the figures of single-epoch fixes, ambiguities included."""
+def fix_figures(fixes: Fixes, site: Site) -> Figures:
+    """Return the figures of single-epoch fixes, ambiguities included and told in words."""
     share = fixes.probability
     second = share[:, 1] if share.shape[1] > 1 else np.zeros(len(fixes))
     return {
@@ -111,6 +113,7 @@ def fix_figures(fixes: Fixes) -> Figures:
         "ambiguous_epochs": int(np.sum(second > 0.05)),
         "undetermined_epochs": int(np.sum(~fixes.determined[:, 0])),
         "residual_rms_median": float(np.median(fixes.residual_rms[:, 0])),
+        **ambiguity_figures(relations(fixes, site)),
     }
 
 

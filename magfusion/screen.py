@@ -23,6 +23,7 @@ _ERRORS = {
 _COLUMNS = ("rms", "aligned", "survey held", "claimed sigma per axis")
 # Told in tables or sentences, or of interest only in report.json.
 _ELSEWHERE = re.compile(
+    r"ambiguity.*|"
     r"job|log|notes|ate_m|attitude_rmse_deg|aligned_.*|rpe_.*|held_.*|.*_sigma_median_.*|cost|failed|"
     r"nees_median|(position|attitude)_inside_3_sigma|start_.*|rival_.*|ambiguous|not_compared|"
     r"(windows|epochs)_dropped_.*|determined|undetermined|time_offset_s|passes|iterations|.*\..*"
@@ -54,6 +55,8 @@ def show(figures: Figures, output: Path | None, console: Console | None = None) 
             console.print(table)
     for sentence in remarks(figures):
         console.print(f"note: {sentence}", style="yellow", soft_wrap=True, markup=False)
+    for sentence in _sentences(figures, "ambiguity_settled"):
+        console.print(sentence, soft_wrap=True, markup=False)
     if output is not None:
         console.print(f"results in {output}", soft_wrap=True, markup=False)
 
@@ -82,6 +85,7 @@ def remarks(figures: Figures) -> list[str]:
             f"{figures['ambiguous_epochs']} of {epochs} epochs are ambiguous: fixes.parquet holds"
             " every pose that explains them; add a beacon, or smooth, so that the motion decides."
         )
+    out += _sentences(figures, "ambiguity")
     if figures.get("undetermined_epochs"):
         out.append(
             f"{figures['undetermined_epochs']} of {epochs} epochs leave a direction of the pose"
@@ -90,6 +94,11 @@ def remarks(figures: Figures) -> list[str]:
     if figures.get("not_compared"):
         out.append(f"There is no comparison with the truth: {figures['not_compared']}")
     return out
+
+
+def _sentences(figures: Figures, key: str) -> list[str]:
+    told = figures.get(key)
+    return told if isinstance(told, list) else []
 
 
 def _errors(figures: Figures) -> Table:

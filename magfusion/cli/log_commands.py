@@ -26,7 +26,7 @@ from magfusion.fixes.published import Method
 from magfusion.fusion.batch import SmootherSettings
 from magfusion.jobs.published import run_published_fix
 from magfusion.jobs.survey import SurveySettings, run_survey
-from magfusion.options import check_fix, groups_option
+from magfusion.options import check_fix, free_option, groups_option
 from magfusion.parameters import GROUPS
 from magfusion.pipeline import run_demodulate, run_fix, run_smooth
 
@@ -121,6 +121,13 @@ def fix(
     block: Annotated[
         float | None, typer.Option(help="Of paper-lines: a line for each block of this size, m.")
     ] = None,
+    free: Annotated[
+        str | None,
+        typer.Option(
+            metavar="phase,gain",
+            help="Find these of every beacon beside the pose, whatever the site says of them.",
+        ),
+    ] = None,
     window: Window = None,
     step: Step = None,
     mains_hz: MainsHz = 50.0,
@@ -132,10 +139,11 @@ def fix(
     """Fix the pose at every epoch on its own, with every hypothesis that survives."""
     job = log_job("fix", log, site, output, window, step, mains_hz, start, end, topics)
     chosen: Literal["likelihood"] | Method = method.value
-    check_fix(chosen, survey, block)
+    check_fix(chosen, survey, block, free)
+    beside = free_option(free)
     if chosen == "likelihood":
         with progress() as report:
-            figures = run_fix(job, report=report)
+            figures = run_fix(job, free=beside, report=report)
     else:
         figures = run_published_fix(job, chosen, survey, block)
     show_result(figures, job.output, as_json)

@@ -52,6 +52,8 @@ class Fixes:
         False where the epoch leaves a direction of the pose open.
     log_gain : ndarray, shape (n, hypotheses, channels)
         Logarithm of each channel's gain; zero where it was not sought.
+    gravity_cost, prior_cost : ndarray, shape (n, hypotheses)
+        What gravity and the prior pose have of the cost; zero where nothing is known of them.
     """
 
     time: Array
@@ -63,6 +65,8 @@ class Fixes:
     phase: Array
     determined: BoolArray
     log_gain: Array
+    gravity_cost: Array
+    prior_cost: Array
 
     def __len__(self) -> int:
         return len(self.time)

@@ -25,6 +25,7 @@ FREE = ("phase", "gain")  # what may be found beside the pose, whatever the site
 GAIN_SIGMA = 0.2  # of a log-gain; smooth errors of real installations (paper 004, Table 1)
 CHUNK = 1000  # epochs solved at once: they fit into the cache
 Chosen = IntArray | BoolArray | slice
+Columns = tuple[Array, Array]  # Jacobian (m, rows, 6 + nuisances) and residual (m, rows)
 ITERATIONS = 100  # a bound; the few that creep along a valley need more than 25
 
 
@@ -310,7 +311,13 @@ def as_fixes(problem: Problem, solved: Solved, count: int) -> Fixes:
         phase=split(state.phase),
         determined=determined.reshape(-1, count),
         log_gain=split(state.log_gain),
+        gravity_cost=split(_cost_of(_gravity(problem, state), problem)),
+        prior_cost=split(_cost_of(_prior_pose(problem, state), problem)),
     )
+
+
+def _cost_of(known: Columns | None, problem: Problem) -> Array:
+    return np.zeros(len(problem.time)) if known is None else np.sum(known[1] ** 2, axis=1)
 
 
 def cost(problem: Problem, state: State) -> Array:
@@ -323,21 +330,31 @@ def cost(problem: Problem, state: State) -> Array:
     return np.asarray(total)
 
 
-def _known(problem: Problem, state: State) -> Iterator[tuple[Array, Array]]:
-    """Yield Jacobian (m, rows, 6 + nuisances) and residual (m, rows) of what is no field."""
-    m, width = len(problem.time), 6 + dimension(problem.blocks)
-    if problem.gravity is not None:
-        up = state.rotation[:, 2]
-        share = 1.0 / problem.gravity.sigma
-        block = np.zeros((m, 3, width))
-        block[:, :, :3] = share[:, None, None] * skew(up)
-        yield block, share[:, None] * (up - problem.gravity.up_body)
+def _gravity(problem: Problem, state: State) -> Columns | None:
+    if problem.gravity is None:
+        return None
+    up, share = state.rotation[:, 2], 1.0 / problem.gravity.sigma
+    block = np.zeros((len(up), 3, 6 + dimension(problem.blocks)))
+    block[:, :, :3] = share[:, None, None] * skew(up)
+    return block, share[:, None] * (up - problem.gravity.up_body)
+
+
+def _prior_pose(problem: Problem, state: State) -> Columns | None:
     prior = problem.prior
-    if prior is not None and prior.root is not None:
-        step = _pose_difference(prior.rotation, prior.position, state.rotation, state.position)
-        block = np.zeros((m, 6, width))
-        block[:, :, :6] = prior.root
-        yield block, (prior.root @ step[..., None])[..., 0]
+    if prior is None or prior.root is None:
+        return None
+    step = _pose_difference(prior.rotation, prior.position, state.rotation, state.position)
+    block = np.zeros((len(step), 6, 6 + dimension(problem.blocks)))
+    block[:, :, :6] = prior.root
+    return block, (prior.root @ step[..., None])[..., 0]
+
+
+def _known(problem: Problem, state: State) -> Iterator[Columns]:
+    """Yield Jacobian and residual of what is no field."""
+    for known in (_gravity(problem, state), _prior_pose(problem, state)):
+        if known is not None:
+            yield known
+    m, width = len(problem.time), 6 + dimension(problem.blocks)
     names = [name for name, _ in problem.calibration.site.channels]
     for gain in problem.blocks:
         if gain.kind == "gain":

@@ -137,7 +137,9 @@ def gravity_at_rest(imu: ImuSamples, site: Site, time: Array) -> Gravity | None:
     return Gravity(mean / size, np.where(still[nearest] & near, sigma, np.inf))
 
 
-def first_fixes(samples: FieldSamples, log: Log, calibration: Calibration) -> Fixes:
+def first_fixes(
+    samples: FieldSamples, log: Log, calibration: Calibration, free: tuple[str, ...] = ()
+) -> Fixes:
     """Return the fix of every epoch, with gravity where the platform rests."""
     gravity = gravity_at_rest(log.imu, calibration.site, samples.time)
-    return fix_epochs(samples, calibration, gravity=gravity)
+    return fix_epochs(samples, calibration, gravity=gravity, free=free)

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from magfusion.records.table import TIME, Span, write_table
@@ -18,6 +19,7 @@ def write_hypotheses(
     cost: Array,
     probability: Array,
     determined: BoolArray,
+    relation: NDArray[np.str_],
 ) -> None:
     """Write the hypotheses of every epoch as Parquet.
 
@@ -34,6 +36,8 @@ def write_hypotheses(
         Chi square, infinite where there is no such hypothesis; share of the posterior.
     determined : bool ndarray, shape (n, hypotheses)
         False where a direction of the pose is open.
+    relation : ndarray of str, shape (n, hypotheses)
+        How each follows from the best, e.g. ``mirror A``.
     """
     epoch, rank = np.nonzero(np.isfinite(cost))
     rotation = Rotation.from_matrix(world_from_body[epoch, rank])
@@ -51,5 +55,6 @@ def write_hypotheses(
         "chi_square": cost[epoch, rank],
         "probability": probability[epoch, rank],
         "determined": determined[epoch, rank],
+        "relation": relation[epoch, rank],
     }
     write_table(columns, path)
