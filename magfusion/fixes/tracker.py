@@ -147,10 +147,10 @@ def locate_by_svd(unit: Array) -> TrackerFix:
 
 
 def _refuse_mirrored(unit: Array) -> None:
-    size = np.linalg.svd(unit, compute_uv=False)
-    finite = np.isfinite(size).all(axis=-1)
+    finite = np.isfinite(unit).all(axis=(-2, -1))
     if not finite.all():
         raise EstimationError(f"coupling {np.argmin(finite.ravel())} holds no numbers to solve for")
+    size = np.linalg.svd(unit, compute_uv=False)
     flat = size[..., 2] < 1e-6 * size[..., 0]
     if flat.any():
         raise EstimationError(
