@@ -1,13 +1,14 @@
 """The commands that match attitudes: their files, their figures, and what they refuse."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet
 import pytest
 import yaml
-from conftest import Refuse, run_command
+from conftest import Refuse, change_table, run_command
 from scipy.spatial.transform import Rotation
 
 from magfusion.records.log import write_log
@@ -147,6 +148,7 @@ def test_a_platform_whose_yaw_wanders_makes_no_database(logs: Path, refuse: Refu
         (("--gravity", "--yaw-deg", "3"), "all three"),
         (("--gravity", "--raw"), "--raw"),
         (("--yaw-deg", "3", "--step", "1e-5"), "--step"),
+        (("--yaw-deg", "3", "--raw", "--step", "1"), "--raw takes every sample"),
         (("--database", "nod_again"), "attitudes.parquet"),
     ],
 )
@@ -192,3 +194,17 @@ def test_a_log_without_truth_needs_a_reference(logs: Path, tmp_path: Path, refus
     assert "--trajectory" in refuse(*build)
     run_command(*build, "--trajectory", logs / "nod" / "truth.parquet", "--step-deg", 4)
     assert report(tmp_path / "out")["angles"] == "roll-pitch"
+
+
+def test_a_dead_magnetometer_is_refused(logs: Path, tmp_path: Path, refuse: Refuse) -> None:
+    spoilt = shutil.copytree(logs / "turn", tmp_path / "dead")
+    offset = demo_site().platform.magnetometer.offset
+    change_table(
+        spoilt / "magnetometer.parquet",
+        lambda c: [
+            c.update({f"field_{x}": [o] * len(c["time_ns"])})
+            for x, o in zip("xyz", offset, strict=True)
+        ],
+    )
+    told = refuse("match", spoilt, "--yaw-deg", 3, "-o", tmp_path / "out")
+    assert "no field at" in told

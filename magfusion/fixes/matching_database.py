@@ -32,6 +32,7 @@ HELD = (
 NEIGHBOURS = {"roll": 3, "roll-pitch": 9}
 # Of the neighbours' extent: directions in which they extend less have no slope.
 _FLAT = 0.05
+_CHUNK = 50_000  # fields at once
 _OUTSIDE = 3.0  # spacings of the database
 
 
@@ -194,6 +195,16 @@ def match_interpolated(index: Index, field_body: Array, sigma: float) -> Matches
     sigma : float
         Noise of each component of the field (T).
     """
+    rows = [slice(k, k + _CHUNK) for k in range(0, len(field_body), _CHUNK)]
+    parts = [_interpolated(index, field_body[part]) for part in rows]
+    rpy, distance, left = (np.concatenate(part) for part in zip(*parts, strict=True))
+    found = _matches(index, field_body, rpy, distance, sigma, interpolated=True)
+    found.sigma[:, 0] = np.hypot(found.sigma[:, 0], left)
+    return found
+
+
+def _interpolated(index: Index, field_body: Array) -> tuple[Array, Array, Array]:
+    """Return angles, distance of the nearest entry (T), and what the map leaves of the angles."""
     kind = index.database.angles
     distance, row = nearest_entries(index, field_body, NEIGHBOURS[kind])
     near = _unit(_compared(kind, index.database.field_body[row]))
@@ -206,15 +217,12 @@ def match_interpolated(index: Index, field_body: Array, sigma: float) -> Matches
     turned = wrap(known - known[:, :1])
     mean = np.mean(turned, axis=1)
     slope = np.linalg.pinv(spread, rcond=_FLAT) @ (turned - mean[:, None])
-    moved = mean + ((asked - centre)[:, None] @ across @ slope)[:, 0]
-    rpy = known[:, 0] + moved
+    rpy = known[:, 0] + mean + ((asked - centre)[:, None] @ across @ slope)[:, 0]
     rpy[:, 0] = wrap(rpy[:, 0])
-    found = _matches(index, field_body, rpy, distance[:, 0], sigma, interpolated=True)
     # What an affine map leaves of the neighbours, it leaves of the angles between them too.
     left = turned - mean[:, None] - spread @ slope
     free = left.shape[1] - (2 if kind == "roll" else 3)
-    found.sigma[:, 0] = np.hypot(found.sigma[:, 0], np.sqrt(np.sum(left**2, axis=1) / free))
-    return found
+    return rpy, distance[:, 0], np.sqrt(np.sum(left**2, axis=1) / free)
 
 
 def _matches(

@@ -21,6 +21,7 @@ from magfusion.trajectory import Trajectory, interpolate
 from magfusion.units import DEGREE, Array
 
 TABLE = "attitudes.parquet"
+LEAST_FIELD = 1e-7  # T; a two hundredth of the Earth's at its weakest
 MAX_GAP = 0.2  # s; of the reference, across which it is interpolated
 _TAPER = 1.5  # by which a raised cosine averages white noise less than equal weights do
 
@@ -166,6 +167,8 @@ def steady(log: Log, site: Site, sampling: Sampling) -> Steady:
             "holds no magnetometer.parquet, in whose steady part the Earth's field is; give the raw"
             " log"
         )
+    if sampling.raw and sampling.step is not None:
+        raise InputError("--raw takes every sample; leave out --step")
     sensor, imu = site.platform.magnetometer, site.platform.imu
     if sampling.raw:
         time, measured, force = log.waveform.time, log.waveform.measured_sensor, None
@@ -177,9 +180,16 @@ def steady(log: Log, site: Site, sampling: Sampling) -> Steady:
         means = average(log.waveform, log.imu, imu.time_offset, sensor, *windows)
         time, measured, force = means.time, means.measured_sensor, means.accel_body
     body_from_measured = sensor.body_from_sensor @ np.linalg.inv(sensor.matrix)
+    field_body = (measured - sensor.offset) @ body_from_measured.T
+    weakest = int(np.argmin(np.linalg.norm(field_body, axis=1)))
+    if np.linalg.norm(field_body[weakest]) < LEAST_FIELD:
+        raise InputError(
+            f"magnetometer: no field at {time[weakest]:.3f} s, where the Earth's is everywhere;"
+            " check the instrument and its calibration, or leave that part out by --start and --end"
+        )
     return Steady(
         time=time,
-        field_body=(measured - sensor.offset) @ body_from_measured.T,
+        field_body=field_body,
         force_body=force,
         sigma=float(sensor.noise_density * np.sqrt(0.5 / effective)),
         force_sigma=float(imu.accel_noise / np.sqrt(effective)),
