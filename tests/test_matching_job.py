@@ -23,12 +23,14 @@ TONE = 2e-6  # T, of a beacon near by
 NOISE = 2.5e-9  # T, of a sample, as the site declares
 
 
-def write_turning(path: Path, seed: int, pitch: np.ndarray, yaw_rate: float = 0.0) -> Path:
-    """Write the log of a body that rolls by 0.8 rad/s at the pitch given, beside a beacon."""
+def write_turning(
+    path: Path, seed: int, pitch: np.ndarray, yaw_rate: float = 0.0, roll_rate: float = 0.8
+) -> Path:
+    """Write the log of a body that rolls at the pitch given (rad), beside a beacon."""
     rng = np.random.default_rng(seed)
     site = demo_site()
     time = np.arange(len(pitch)) / RATE
-    angles = [0.8 * time + rng.uniform(0.0, 6.0), pitch, YAW + yaw_rate * time]
+    angles = [roll_rate * time + rng.uniform(0.0, 6.0), pitch, YAW + yaw_rate * time]
     turn = Rotation.from_euler("xyz", np.stack(angles, axis=1))
     rate = RATE * (turn[:-1].inv() * turn[1:]).as_rotvec()
     sensor = site.platform.magnetometer
@@ -54,6 +56,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_turning(root / "nod", 3, 0.35 * np.sin(0.23 * long))
     write_turning(root / "nod_again", 4, 0.33 * np.sin(0.3 * short))
     write_turning(root / "wander", 5, 0.3 * np.sin(0.3 * short), yaw_rate=0.3)
+    tilted = np.where(short < 10.0, 0.3, -0.4)  # turned at once between two rests
+    write_turning(root / "rests", 7, tilted, roll_rate=0.0)
     write_turning(root / "dive", 6, np.linspace(0.6, 1.3, len(short)))
     run_command("calibrate", "attitude-database", root / "turn", "-o", root / "turn_table",
                 "--step", 0.1)  # fmt: skip
@@ -113,10 +117,18 @@ def test_roll_is_found_by_its_database_and_in_closed_form(logs: Path, tmp_path: 
 
 
 def test_gravity_adds_the_third_angle(logs: Path, tmp_path: Path) -> None:
-    run_command("match", logs / "wander", "--gravity", "-o", tmp_path / "out")
+    run_command("match", logs / "rests", "--gravity", "-o", tmp_path / "out")
     told = report(tmp_path / "out")
     assert told["angles"] == "roll-pitch-yaw"
     assert told["attitude_rmse_deg"] < 0.1
+    assert 0 < told["epochs_not_determined"] < 0.2 * told["epochs"]
+
+
+def test_gravity_is_not_believed_in_motion(logs: Path, tmp_path: Path) -> None:
+    run_command("match", logs / "wander", "--gravity", "-o", tmp_path / "out")
+    told = report(tmp_path / "out")
+    assert told["epochs_not_determined"] == told["epochs"]
+    assert "not_compared" in told
 
 
 def test_both_pitches_are_written_where_there_are_two(logs: Path, tmp_path: Path) -> None:

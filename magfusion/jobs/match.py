@@ -31,6 +31,7 @@ from magfusion.records.attitude_table import read_database, write_attitudes
 from magfusion.records.samples import Log
 from magfusion.report import Figures, write_report
 from magfusion.site import Site
+from magfusion.strapdown import resting
 from magfusion.trajectory import Trajectory, interpolate
 from magfusion.units import DEGREE, Array, BoolArray
 
@@ -93,7 +94,7 @@ def run_match(job: Job, settings: MatchSettings) -> Figures:
     log, site = read_job(job)
     with named(job.log_path):
         taken = steady(log, site, settings.sampling)
-    found = _match(job, site, taken, settings)
+    found = _match(job, log, site, taken, settings)
     first = found.matches.determined[:, 0]
     figures: Figures = {
         "job": "match",
@@ -170,7 +171,7 @@ def _given(settings: MatchSettings) -> bool:
     return any(value is not None for value in values)
 
 
-def _match(job: Job, site: Site, taken: Steady, settings: MatchSettings) -> _Found:
+def _match(job: Job, log: Log, site: Site, taken: Steady, settings: MatchSettings) -> _Found:
     if settings.database is not None:
         return _by_database(settings.database, taken, settings)
     field_world = _earth_field(job, site)
@@ -181,6 +182,7 @@ def _match(job: Job, site: Site, taken: Steady, settings: MatchSettings) -> _Fou
             force_sigma = float(np.hypot(taken.force_sigma, bias))
             vectors = (taken.field_body, taken.force_body, field_world, site.gravity)
             matches = match_with_gravity(*vectors, taken.sigma, force_sigma)
+            matches.determined[:, 0] &= _resting(log, site, taken.time)
             return _Found(matches, "gravity", (0, 1, 2))
         assert settings.yaw_deg is not None
         yaw = float(wrap(np.asarray(settings.yaw_deg * DEGREE)))
@@ -190,6 +192,13 @@ def _match(job: Job, site: Site, taken: Steady, settings: MatchSettings) -> _Fou
         pitch = settings.pitch_deg * DEGREE
         matches = match_roll(taken.field_body, pitch, yaw, field_world, taken.sigma)
         return _Found(matches, "closed-form", (0,))
+
+
+def _resting(log: Log, site: Site, time: Array) -> BoolArray:
+    """Tell at which times the platform rests: else its acceleration passes for gravity."""
+    stamps = log.imu.time + site.platform.imu.time_offset
+    still = resting(stamps, log.imu.gyro_body, log.imu.accel_body)
+    return still[np.minimum(np.searchsorted(stamps, time), len(stamps) - 1)]
 
 
 def _by_database(place: Path, taken: Steady, settings: MatchSettings) -> _Found:
