@@ -14,6 +14,7 @@ from magfusion.calibration.magnetometer import (
     missing_orientations,
     prior_cov,
     refined,
+    spread,
 )
 from magfusion.calibration.magnetometer_graph import Epochs, GraphFit, Prior, fit_graph
 from magfusion.calibration.steady_field import LONGEST, SteadyField, average, steady_field
@@ -57,6 +58,11 @@ class LogCalibration:
         Orientations that were not there, in words.
     scale_known : bool
         Whether the site's Earth field set the scale; else the declared matrix did.
+    spread_unseen : float, optional
+        Standard deviation over mean of the field's size in each half of the log by the calibration
+        on the other half; None where a half is not enough.
+    shape_kept : bool
+        Whether the declared shape and offset did as well on the unseen half, and were kept.
     """
 
     magnetometer: Magnetometer
@@ -66,6 +72,8 @@ class LogCalibration:
     field_sigma: float
     missing: list[str]
     scale_known: bool
+    spread_unseen: float | None
+    shape_kept: bool
 
 
 def calibrate_log(
@@ -120,6 +128,10 @@ def calibrate_log(
         _refuse_few_stops(distinct(graph.world_from_body), missing)
     if site.earth_field_world is None:
         graph = replace(graph, fit=_with_unknown_scale(graph.fit, prior))
+    unseen = None if at_stops else _spread_unseen(epochs, prior, graph.fit)
+    kept = unseen is not None and _no_better(unseen, readings, known)
+    if kept:
+        graph = replace(graph, fit=_turned_only(known, graph.fit))
     return LogCalibration(
         magnetometer=refined(known, graph.fit),
         graph=graph,
@@ -128,6 +140,8 @@ def calibrate_log(
         field_sigma=sigma,
         missing=missing,
         scale_known=site.earth_field_world is not None,
+        spread_unseen=unseen,
+        shape_kept=kept,
     )
 
 
@@ -271,3 +285,41 @@ def _with_unknown_scale(fit: MagnetometerFit, prior: Prior) -> MagnetometerFit:
     variance = float(np.mean(np.diagonal(prior.cov)[[0, 4, 8]])) / 3.0
     direction = np.concatenate([fit.matrix.ravel(), np.zeros(3)])
     return replace(fit, cov=fit.cov + variance * np.outer(direction, direction))
+
+
+def _spread_unseen(epochs: Epochs, prior: Prior, start: MagnetometerFit) -> float | None:
+    """Return the spread of the field in either half by what the other half alone tells."""
+    half, n = len(epochs) // 2, len(epochs)
+    fields = []
+    for own, other in ((slice(half), slice(half, n)), (slice(half, n), slice(half))):
+        try:
+            fit = fit_graph(_part(epochs, own), prior, start).fit
+        except EstimationError:
+            return None
+        fields.append(field_from_measured(epochs.measured_sensor[other], fit.matrix, fit.offset))
+    return spread(np.concatenate(fields))
+
+
+def _part(epochs: Epochs, part: slice) -> Epochs:
+    assert epochs.accel_body is not None
+    assert epochs.accel_sigma is not None
+    begin, end, _ = part.indices(len(epochs))
+    return replace(
+        epochs,
+        measured_sensor=epochs.measured_sensor[part],
+        accel_body=epochs.accel_body[part],
+        accel_sigma=epochs.accel_sigma[part],
+        turns=epochs.turns[begin : end - 1],
+    )
+
+
+def _no_better(unseen: float, readings: SteadyField, known: Magnetometer) -> bool:
+    """Tell whether the spread is not below the declared calibration's by more than chance."""
+    declared = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
+    return unseen > spread(declared) * (1.0 - float(np.sqrt(0.5 / len(readings))))
+
+
+def _turned_only(known: Magnetometer, fit: MagnetometerFit) -> MagnetometerFit:
+    """Return the declared shape and offset with the rotation that was found."""
+    left, _, right = np.linalg.svd(np.linalg.inv(known.matrix) @ fit.matrix)
+    return replace(fit, matrix=known.matrix @ left @ right, offset=known.offset)

@@ -116,6 +116,7 @@ def _figures(
         "window_s": float(np.median(readings.window)),
         "spread_before": spread(before),
         "spread_after": spread(after),
+        "spread_unseen": found.spread_unseen,
         "field_size_before_t": float(np.mean(np.linalg.norm(before, axis=1))),
         "field_size_after_t": float(np.mean(np.linalg.norm(after, axis=1))),
         "field_noise_t": found.field_sigma,
@@ -142,6 +143,11 @@ def _notes(found: LogCalibration, told: list[_Told]) -> list[str]:
         notes.append(
             "The site has no Earth field: the scale of the matrix is the declared one, and only"
             " ratios, angles and offset are found; give earth_field_t or a location."
+        )
+    if found.shape_kept:
+        notes.append(
+            "The declared shape and offset leave no more spread than what one half of the log finds"
+            " for the other: they were kept, and only the sensor's rotation was taken."
         )
     largest = max(told, key=lambda p: abs(p.change) / p.prior_sigma)
     if abs(largest.change) > CONTRADICTED * largest.prior_sigma:
