@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.fixes.refine import FREE
+from magfusion.fixes.problem import FREE
 from magfusion.parameters import GROUPS
 from magfusion.receiver.windows import LockinSettings
 from magfusion.records.rosbag import Topics

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from magfusion.errors import EstimationError
 from magfusion.fixes.fix import Gravity
 from magfusion.fixes.likelihood import HYPOTHESES, fix_epochs
-from magfusion.fixes.refine import CHUNK
+from magfusion.fixes.problem import CHUNK
 from magfusion.parameters import initial_calibration, predict_channels
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.field import Drives

@@ -9,9 +9,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from magfusion.errors import EstimationError
+from magfusion.field_map import FieldMap
 from magfusion.fixes.fix import Gravity
 from magfusion.fixes.likelihood import fix_epochs
-from magfusion.fixes.refine import CHUNK, FREE, refine
+from magfusion.fixes.problem import CHUNK, FREE
+from magfusion.fixes.refine import refine
 from magfusion.parameters import Block, initial_calibration, predict_channels, retract
 from magfusion.records.samples import FieldSamples
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -19,6 +21,7 @@ from magfusion.simulation.log import simulate_fields
 from magfusion.simulation.worlds import ROOM, S0, draw_world
 from magfusion.trajectory import Trajectory
 from magfusion.units import DEGREE
+from magfusion.weights import measurement_cov, paired_whitening, sensor_positions, stacked
 
 SIGMA = 3e-10  # T, of a phasor's component
 EXACT = 1e-6  # m, rad
@@ -204,3 +207,48 @@ def test_what_free_phases_and_gains_cost_in_the_room_of_paper_004(free, metres, 
     assert low < np.sum(nees(fixes, truth)) < high
     error = deviations(fixes, truth)
     assert np.sqrt(np.mean(np.sum(error[:, 3:] ** 2, axis=1))) == pytest.approx(bound, rel=0.05)
+
+
+def half_mapped(site):
+    """Return the site with maps that are known on one side of the room alone."""
+    points = np.stack(np.meshgrid([0.0, 0.7, 1.4], [0.0, 1.5, 3.0], [1.0]), axis=-1).reshape(-1, 3)
+    field_map = FieldMap(
+        points_world=points,
+        weights=0.3 * np.random.default_rng(6).normal(size=(len(points), 4)),
+        information=np.broadcast_to(1e4 * np.eye(4), (len(points), 4, 4)).copy(),
+        length_scale=1.0,
+        gain_sigma=0.1,
+        rotation_sigma=0.05,
+        residual=0.002,
+    )
+    return replace(site, beacons=tuple(replace(b, field_map=field_map) for b in site.beacons))
+
+
+@pytest.mark.parametrize("from_guess", [True, False])
+def test_a_map_counts_by_how_well_it_is_known_where_the_fix_is(from_guess):
+    site, truth = half_mapped(dipoles()), poses(60)
+    calibration = initial_calibration(site, 0.0)
+    samples = seen(dipoles(), truth)
+    phasor = predict_channels(
+        calibration, truth.time, truth.world_from_body, truth.position_world
+    ) + (samples.phasor_sensor - seen(dipoles(), truth, 0.0).phasor_sensor)
+    samples = replace(samples, phasor_sensor=phasor)
+    if from_guess:
+        fixes = refined(site, samples, astray(truth, metres=0.02))
+    else:
+        fixes = fix_epochs(samples, calibration, survey_error=False)
+    found = fixes.best()
+    error = stacked(
+        predict_channels(calibration, found.time, found.world_from_body, found.position_world)
+        - samples.phasor_sensor
+    )
+
+    def chi_square(sensor_world):
+        cov = measurement_cov(site, samples, sensor_world=sensor_world)
+        white = paired_whitening(cov, samples.valid) @ error[..., None]
+        return np.sum(white**2, axis=(1, 2, 3))
+
+    # The weights are those of the first solution, millimetres from the last.
+    there = chi_square(sensor_positions(site, found))
+    np.testing.assert_allclose(fixes.cost[:, 0], there, rtol=0.02)
+    assert np.median(np.abs(chi_square(None) / there - 1.0)) > 0.1

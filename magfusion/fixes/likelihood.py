@@ -11,17 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.fixes.candidates import attitudes, positions
 from magfusion.fixes.fix import Fixes, Gravity
-from magfusion.fixes.refine import (
-    GAIN_SIGMA,
-    Problem,
-    Solved,
-    State,
-    as_fixes,
-    cost,
-    joined,
-    levenberg_marquardt,
-    problems,
-)
+from magfusion.fixes.problem import GAIN_SIGMA, Epochs, Problem, State, epochs_of
+from magfusion.fixes.refine import Solved, as_fixes, cost, joined, levenberg_marquardt
 from magfusion.parameters import Calibration
 from magfusion.records.samples import FieldSamples
 from magfusion.trajectory import Trajectory
@@ -71,7 +62,7 @@ def fix_epochs(
     EstimationError
         Where there is no epoch.
     """
-    parts = problems(
+    parts = epochs_of(
         samples,
         calibration,
         gravity=gravity,
@@ -80,13 +71,18 @@ def fix_epochs(
         free=free,
         gain_sigma=gain_sigma,
     )
-    return joined([_solve(problem) for problem in parts])
+    return joined([_solve(epochs) for epochs in parts])
 
 
-def _solve(problem: Problem) -> Fixes:
+def _solve(epochs: Epochs) -> Fixes:
+    problem = epochs.problem
     start, count = _starts(problem)
     epoch = np.repeat(np.arange(len(problem.time)), count)
     solved = levenberg_marquardt(problem.rows(epoch), start)
+    best = np.argmin(solved.cost.reshape(-1, count), axis=1) + count * np.arange(len(problem.time))
+    again = epochs.reweighed(solved.state.rotation[best], solved.state.position[best])
+    if again is not None:
+        problem, solved = again, levenberg_marquardt(again.rows(epoch), solved.state)
     order, ranked = _ranked(
         solved.state.rotation.reshape(-1, count, 3, 3),
         solved.state.position.reshape(-1, count, 3),

@@ -4,130 +4,23 @@ Levenberg-Marquardt, a row for each pose; a row that has converged costs nothing
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.errors import EstimationError
 from magfusion.fixes.fix import Fixes, Gravity
+from magfusion.fixes.problem import GAIN_SIGMA, Problem, State, epochs_of
 from magfusion.fixes.survey import honest_covariance, survey_jacobians, whitened
 from magfusion.observation import skew
-from magfusion.parameters import Block, Calibration, dimension, linearize_channels, predict_channels
+from magfusion.parameters import Calibration, dimension, linearize_channels, predict_channels
 from magfusion.records.samples import FieldSamples
-from magfusion.site import Site
 from magfusion.trajectory import Trajectory
-from magfusion.units import Array, BoolArray, IntArray
-from magfusion.weights import block_diagonal, measurement_cov, stacked, whitening
+from magfusion.units import Array, BoolArray
+from magfusion.weights import block_diagonal, stacked
 
-FREE = ("phase", "gain")  # what may be found beside the pose, whatever the site says of it
-GAIN_SIGMA = 0.2  # of a log-gain; smooth errors of real installations (paper 004, Table 1)
-CHUNK = 1000  # epochs solved at once: they fit into the cache
-Chosen = IntArray | BoolArray | slice
 Columns = tuple[Array, Array]  # Jacobian (m, rows, 6 + nuisances) and residual (m, rows)
 ITERATIONS = 100  # a bound; the few that creep along a valley need more than 25
-
-
-class _Prior(NamedTuple):
-    """Where the body is thought to be."""
-
-    rotation: Array  # (m, 3, 3) world_from_body
-    position: Array  # (m, 3)
-    root: Array | None  # (m, 6, 6) whitening; None where it is a candidate and no more
-
-    def rows(self, chosen: Chosen) -> "_Prior":
-        """Return some rows, or rows repeated."""
-        root = None if self.root is None else self.root[chosen]
-        return _Prior(self.rotation[chosen], self.position[chosen], root)
-
-
-def _prior(prior: Trajectory) -> _Prior:
-    cov = prior.pose_cov
-    root = None if cov is None else np.linalg.inv(np.linalg.cholesky(cov))
-    return _Prior(prior.world_from_body, prior.position_world, root)
-
-
-class State(NamedTuple):
-    """What is found in each row."""
-
-    rotation: Array  # (m, 3, 3) world_from_body
-    position: Array  # (m, 3)
-    phase: Array  # (m, channels), beyond the calibration's
-    log_gain: Array  # (m, channels), beyond the calibration's
-
-    def rows(self, chosen: IntArray | BoolArray) -> "State":
-        """Return some rows."""
-        return State(*(part[chosen] for part in self))
-
-    def where(self, condition: BoolArray, other: "State") -> "State":
-        """Return the other's rows where the condition does not hold."""
-        pairs = zip(self, other, strict=True)
-        return State(
-            *(np.where(condition[(...,) + (None,) * (a.ndim - 1)], a, b) for a, b in pairs)
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Problem:
-    """Phasors with their weights, and what else is known; a row for each pose sought.
-
-    Parameters
-    ----------
-    calibration : Calibration
-    time : ndarray, shape (m,)
-    measured : ndarray, shape (m, channels, 6)
-        Real parts, then imaginary parts (T).
-    root : ndarray, shape (m, channels, 3, 3)
-        Whitening (1/T); zero where a channel is missing.
-    noise : ndarray, shape (m, channels, 3, 3), optional
-        Covariance of the whitened noise, where the root stands for more than noise.
-    blocks : tuple of Block
-        Nuisances found beside the pose.
-    gravity : Gravity, optional
-    prior : optional
-        Poses with their whitening.
-    """
-
-    calibration: Calibration
-    time: Array
-    measured: Array
-    root: Array
-    noise: Array | None
-    blocks: tuple[Block, ...]
-    gravity: Gravity | None
-    prior: "_Prior | None"
-
-    def rows(self, chosen: Chosen) -> "Problem":
-        """Return some rows, or rows repeated."""
-        return replace(
-            self,
-            time=self.time[chosen],
-            measured=self.measured[chosen],
-            root=self.root[chosen],
-            noise=None if self.noise is None else self.noise[chosen],
-            gravity=None if self.gravity is None else self.gravity.rows(chosen),
-            prior=None if self.prior is None else self.prior.rows(chosen),
-        )
-
-    @property
-    def residuals(self) -> int:
-        """Number of residuals of each row."""
-        gains = sum(block.kind == "gain" for block in self.blocks)
-        told = self.prior is not None and self.prior.root is not None
-        return 6 * int(self.root.shape[1]) + 3 * (self.gravity is not None) + 6 * told + gains
-
-    def start(self, rotation: Array, position: Array, phase: Array | None = None) -> State:
-        """Return the state at given poses."""
-        none = np.zeros((len(position), self.root.shape[1]))
-        return State(rotation, position, none if phase is None else phase, none)
-
-    def at(self, state: State) -> Calibration:
-        """Return the calibration with each row's own phases and gains."""
-        known = self.calibration
-        return replace(
-            known, phase=known.phase + state.phase, log_gain=known.log_gain + state.log_gain
-        )
 
 
 class Solved(NamedTuple):
@@ -136,94 +29,6 @@ class Solved(NamedTuple):
     state: State
     cost: Array  # (m,)
     information: Array  # (m, 6 + nuisances, 6 + nuisances)
-
-
-def nuisance_blocks(site: Site, gain_sigma: float | None = None) -> tuple[Block, ...]:
-    """Return the columns of what is found beside the pose.
-
-    Parameters
-    ----------
-    site : Site
-        The drive phases of its beacons that are not synchronised come first.
-    gain_sigma : float, optional
-        Prior of a log-gain of each beacon; None where gains are known.
-    """
-    blocks: list[Block] = []
-    start = 0
-    for beacon in site.beacons:
-        if not beacon.synchronised:
-            columns = slice(start, start + len(beacon.tones))
-            sigma = np.full(len(beacon.tones), np.inf)
-            blocks.append(Block("phase", beacon.name, "phase", columns, sigma))
-            start = columns.stop
-    for beacon in () if gain_sigma is None else site.beacons:
-        sigma = np.array([gain_sigma])
-        blocks.append(Block("gain", beacon.name, "gain", slice(start, start + 1), sigma))
-        start += 1
-    return tuple(blocks)
-
-
-def problems(
-    samples: FieldSamples,
-    calibration: Calibration,
-    *,
-    gravity: Gravity | None,
-    prior: Trajectory | None,
-    survey_error: bool,
-    free: tuple[str, ...],
-    gain_sigma: float,
-) -> Iterator[Problem]:
-    """Yield the epochs of a log in chunks, weighed.
-
-    Raises
-    ------
-    EstimationError
-        Where there is no epoch.
-    """
-    if len(samples) == 0:
-        raise EstimationError("no epoch to fix: every window was dropped")
-    if not set(free) <= set(FREE):
-        raise ValueError(f"free must be among {FREE}; got {sorted(set(free) - set(FREE))}")
-    if "phase" in free:
-        site = calibration.site
-        loose = tuple(replace(b, synchronised=False) for b in site.beacons)
-        calibration = replace(calibration, site=replace(site, beacons=loose))
-    blocks = nuisance_blocks(calibration.site, gain_sigma if "gain" in free else None)
-    told = None if prior is None else _prior(prior)
-    for start in range(0, len(samples), CHUNK):
-        rows = slice(start, start + CHUNK)
-        some = _rows_of_samples(samples, rows)
-        root, noise = _weights(calibration.site, some, survey_error)
-        yield Problem(
-            calibration=calibration,
-            time=some.time,
-            measured=stacked(some.phasor_sensor),
-            root=root,
-            noise=noise,
-            blocks=blocks,
-            gravity=None if gravity is None else gravity.rows(rows),
-            prior=None if told is None else told.rows(rows),
-        )
-
-
-def _rows_of_samples(samples: FieldSamples, rows: slice) -> FieldSamples:
-    return replace(
-        samples,
-        time=samples.time[rows],
-        window=samples.window[rows],
-        phasor_sensor=samples.phasor_sensor[rows],
-        phasor_cov=samples.phasor_cov[rows],
-    )
-
-
-def _weights(site: Site, samples: FieldSamples, survey_error: bool) -> tuple[Array, Array | None]:
-    """Return the whitening, and the covariance of the whitened noise where the two differ."""
-    valid = samples.valid
-    root = whitening(measurement_cov(site, samples, survey_error=survey_error), valid)
-    if not survey_error:
-        return root, None
-    known = np.where(valid[..., None, None], measurement_cov(site, samples), 0.0)
-    return root, root @ known @ np.swapaxes(root, -1, -2)
 
 
 def refine(
@@ -262,7 +67,7 @@ def refine(
         Where there is no epoch.
     """
     parts, first = [], 0
-    for problem in problems(
+    for epochs in epochs_of(
         samples,
         calibration,
         gravity=gravity,
@@ -271,10 +76,14 @@ def refine(
         free=free,
         gain_sigma=gain_sigma,
     ):
-        rows = slice(first, first + len(problem.time))
+        problem, rows = epochs.problem, slice(first, first + len(epochs.samples))
         first = rows.stop
         at = problem.start(start.world_from_body[rows], start.position_world[rows])
-        parts.append(as_fixes(problem, levenberg_marquardt(problem, at), 1))
+        solved = levenberg_marquardt(problem, at)
+        again = epochs.reweighed(solved.state.rotation, solved.state.position)
+        if again is not None:
+            problem, solved = again, levenberg_marquardt(again, solved.state)
+        parts.append(as_fixes(problem, solved, 1))
     return joined(parts)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError
 from magfusion.fixes.fix import Fixes
-from magfusion.fixes.refine import nuisance_blocks
+from magfusion.fixes.problem import nuisance_blocks
 from magfusion.fixes.survey import survey_jacobians
 from magfusion.fusion.factors import FieldFactors, FieldMeasurements, read_poses
 from magfusion.fusion.inertial import cut_at_epochs, low_passed, preintegrate
@@ -103,6 +103,10 @@ class Smoothed:
     residual : ndarray, shape (n, channels, 6)
         Whitened; NaN where a channel is missing, or with loose coupling.
     start : Start
+    problem : Problem
+        The graph as it was last optimised.
+    values : gtsam.Values
+        States in it.
     rival_chi_square : float, optional
         How much worse the best trajectory from another chain of hypotheses is, after its first
         pass: a small figure means that the log leaves a mirrored trajectory possible.  None where
@@ -124,6 +128,8 @@ class Smoothed:
     calibration_cov: Array
     residual: Array
     start: Start
+    problem: Problem
+    values: gtsam.Values
     rival_chi_square: float | None
     dropped: Mapping[str, int]
     bridged: int
@@ -333,6 +339,8 @@ def _posterior(
         calibration_cov=calibration_cov,
         residual=residual,
         start=job.start,
+        problem=problem,
+        values=found.estimate.values,
         rival_chi_square=job.rival_chi_square,
         dropped=job.source.dropped,
         bridged=bridged,
