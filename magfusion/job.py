@@ -57,6 +57,7 @@ _WRITTEN = {
     "demodulate": _LOG,
     "survey": {"survey.parquet", "survey.png", "report.json"},
     "calibrate beacon": {"site.yaml", "site_field_map.parquet", "beacon.png", "report.json"},
+    "calibrate antenna": {"site.yaml", "site_field_map.parquet", "antenna.png", "report.json"},
     "calibrate fieldmap": {"site.yaml", "site_field_map.parquet", "field_map.png", "report.json"},
     "calibrate magnetometer": {
         "site.yaml",

@@ -23,6 +23,7 @@ FLOORS = (
         "report",
         "job",
         "beacon_plot",
+        "antenna_plot",
         "coverage_plot",
         "fieldmap_plot",
         "magnetometer_plot",
@@ -102,8 +103,9 @@ def test_only_the_view_imports_rerun() -> None:
 
 def test_only_the_plot_imports_matplotlib() -> None:
     assert _importers("matplotlib") <= {
-        "magfusion/coverage_plot.py",
         "magfusion/beacon_plot.py",
+        "magfusion/antenna_plot.py",
+        "magfusion/coverage_plot.py",
         "magfusion/fieldmap_plot.py",
         "magfusion/magnetometer_plot.py",
         "magfusion/match_plot.py",

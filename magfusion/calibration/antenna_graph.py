@@ -65,7 +65,10 @@ def fit_at_uncertain_poses(
     scaled = np.zeros(len(sigma))
     cost = problem.cost(poses, scaled)
     for _ in range(ITERATIONS):
-        net = problem.linearized(poses, scaled).eliminateSequential(problem.ordering)
+        try:
+            net = problem.linearized(poses, scaled).eliminateSequential(problem.ordering)
+        except RuntimeError:  # GTSAM's for a singular system: a pose that its couplings leave open
+            break
         delta = net.optimize()
         share = 1.0
         while True:  # a full step may be too long far from the solution

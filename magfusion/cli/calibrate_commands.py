@@ -18,10 +18,11 @@ from magfusion.cli.app import (
     progress,
     show_result,
 )
+from magfusion.jobs.calibrate_antenna import AntennaSettings, run_calibrate_antenna
 from magfusion.jobs.calibrate_beacon import run_calibrate_beacon
 from magfusion.jobs.calibrate_fieldmap import MapSource, run_calibrate_fieldmap
 from magfusion.jobs.calibrate_magnetometer import run_calibrate_magnetometer
-
+from magfusion.units import DEGREE
 
 
 @calibrate.command()
@@ -41,6 +42,7 @@ def beacon(
     with progress() as report:
         figures = run_calibrate_beacon(survey, site, tuple(beacon or ()), output, report=report)
     show_result(figures, output, as_json)
+
 
 @calibrate.command()
 def fieldmap(
@@ -84,3 +86,29 @@ def magnetometer(
     """Calibrate the magnetometer on a log of slow turning by hand, in the Earth's field."""
     job = log_job("magnetometer", log, site, output, None, None, 50.0, start, end, topics)
     show_result(run_calibrate_magnetometer(job, positions=positions), output, as_json)
+
+
+@calibrate.command()
+def antenna(
+    survey: Annotated[
+        Path, typer.Argument(help="Survey: known poses and the phasors of a three-coil beacon.")
+    ],
+    site: Annotated[Path, typer.Option("--site", help="Site file.")],
+    output: Output = Path("antenna"),
+    beacon: Annotated[
+        str | None, typer.Option(help="Which; default: the only one of three coils.")
+    ] = None,
+    pose_rotation_deg: Annotated[
+        float, typer.Option(help="Error of the survey's attitudes, one sigma an axis; 0: exact.")
+    ] = 0.1,
+    pose_position_m: Annotated[
+        float, typer.Option(help="Error of the survey's positions, one sigma an axis; 0: exact.")
+    ] = 0.0005,
+    sizes: Annotated[
+        bool, typer.Option("--sizes", help="Estimate the coils' size too (for the report alone).")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate a tracker's antennas at known poses: moments, axes and centres of all six coils."""
+    settings = AntennaSettings(beacon, pose_rotation_deg * DEGREE, pose_position_m, sizes)
+    show_result(run_calibrate_antenna(survey, site, settings, output), output, as_json)

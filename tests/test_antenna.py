@@ -1,0 +1,415 @@
+"""The antennas' model and calibration: the one measurement model, derivatives, ranks, fits."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from derivatives import central_difference
+from scipy.spatial.transform import Rotation
+from tracker_antennas import (
+    Config,
+    Errors,
+    draw_antennas,
+    draw_survey,
+    noise_sigma,
+    nominal,
+    random_poses,
+    usual_prior,
+)
+from tracker_site import body_poses, in_beacon, tracker_site
+from tracker_table1 import POSITION_BEACON, TABLE, one_of
+
+from magfusion.antenna import (
+    KAPPAS,
+    Antenna,
+    antenna_from_vector,
+    antenna_of,
+    observe_antenna,
+)
+from magfusion.calibration.antenna import (
+    AntennaFit,
+    AntennaSurvey,
+    fit_at_known_poses,
+    prior_sigma,
+)
+from magfusion.calibration.antenna_bench import (
+    bench_points,
+    bursa_wolf_matrix,
+    helmert,
+    mean_shift,
+    measure,
+    shift_as_printed,
+)
+from magfusion.calibration.antenna_graph import fit_at_uncertain_poses
+from magfusion.calibration.antenna_observability import Observability, observability
+from magfusion.errors import EstimationError, InputError
+from magfusion.fixes.tracker import attitude_from_angles
+from magfusion.observation import Observation, observe, observe_from, predict
+from magfusion.physics.dipole import dipole_field
+from magfusion.site import Magnetometer
+from magfusion.units import DEGREE
+
+
+def tracker() -> Antenna:
+    """Return one antenna of plausible errors."""
+    return draw_antennas(Errors(0.01, 0.5, 2e-3), 1, np.random.default_rng(1)).at(0)
+
+
+def sized(antenna: Antenna) -> Antenna:
+    return antenna_from_vector(np.concatenate([antenna.vector(), [5e-4, 3e-4]]))
+
+
+# The model
+
+
+def test_it_is_the_one_measurement_model() -> None:
+    rng = np.random.default_rng(0)
+    site = tracker_site(rng, gain=0.1, tilt=0.1, centre=0.01)
+    beacon, sensor = site.beacons[0], site.platform.magnetometer
+    attitude, place = body_poses(site, 6, rng)
+    seen = observe_antenna(antenna_of(beacon, sensor), *in_beacon(site, attitude, place))
+    turned_back = np.exp(-0.3j * np.arange(3))[:, None]  # of the coils' own phases
+    whole = observe(beacon, sensor, attitude, place)
+    for found in (whole.phasor_sensor, predict(beacon, sensor, attitude, place)):
+        coupling = np.swapaxes(found * turned_back, 1, 2)
+        atol = 1e-13 * np.max(seen.value)
+        np.testing.assert_allclose(coupling, seen.value, rtol=0, atol=atol)
+    # Of the sensor's pose, as observe has it of the mounting; its coils' centres turn with it.
+    by_mounting = np.swapaxes(whole.body_from_sensor * turned_back[..., None], 1, 2)
+    atol = 1e-12 * np.max(np.abs(seen.pose))
+    np.testing.assert_allclose(by_mounting, seen.pose, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("antenna", [tracker(), sized(tracker())], ids=["points", "sized"])
+def test_derivatives_of_the_antennas(antenna: Antenna) -> None:
+    rotation, position = random_poses((5,), np.random.default_rng(2))
+    seen, vector = observe_antenna(antenna, rotation, position), antenna.vector()
+
+    def by_antenna(step: np.ndarray) -> np.ndarray:
+        moved = antenna_from_vector(vector + step)
+        return observe_antenna(moved, rotation, position).value
+
+    def by_pose(step: np.ndarray) -> np.ndarray:
+        turn = rotation @ Rotation.from_rotvec(step[:3]).as_matrix()
+        return observe_antenna(antenna, turn, position + rotation @ step[3:]).value
+
+    groups = [(seen.antenna, by_antenna, 1e-5), (seen.pose, by_pose, 1e-5)]
+    for found, function, step in groups:
+        expected = central_difference(function, found.shape[-1], step)
+        scale = np.max(np.abs(expected), axis=(0, 1, 2))
+        np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=3e-7)
+
+
+def test_many_antennas_at_once() -> None:
+    antennas = draw_antennas(Errors(0.01, 0.5, 2e-3), 4, np.random.default_rng(3))
+    rotation, position = random_poses((4, 7), np.random.default_rng(4))
+    together = observe_antenna(antennas.at(np.s_[:, None]), rotation, position)
+    for k in range(4):
+        alone = observe_antenna(antennas.at(k), rotation[k], position[k])
+        for found, expected in zip(together, alone, strict=True):
+            np.testing.assert_allclose(found[k], expected, rtol=1e-12, atol=1e-22)
+
+
+def test_a_beacon_of_two_coils_is_no_tracker() -> None:
+    site = tracker_site(np.random.default_rng(0))
+    flat = replace(site.beacons[0], coils=site.beacons[0].coils[:2])
+    with pytest.raises(InputError, match=r"beacon T has 2 coils in 2 tones .* needs three"):
+        antenna_of(flat, site.platform.magnetometer)
+
+
+# Coils of their own in the general model
+
+
+def _observe(sensor: Magnetometer) -> tuple[Observation, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(5)
+    site = tracker_site(rng, centre=0.01)
+    attitude, place = body_poses(site, 4, rng)
+    twist = rng.standard_normal((4, 6))
+    return observe(site.beacons[0], sensor, attitude, place, None, twist), attitude, place
+
+
+def test_coils_at_one_place_change_nothing() -> None:
+    sensor = tracker_site(np.random.default_rng(5), centre=0.0).platform.magnetometer
+    plain, _, _ = _observe(sensor)
+    apart, _, _ = _observe(replace(sensor, coil_centres_sensor=np.zeros((3, 3))))
+    for name, value in vars(plain).items():
+        np.testing.assert_allclose(getattr(apart, name), value, rtol=1e-12, atol=1e-22)
+    # All three moved alike are a lever arm.
+    shift = np.array([0.01, -0.02, 0.03])
+    arm = sensor.position_body + sensor.body_from_sensor @ shift
+    moved, _, _ = _observe(replace(sensor, coil_centres_sensor=np.tile(shift, (3, 1))))
+    lever, _, _ = _observe(replace(sensor, position_body=arm))
+    for name in ("phasor_sensor", "platform_pose", "beacon_pose", "matrix", "time_offset"):
+        np.testing.assert_allclose(getattr(moved, name), getattr(lever, name), rtol=1e-9)
+
+
+def test_derivatives_with_coils_apart() -> None:
+    rng = np.random.default_rng(5)
+    site = tracker_site(rng, centre=0.01)
+    beacon, sensor = site.beacons[0], site.platform.magnetometer
+    seen, attitude, place = _observe(sensor)
+
+    def turn(matrix: np.ndarray, step: np.ndarray) -> np.ndarray:
+        return matrix @ Rotation.from_rotvec(step).as_matrix()
+
+    def platform(step: np.ndarray) -> np.ndarray:
+        return predict(beacon, sensor, turn(attitude, step[:3]), place + attitude @ step[3:])
+
+    def mounting(step: np.ndarray) -> np.ndarray:
+        moved = replace(
+            sensor,
+            body_from_sensor=turn(sensor.body_from_sensor, step[:3]),
+            position_body=sensor.position_body + sensor.body_from_sensor @ step[3:],
+        )
+        return predict(beacon, moved, attitude, place)
+
+    def source(step: np.ndarray) -> np.ndarray:
+        moved = replace(
+            beacon,
+            world_from_beacon=turn(beacon.world_from_beacon, step[:3]),
+            position_world=beacon.position_world + beacon.world_from_beacon @ step[3:],
+        )
+        return predict(moved, sensor, attitude, place)
+
+    def matrix(step: np.ndarray) -> np.ndarray:
+        moved = replace(sensor, matrix=sensor.matrix + step.reshape(3, 3))
+        return predict(beacon, moved, attitude, place)
+
+    def moments(step: np.ndarray) -> np.ndarray:
+        coils = tuple(
+            replace(coil, moment_beacon=coil.moment_beacon * np.exp(change))
+            for coil, change in zip(beacon.coils, step, strict=True)
+        )
+        return predict(replace(beacon, coils=coils), sensor, attitude, place)
+
+    for found, function in (
+        (seen.platform_pose, platform),
+        (seen.body_from_sensor, mounting),
+        (seen.beacon_pose, source),
+        (seen.matrix, matrix),
+        (seen.log_moments, moments),
+    ):
+        expected = central_difference(function, found.shape[-1], 1e-6)
+        atol = 1e-8 * np.max(np.abs(expected))
+        np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
+    np.testing.assert_array_equal(observe_from(beacon, sensor, attitude, place)[0].shape, (4, 3, 3))
+    np.testing.assert_allclose(
+        observe_from(beacon, sensor, attitude, place)[1], seen.platform_pose, rtol=1e-12
+    )
+
+
+# The bench
+
+
+def bench_fields(moments: np.ndarray, centres: np.ndarray, distance: float) -> np.ndarray:
+    offset = bench_points(distance) - centres[:, None, None, :]
+    return dipole_field(offset, moments[:, None, None, :])
+
+
+def test_six_points_see_all_of_a_centre_and_four_not_the_axis() -> None:
+    antenna, distance = tracker(), 0.3
+    fields = bench_fields(antenna.moments_beacon, antenna.centres_beacon, distance)
+    six = measure(fields, distance, on_axis=True)
+    four = measure(fields, distance, on_axis=False)
+    # What is left is of the second order in the offset over the distance.
+    second = 6.0 * np.max(np.linalg.norm(antenna.centres_beacon, axis=1) / distance) ** 2
+    assert second < 0.01
+    tilt = np.max(np.abs(antenna.moments_beacon * (1.0 - np.eye(3))))
+    atol = 2.0 * tilt * np.max(np.abs(antenna.centres_beacon))  # the axes err too
+    np.testing.assert_allclose(six.centres, antenna.centres_beacon, rtol=0, atol=atol)
+    np.testing.assert_allclose(six.moments, antenna.moments_beacon, rtol=0, atol=second)
+    np.testing.assert_allclose(four.moments, antenna.moments_beacon, rtol=0, atol=second)
+    np.testing.assert_array_equal(np.diagonal(four.centres), 0.0)
+    across = ~np.eye(3, dtype=bool)
+    np.testing.assert_array_equal(four.centres[across], six.centres[across])
+
+
+def test_the_printed_sum_doubles_a_common_offset() -> None:
+    common = np.array([1e-3, -2e-3, 3e-3])
+    centres = np.tile(common, (3, 1))
+    np.testing.assert_allclose(shift_as_printed(centres), 2.0 * common, rtol=1e-14)
+    np.testing.assert_allclose(mean_shift(centres), common, rtol=1e-14)
+
+
+def test_bursa_and_wolf() -> None:
+    rotation = np.array([0.02, -0.03, 0.05])  # rad
+    square = float(rotation @ rotation)
+    size = np.linalg.svd(bursa_wolf_matrix(rotation), compute_uv=False)
+    np.testing.assert_allclose(size, [np.sqrt(1.0 + square)] * 2 + [1.0], rtol=1e-14)
+    turn = Rotation.from_rotvec(rotation).as_matrix()
+    np.testing.assert_allclose(helmert(2.0 * turn.T), rotation, rtol=0, atol=square**1.5)
+    assert np.max(np.abs(helmert(np.diag([1.0, 1.1, 0.9])))) == 0.0  # gains are no rotation
+
+
+# What is observable
+
+
+def _survey(rotation: np.ndarray, position: np.ndarray) -> AntennaSurvey:
+    sigma = noise_sigma(60.0, np.linalg.norm(position, axis=-1))
+    return AntennaSurvey(rotation, position, np.zeros((len(sigma), 3, 3)), sigma)
+
+
+def _varied(number: int = 30) -> AntennaSurvey:
+    return _survey(*random_poses((number,), np.random.default_rng(6)))
+
+
+def _nullity(found: Observability) -> int:
+    return found.parameters - found.rank
+
+
+GAIN = "the share of moments and sensitivities in their product"
+
+
+def test_known_poses_leave_one_gain() -> None:
+    found = observability(_varied(), tracker())
+    assert (found.rank, found.null_space) == (35, (GAIN,))
+    assert found.fewest_poses == 4
+    assert found.singular[35] < 1e-13 < 1e-3 < found.singular[34]
+    with_sizes = observability(_varied(), sized(tracker()))
+    assert (with_sizes.parameters, with_sizes.rank) == (38, 37)
+
+
+def test_one_position_leaves_two_and_one_attitude_four() -> None:
+    rotation, position = random_poses((30,), np.random.default_rng(6))
+    one_position = _survey(rotation, np.tile(POSITION_BEACON, (30, 1)))
+    assert observability(one_position, tracker()).rank == 34
+    attitudes = np.swapaxes(attitude_from_angles(TABLE[:, 0] * DEGREE), 1, 2)
+    table = _survey(attitudes, np.tile(POSITION_BEACON, (13, 1)))
+    found = observability(table, tracker())
+    assert found.rank == 34
+    assert 1e-5 < found.singular[33] < 1e-2  # barely seen
+    one_attitude = _survey(np.tile(rotation[0], (30, 1, 1)), position)
+    found = observability(one_attitude, tracker())
+    assert found.rank == 32
+    assert found.null_space == (GAIN, "shift of both antennas' centres together (3)")
+
+
+def test_unknown_poses_leave_frames_and_scale() -> None:
+    survey, antenna = _varied(), tracker()
+    no_attitude = observability(survey, antenna, attitudes_known=False)
+    assert _nullity(no_attitude) == 4
+    assert no_attitude.null_space == (GAIN, "rotation of the receiver's frame (3)")
+    no_position = observability(survey, antenna, positions_known=False)
+    assert _nullity(no_position) == 8
+    nothing = observability(survey, antenna, attitudes_known=False, positions_known=False)
+    assert (_nullity(nothing), nothing.rank, nothing.fewest_poses) == (14, 22, 8)
+    assert len(nothing.null_space) == 6
+    assert "the scale of all lengths" in nothing.null_space
+
+
+def test_centred_antennas() -> None:
+    known = observability(_varied(), nominal(), centred=True)
+    assert (known.parameters, _nullity(known)) == (18, 1)
+    unknown = observability(
+        _varied(), nominal(), centred=True, attitudes_known=False, positions_known=False
+    )
+    assert _nullity(unknown) == 8
+
+
+def test_what_has_no_name_is_told_by_its_parts() -> None:
+    rotation, _ = random_poses((30,), np.random.default_rng(6))
+    found = observability(_survey(rotation, np.tile(POSITION_BEACON, (30, 1))), tracker())
+    assert found.null_space[0] == GAIN
+    assert found.null_space[1].startswith("1 more, in moments")
+
+
+# Fits
+
+
+def at_unknown_poses(survey: AntennaSurvey, start: Antenna, sigma: np.ndarray) -> AntennaFit:
+    return fit_at_uncertain_poses(survey, start, sigma, np.inf, np.inf)
+
+
+def test_the_fit_is_exact_without_noise() -> None:
+    """But for the one gain that no couplings tell: its product with the other is."""
+    config = Config(snr_db=140.0, antennas=3, poses=20, pose_deg=0.0, pose_m=0.0)
+    rng = np.random.default_rng(7)
+    truth = draw_antennas(config.errors, 3, rng)
+    survey = draw_survey(truth, config, rng)
+    fit = fit_at_known_poses(survey, nominal(), usual_prior(config.errors))
+    found, true = fit.antenna, truth
+    np.testing.assert_allclose(found.centres_beacon, true.centres_beacon, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(found.centres_sensor, true.centres_sensor, rtol=0, atol=1e-7)
+    for k in range(3):
+        product = np.kron(found.moments_beacon[k], found.sensitivities_sensor[k])
+        expected = np.kron(true.moments_beacon[k], true.sensitivities_sensor[k])
+        np.testing.assert_allclose(product, expected, rtol=0, atol=1e-6)
+
+
+def test_the_covariance_is_honest() -> None:
+    """NEES of 60 antennas of 36 parameters: 1 within three of its standard errors."""
+    config = Config(errors=Errors(0.005, 0.12, 0.5e-3), antennas=60, pose_deg=0.0, pose_m=0.0)
+    rng = np.random.default_rng(8)
+    truth = draw_antennas(config.errors, config.antennas, rng)
+    survey = draw_survey(truth, config, rng)
+    fit = fit_at_known_poses(survey, nominal(), usual_prior(config.errors))
+    off = fit.antenna.vector() - truth.vector()
+    nees = np.einsum("ni,nij,nj->n", off, np.linalg.inv(fit.cov), off) / 36.0
+    # The prior is four times as wide as the draws along the one gain: 35 parameters count whole.
+    assert np.mean(nees) == pytest.approx(35.0 / 36.0, abs=3.0 * np.sqrt(2.0 / 36.0 / 60.0))
+    assert np.mean(fit.chi2 / fit.dof) == pytest.approx(0.9, abs=0.03)
+
+
+def test_the_graph_with_sure_poses_is_least_squares() -> None:
+    config = Config(antennas=1, pose_deg=0.0, pose_m=0.0)
+    rng = np.random.default_rng(9)
+    truth = draw_antennas(config.errors, 1, rng)
+    survey, prior = draw_survey(truth, config, rng), usual_prior(config.errors)
+    exact = fit_at_known_poses(survey, nominal(), prior)
+    graph = fit_at_uncertain_poses(one_of(survey, 0), nominal(), prior, 1e-8, 1e-9)
+    apart = (graph.antenna.vector() - exact.antenna.vector()[0]) / prior
+    assert np.max(np.abs(apart)) < 1e-4
+    np.testing.assert_allclose(np.diagonal(graph.cov), np.diagonal(exact.cov[0]), rtol=1e-3)
+    assert graph.chi2 == pytest.approx(exact.chi2[0], rel=1e-4)
+
+
+def test_self_calibration_finds_shapes_and_mends_the_poses() -> None:
+    """With no pose known at all: what no frame or scale changes, from poses a degree wrong."""
+    config = Config(errors=Errors(0.01, 0.5, 1e-3), antennas=1, poses=30, pose_deg=1.0, pose_m=3e-3)
+    rng = np.random.default_rng(10)
+    truth = draw_antennas(config.errors, 1, rng)
+    survey = one_of(draw_survey(truth, config, rng), 0)
+    fit = fit_at_uncertain_poses(survey, nominal(), usual_prior(config.errors), np.inf, np.inf)
+    assert fit.dof == 9 * 30 - 6 * 30
+
+    def angles(coils: np.ndarray) -> np.ndarray:
+        unit = coils / np.linalg.norm(coils, axis=-1, keepdims=True)
+        return np.asarray((unit @ unit.T)[np.triu_indices(3, 1)])
+
+    for found, true in (
+        (fit.antenna.moments_beacon, truth.moments_beacon[0]),
+        (fit.antenna.sensitivities_sensor, truth.sensitivities_sensor[0]),
+    ):
+        error = np.sqrt(np.mean((angles(found) - angles(true)) ** 2)) / DEGREE
+        assert error < 0.06 < np.sqrt(np.mean(angles(true) ** 2)) / DEGREE
+    assert np.mean(fit.chi2) / fit.dof == pytest.approx(1.0, abs=0.35)
+
+
+def test_sizes_are_found() -> None:
+    rng = np.random.default_rng(11)
+    rotation, position = random_poses((40,), rng, nearest=0.15, farthest=0.3)
+    truth = sized(tracker())
+    sigma = noise_sigma(80.0, np.linalg.norm(position, axis=-1))
+    seen = observe_antenna(truth, rotation, position).value
+    seen = seen + sigma[:, None, None] * rng.standard_normal(seen.shape)
+    survey = AntennaSurvey(rotation, position, seen, sigma)
+    start = antenna_from_vector(np.concatenate([nominal().vector(), np.zeros(2)]))
+    prior = prior_sigma(start, gain=0.05, tilt=0.05, centre=0.01, kappa=1e-3)
+    fit = fit_at_known_poses(survey, start, prior)
+    error = (fit.antenna.vector() - truth.vector())[KAPPAS]
+    sigma_kappa = np.sqrt(np.diagonal(fit.cov))[KAPPAS]
+    assert np.all(np.abs(error) < 3.0 * sigma_kappa)
+    assert np.all(sigma_kappa < 0.1 * truth.vector()[KAPPAS])
+
+
+@pytest.mark.parametrize("fit", [fit_at_known_poses, at_unknown_poses])
+def test_nonsense_does_not_converge(
+    fit: Callable[[AntennaSurvey, Antenna, np.ndarray], AntennaFit],
+) -> None:
+    survey = _varied(10)
+    noise = np.random.default_rng(12).standard_normal((10, 3, 3))
+    survey = replace(survey, coupling=1e4 * survey.sigma[:, None, None] * noise)
+    prior = prior_sigma(nominal(), 1.0, 1.0, 0.2)
+    with pytest.raises(EstimationError, match="does not converge"):
+        fit(survey, nominal(), prior[:36])

@@ -1,0 +1,158 @@
+"""Paper 000, Table 1 and the near field, against the independent analysis, over pooled draws."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tracker_near_field
+import tracker_table1
+from tracker_antennas import Errors
+from tracker_near_field import learn_sizes
+from tracker_table1 import SCENARIO_A, SCENARIO_COMMON, SCENARIO_E, SCENARIO_F2, Row
+
+
+@pytest.fixture(scope="module")
+def independent() -> dict[str, Row]:
+    return {row.level: row for row in tracker_table1.run_levels(SCENARIO_A)}
+
+
+@pytest.fixture(scope="module")
+def near() -> tuple[tracker_near_field.Row, ...]:
+    return tracker_near_field.run(tracker_near_field.Config())
+
+
+@pytest.mark.parametrize(
+    ("name", "ratio"),
+    [
+        ("mean of 39 angles", 4.48),
+        ("RMS of 39 angles", 4.47),
+        ("largest", 5.33),
+        ("geodesic RMS", 4.58),
+        ("RMS without the pole", 4.38),
+    ],
+)
+def test_the_printed_table_has_these_ratios(name: str, ratio: float) -> None:
+    assert tracker_table1.printed_ratios()[name][2] == pytest.approx(ratio, abs=0.01)
+
+
+def test_rigid_calibration_does_not_help_independent_errors(independent: dict[str, Row]) -> None:
+    assert independent["U"].attitude_deg == pytest.approx(0.89, abs=0.07)
+    assert independent["P1"].ratio == pytest.approx(1.03, abs=0.06)
+    assert independent["P2"].ratio == pytest.approx(1.03, abs=0.06)
+
+
+def test_six_points_and_the_joint_fit_reach_the_papers_factor(independent: dict[str, Row]) -> None:
+    ratios = [independent[level].ratio for level in ("P2", "P3", "P4", "P6", "J")]
+    assert ratios == sorted(ratios)
+    assert independent["P6"].ratio == pytest.approx(5.1, abs=0.6)
+    assert independent["J"].ratio == pytest.approx(6.8, abs=0.8)
+    assert independent["J"].attitude_deg <= independent["P6"].attitude_deg
+
+
+def test_the_papers_calibration_helps_against_its_own_error() -> None:
+    rows = {row.level: row for row in tracker_table1.run_levels(SCENARIO_F2)}
+    assert rows["P2"].ratio == pytest.approx(4.6, abs=0.6)
+    assert rows["P1"].ratio == pytest.approx(rows["P2"].ratio, rel=0.02)
+
+
+def test_the_printed_sum_of_offsets_mends_nothing() -> None:
+    rows = {row.level: row for row in tracker_table1.run_levels(SCENARIO_COMMON)}
+    assert rows["P1"].position_mm == pytest.approx(7.1, abs=0.5)
+    assert rows["P2"].position_mm == pytest.approx(0.30, abs=0.05)
+
+
+@pytest.mark.parametrize("errors", [Errors(gain=0.01), Errors(tilt_deg=0.3)], ids=["gain", "tilt"])
+def test_single_causes_are_beyond_a_rigid_calibration(errors: Errors) -> None:
+    config = replace(SCENARIO_A, errors=errors, snr_db=65.0, antennas=100)
+    rows = {row.level: row for row in tracker_table1.run_levels(config)}
+    assert 0.95 < rows["P2"].ratio < 1.2
+    assert rows["P3"].ratio > 4.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("snr_db", "most"), [(60.0, 0.8), (65.0, 0.65)])
+def test_uncertain_poses_belong_in_the_graph(snr_db: float, most: float) -> None:
+    found = tracker_table1.run_uncertain(replace(SCENARIO_E, snr_db=snr_db))
+    assert found.graph_to_exact <= most
+    assert found.improvement >= 6.0
+    assert 0.85 <= found.chi2_per_dof <= 1.1
+    # Of 36 parameters and 200 antennas; one gain is left to the prior, four times too wide.
+    assert found.nees == pytest.approx(35.0 / 36.0, abs=3.0 * np.sqrt(2.0 / 36.0 / 200.0))
+
+
+def test_uncertain_poses_belong_in_the_graph_on_a_few_antennas() -> None:
+    found = tracker_table1.run_uncertain(replace(SCENARIO_E, antennas=30))
+    assert found.graph_to_exact <= 0.8
+    assert found.improvement >= 6.0
+    assert 0.85 <= found.chi2_per_dof <= 1.1
+    assert found.volume_position_mm < 1.1
+    assert found.volume_attitude_deg < 0.16
+
+
+def test_the_dipole_errs_with_the_square_of_the_size(
+    near: tuple[tracker_near_field.Row, ...],
+) -> None:
+    ten = next(r for r in near if (r.shape, r.receiver, r.ratio) == ("circle", 1.0, 10.0))
+    assert ten.dipole_deg == pytest.approx(0.52, abs=0.12)
+    assert tracker_near_field.slope(near) == pytest.approx(-2.0, abs=0.15)
+    closest = [r.dipole_deg for r in near if r.ratio == 1.5]
+    assert min(closest) > 10.0
+
+
+def test_one_term_repairs_it(near: tuple[tracker_near_field.Row, ...]) -> None:
+    for row in near:
+        if row.ratio >= 10.0:
+            assert row.sized_deg is not None
+            assert row.sized_deg < 0.005
+        if row.ratio == 5.0:
+            assert row.sized_deg is not None
+            assert row.sized_deg < 0.05
+
+
+def test_the_exact_coupling_is_that_of_biot_and_savart() -> None:
+    """A small receiving loop sees the field of the loop, another code."""
+    from magfusion.physics.solenoid import loop_field
+
+    place, size = np.array([[0.1, 0.05, 0.2]]), tracker_near_field.SIZE
+    seen = tracker_near_field.exact_couplings("circle", 1e-2, np.eye(3)[None], place)[0]
+    for j, axis in enumerate(np.eye(3)):
+        field = loop_field(place, axis, 0.5 * size)[0]
+        np.testing.assert_allclose(seen[:, j], field, rtol=0, atol=1e-5 * np.max(field))
+
+
+def test_a_calibration_finds_the_sizes() -> None:
+    found = learn_sizes(tracker_near_field.Config())
+    assert found == pytest.approx((1.0, 1.0), abs=0.05)
+
+
+def _last_line(
+    scenario: str,
+    main: object,
+    options: list[str],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> dict[str, object]:
+    monkeypatch.setattr(sys, "argv", [scenario, *options])
+    main()  # type: ignore[operator]
+    return dict(json.loads(capsys.readouterr().out.splitlines()[-1]))
+
+
+def test_table_1_ends_with_one_json_line_and_draws(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = ["--quick", "-o", str(tmp_path / "out")]
+    found = _last_line("table1", tracker_table1.main, options, capsys, monkeypatch)
+    assert found.keys() == {"printed", "A", "F2", "common", "E"}
+    assert (tmp_path / "out" / "tracker_table1.png").stat().st_size > 10_000
+
+
+def test_the_near_field_ends_with_one_json_line_and_draws(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = ["--seed", "3", "-o", str(tmp_path)]
+    found = _last_line("near", tracker_near_field.main, options, capsys, monkeypatch)
+    assert found["slope"] == pytest.approx(-2.0, abs=0.15)
+    assert (tmp_path / "tracker_near_field.png").stat().st_size > 10_000
