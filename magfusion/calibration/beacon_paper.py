@@ -36,6 +36,8 @@ class PrintedCalibration:
         Transpose of the least-squares matrix of Eq 19, in general no rotation.
     angles : ndarray, shape (runs, 3)
         psi, gamma, lambda of Eq 21 (rad).
+    distance : ndarray, shape (runs, magnetometers)
+        From the centre (m); one below zero tells that the directions fit no beacon.
     alarm : ndarray, shape (runs,)
         What the law of cosines leaves (m^2), root of the mean square; zero for three magnetometers.
     """
@@ -43,6 +45,7 @@ class PrintedCalibration:
     centre_world: Array
     world_from_beacon: Array
     angles: Array
+    distance: Array
     alarm: Array
 
 
@@ -166,6 +169,7 @@ def calibrate_as_printed(
         centre_world=centre,
         world_from_beacon=world_from_beacon,
         angles=angles_as_printed(world_from_beacon),
+        distance=distance,
         alarm=np.sqrt(np.mean(residual**2, axis=-1)),
     )
 

@@ -5,13 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.calibration.beacon import BeaconFits, BeaconMeasurements
+from magfusion.calibration.beacon import BeaconFits, BeaconMeasurements, calibrate_beacon
 from magfusion.calibration.least_squares import minimise
 from magfusion.fixes.candidates import wahba
 from magfusion.observation import observe
 from magfusion.site import Beacon, BeaconSigma
 from magfusion.units import Array, ComplexArray, IntArray
 
+TURNS = 8  # each leaves the offset over the distance of the error, some hundredths
 OPEN = 0.1  # of the moment that a turn moves, below which it goes with the drive phase
 
 
@@ -104,6 +105,27 @@ def open_axes(beacon: Beacon) -> Array:
 
 def _parts(columns: ComplexArray) -> Array:
     return np.concatenate([columns.real, columns.imag])
+
+
+def calibrate_one(measured: BeaconMeasurements, reach: float) -> tuple[BeaconFits, RefinedBeacon]:
+    """Calibrate a beacon whose coils may have centres of their own, from one run.
+
+    Their offsets turn with the attitude that is to be found: the fit is repeated with what it
+    found until that stays.
+
+    Parameters
+    ----------
+    measured : BeaconMeasurements
+    reach : float
+        As in `magfusion.calibration.beacon.calibrate_beacon` (m).
+    """
+    declared = measured.beacon
+    for _ in range(TURNS if declared.centres_beacon.any() else 1):
+        fits = calibrate_beacon(measured, reach)
+        found, _ = attitudes(measured.beacon, fits.moments_world)
+        used = measured
+        measured = replace(measured, beacon=replace(declared, world_from_beacon=found[0]))
+    return fits, refine(used, fits)
 
 
 def refine(measured: BeaconMeasurements, fits: BeaconFits, run: int = 0) -> RefinedBeacon:

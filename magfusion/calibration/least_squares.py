@@ -9,7 +9,7 @@ from magfusion.units import Array, IntArray
 Model = Callable[[IntArray, Array], tuple[Array, Array]]
 
 PASSES = 100
-SETTLED = 1e-13  # relative fall of the cost below which a problem is solved
+SETTLED = 1e-11  # relative fall of the cost below which a problem is solved
 STUCK = 1e9  # damping above which no step helps
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.beacon_plot import BeaconPanel, write_beacon_plot
-from magfusion.calibration.beacon import REACH, BeaconFits, BeaconMeasurements, calibrate_beacon
-from magfusion.calibration.beacon_refined import RefinedBeacon, refine
+from magfusion.calibration.beacon import REACH, BeaconFits, BeaconMeasurements
+from magfusion.calibration.beacon_refined import RefinedBeacon, calibrate_one
 from magfusion.errors import InputError
 from magfusion.job import claim, named
 from magfusion.observation import model_error_cov, predict
@@ -131,8 +131,7 @@ def _calibrated(site: Site, beacon: Beacon, survey: Survey) -> _Calibrated:
         np.stack([total, total], axis=-1)[heard],
     )
     reach = float(np.clip(3.0 * np.max(beacon.sigma.position_world), REACH, FARTHEST))
-    fits = calibrate_beacon(measured, reach)
-    return _Calibrated(measured, fits, refine(measured, fits), survey.point[heard])
+    return _Calibrated(measured, *calibrate_one(measured, reach), survey.point[heard])
 
 
 def _residual(found: _Calibrated) -> Array:
