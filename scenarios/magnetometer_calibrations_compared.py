@@ -5,9 +5,9 @@ sensors (scale 8 %, misalignment 0.02, offset 60 mG) and asks for the error of t
 field that the calibrated sensor gives, all round the sphere:
 
 1. How much do noise, a tilted table, a wrong reference field and a wrong heading cost?  Reference
-   and heading nothing: they are a pure scale.  A tilt of one degree costs 0.8 degrees.
-2. Least squares over the same readings takes a tenth off.  A graph that lets each position tilt,
-   and reads an accelerometer in each, takes two thirds off.
+   and heading nothing: they are a pure scale.  A tilt of one degree costs 0.7 degrees.
+2. Least squares over the same readings takes a tenth off.  A graph that lets each position be off,
+   and reads an accelerometer in each, takes half off at half a degree and more beyond.
 3. Without a turntable, by turning the sensor by hand: the ellipsoid alone leaves a degree, because
    it does not see by which rotation it became a sphere; with the vertical beside each reading a
    tenth of that; the graph, which weighs the two by the noise they share, half of it again.
