@@ -1,0 +1,62 @@
+"""The fix command: what it finds beside the pose, and what it says of rival poses."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from conftest import Refuse, Worked, run_command
+
+from magfusion.site_file import load_site, save_site
+
+
+def report_of(run: Path) -> dict[str, object]:
+    found: dict[str, object] = json.loads((run / "report.json").read_text())
+    return found
+
+
+def test_free_phases_and_gains_make_a_fix_less_sure(worked: Worked, tmp_path: Path) -> None:
+    run_command("fix", worked.log, "-o", tmp_path / "free", "--free", "phase,gain")
+    held, free = (report_of(run) for run in (worked.fixes, tmp_path / "free"))
+    assert free["epochs"] == held["epochs"]
+    assert float(str(free["ate_m"])) > float(str(held["ate_m"]))
+    cov = [
+        pq.read_table(run / "trajectory.parquet", columns=["cov_33"]).column(0).to_numpy()
+        for run in (worked.fixes, tmp_path / "free")
+    ]
+    assert (cov[1] > cov[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [
+        (("--free", "phase,matrix"), "matrix"),
+        (("--free", ""), "nothing"),
+        (("--free", "gain", "--method", "paper-lines"), "--free belongs to --method likelihood"),
+    ],
+)
+def test_what_cannot_be_free_is_refused(
+    options: tuple[str, ...], found: str, worked: Worked, tmp_path: Path, refuse: Refuse
+) -> None:
+    assert found in refuse("fix", worked.log, "-o", tmp_path / "run", *options)
+
+
+def test_rivals_are_told_in_the_report_the_table_and_on_the_screen(
+    worked: Worked, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    site = load_site(worked.log / "site.yaml")
+    save_site(replace(site, beacons=site.beacons[1:2]), tmp_path / "site.yaml")
+    run_command("fix", worked.log, "--site", tmp_path / "site.yaml", "-o", tmp_path / "run")
+    figures = report_of(tmp_path / "run")
+    sentences = figures["ambiguity"]
+    assert isinstance(sentences, list)
+    name = site.beacons[1].name
+    assert any(f"on the opposite side of beacon {name}" in sentence for sentence in sentences)
+    assert int(str(figures["ambiguity_mirror_epochs"])) > 0
+    out = capfd.readouterr().out
+    assert all(sentence in out for sentence in sentences)
+    table = pq.read_table(tmp_path / "run" / "fixes.parquet").to_pydict()
+    best = [r for r, h in zip(table["relation"], table["hypothesis"], strict=True) if h == 0]
+    assert set(best) == {"best"}
+    assert f"mirror {name}" in table["relation"]
