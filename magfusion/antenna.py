@@ -66,9 +66,9 @@ class Antenna:
             parts += [np.asarray(self.kappa_sensor)[..., None]]
         return np.concatenate(parts, axis=-1)
 
-    def at(self, index: object) -> "Antenna":
+    def at(self, index: int | tuple[int | slice | None, ...]) -> "Antenna":
         """Return some of many antennas, or the same with other leading axes."""
-        return antenna_from_vector(self.vector()[index])  # type: ignore[index]
+        return antenna_from_vector(np.asarray(self.vector()[index]))
 
 
 def antenna_from_vector(vector: Array) -> Antenna:

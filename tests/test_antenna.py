@@ -32,6 +32,7 @@ from magfusion.calibration.antenna import (
     AntennaSurvey,
     fit_at_known_poses,
     prior_sigma,
+    with_receiver_gain,
 )
 from magfusion.calibration.antenna_bench import (
     bench_points,
@@ -349,6 +350,34 @@ def test_the_covariance_is_honest() -> None:
     # The prior is four times as wide as the draws along the one gain: 35 parameters count whole.
     assert np.mean(nees) == pytest.approx(35.0 / 36.0, abs=3.0 * np.sqrt(2.0 / 36.0 / 60.0))
     assert np.mean(fit.chi2 / fit.dof) == pytest.approx(0.9, abs=0.03)
+
+
+def test_a_held_gain_leaves_only_errors_of_couplings() -> None:
+    config = Config(antennas=60, pose_deg=0.0, pose_m=0.0)
+    rng = np.random.default_rng(13)
+    truth = draw_antennas(config.errors, config.antennas, rng)
+    survey, prior = draw_survey(truth, config, rng), 10.0 * usual_prior(config.errors)
+    rotation, position = random_poses((5,), rng)
+    normalised = []
+    for k in range(config.antennas):
+        fit = fit_at_known_poses(one_of(survey, k), nominal(), prior)
+        held = with_receiver_gain(fit, nominal())
+        size = np.linalg.norm(held.antenna.sensitivities_sensor, axis=1)
+        assert np.prod(size) == pytest.approx(1.0, rel=1e-12)
+        before, after = (observe_antenna(f.antenna, rotation, position) for f in (fit, held))
+        np.testing.assert_allclose(after.value, before.value, rtol=0, atol=1e-12 * 1e-5)
+        # What the couplings' covariance was it still is; that of the gains is now small.
+        old, new = (
+            s.antenna[0, 0, 0] @ f.cov @ s.antenna[0, 0, 0]
+            for s, f in ((before, fit), (after, held))
+        )
+        assert new == pytest.approx(old, rel=1e-4)
+        true = with_receiver_gain(replace(fit, antenna=truth.at(k)), nominal()).antenna
+        off = held.antenna.vector() - true.vector()
+        sigma = np.sqrt(np.diagonal(held.cov))
+        assert np.max(sigma[:9]) < 1e-3 < 5e-3 < np.max(np.sqrt(np.diagonal(fit.cov))[:9])
+        normalised.append(off / sigma)
+    assert np.mean(np.square(normalised)) == pytest.approx(1.0, abs=0.12)
 
 
 def test_the_graph_with_sure_poses_is_least_squares() -> None:

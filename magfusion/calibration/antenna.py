@@ -4,7 +4,7 @@ Where the poses are themselves uncertain, see `magfusion.calibration.antenna_gra
 of paper 000 is in `magfusion.calibration.antenna_bench`.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -166,3 +166,41 @@ def _linearized(survey: AntennaSurvey, vector: Array, sigma: Array) -> tuple[Arr
     jacobian = seen.antenna * (weight[..., None] * sigma)
     lead = rest.shape[:-3]
     return rest.reshape(*lead, -1), jacobian.reshape(*lead, -1, len(sigma))
+
+
+def with_receiver_gain(fit: AntennaFit, declared: Antenna) -> AntennaFit:
+    """Return a fit whose sensitivities are as large as declared in their geometric mean.
+
+    Couplings tell the product of moments and sensitivities alone.  The prior shares it out, with a
+    sigma that is no error of any coupling; here the receiver's mean gain is held, and the sigmas
+    are those of everything else (the S-transformation of geodesy).
+
+    Parameters
+    ----------
+    fit : AntennaFit
+        Of one antenna.
+    declared : Antenna
+
+    Returns
+    -------
+    AntennaFit
+    """
+    found = fit.antenna
+    size = np.linalg.norm(found.sensitivities_sensor, axis=-1)
+    reference = np.linalg.norm(declared.sensitivities_sensor, axis=-1)
+    factor = float(np.exp(np.mean(np.log(reference / size))))
+    held = replace(
+        found,
+        moments_beacon=found.moments_beacon / factor,
+        sensitivities_sensor=found.sensitivities_sensor * factor,
+    )
+    scale = np.ones(len(fit.cov))
+    scale[MOMENTS], scale[SENSITIVITIES] = 1.0 / factor, factor
+    gauge, by_gain = np.zeros(len(scale)), np.zeros(len(scale))
+    gauge[MOMENTS] = -held.moments_beacon.ravel()
+    gauge[SENSITIVITIES] = held.sensitivities_sensor.ravel()
+    square = (size * factor)[:, None] ** 2
+    by_gain[SENSITIVITIES] = (held.sensitivities_sensor / square / len(size)).ravel()
+    projection = np.eye(len(scale)) - np.outer(gauge, by_gain)  # by_gain @ gauge is one
+    transform = projection * scale
+    return replace(fit, antenna=held, cov=transform @ fit.cov @ transform.T)

@@ -9,14 +9,8 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
 
-from magfusion.antenna import antenna_from_vector, observe_antenna
-from magfusion.calibration.antenna import (
-    CONVERGED,
-    ITERATIONS,
-    Antenna,
-    AntennaFit,
-    AntennaSurvey,
-)
+from magfusion.antenna import Antenna, antenna_from_vector, observe_antenna
+from magfusion.calibration.antenna import CONVERGED, ITERATIONS, AntennaFit, AntennaSurvey
 from magfusion.errors import EstimationError
 from magfusion.units import Array
 

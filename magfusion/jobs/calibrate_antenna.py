@@ -22,6 +22,7 @@ from magfusion.calibration.antenna import (
     AntennaSurvey,
     fit_at_known_poses,
     prior_sigma,
+    with_receiver_gain,
 )
 from magfusion.calibration.antenna_graph import fit_at_uncertain_poses
 from magfusion.calibration.antenna_observability import Observability, observability
@@ -92,7 +93,7 @@ def run_calibrate_antenna(
         before = _pose_errors(start, survey)
     if settings.sizes:
         start = antenna_from_vector(np.concatenate([start.vector(), np.zeros(2)]))
-    fit = _fit(survey, start, settings)
+    fit = with_receiver_gain(_fit(survey, start, settings), start)
     told = observability(survey, fit.antenna)
     after = _judged(survey, start, settings)
     figures: Figures = {"job": JOB, "log": survey_path.stem, "beacon": beacon.name}
@@ -201,9 +202,8 @@ def _fit(survey: AntennaSurvey, start: Antenna, settings: AntennaSettings) -> An
 
 def _pose_errors(antenna: Antenna, survey: AntennaSurvey) -> tuple[Array, Array]:
     """Return how far tracked poses are from the surveyed ones (rad, m)."""
-    free = whitened(
-        survey.coupling, np.linalg.inv(antenna.sensitivities_sensor), antenna.moments_beacon.T
-    )
+    receiver = np.asarray(np.linalg.inv(antenna.sensitivities_sensor))
+    free = whitened(survey.coupling, receiver, antenna.moments_beacon.T)
     try:
         start = locate_by_svd(free).nearest(survey.position_beacon)
         rotation, position = refine_poses(
