@@ -66,6 +66,7 @@ def demodulate_about(
     states: Trajectory,
     imu: ImuSamples,
     calibration: Calibration,
+    path: Trajectory | None = None,
 ) -> WaveFields:
     """Demodulate what a prediction of the waveform leaves, and add the phasors at the centres.
 
@@ -81,16 +82,18 @@ def demodulate_about(
         At the centres of the windows.
     imu : ImuSamples
     calibration : Calibration
+    path : Trajectory, optional
+        States between which the motion is interpolated, where they are not those of the windows.
 
     Returns
     -------
     WaveFields
     """
-    site = calibration.site
+    site, known = calibration.site, states if path is None else path
     earth = np.zeros(3) if site.earth_field_world is None else site.earth_field_world
 
     def predicted(stream: ImuSamples, time_offset: float) -> Array:
-        motion = motion_at(states, stream, time_offset, site.gravity, operator.time)
+        motion = motion_at(known, stream, time_offset, site.gravity, operator.time)
         return predicted_waveform(motion, calibration, earth)
 
     offset, slow = calibration.time_offset, low_passed(imu)

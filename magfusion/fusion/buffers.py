@@ -1,0 +1,84 @@
+"""What has arrived and is not used up yet: streams in order, and how late they may be."""
+
+from collections import deque
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.units import Array
+
+LARGEST_JUMP = 60.0  # s; a stamp farther ahead of its stream is a clock that jumped
+
+
+class Buffer:
+    """One stream, sorted by time: stamps with rows of numbers.
+
+    Parameters
+    ----------
+    name : str
+        Of the stream, for refusals.
+    width : int
+        Numbers in a row.
+    """
+
+    def __init__(self, name: str, width: int) -> None:
+        self.name = name
+        self._time: Array = np.empty(0)
+        self._rows: Array = np.empty((0, width))
+        self._waiting: deque[tuple[Array, Array]] = deque()
+        self.newest = -np.inf
+        self.settled = -np.inf
+        self.late = 0
+
+    def add(self, time: Array, rows: Array) -> None:
+        """Take samples in, in any order but not from before what has been settled.
+
+        Raises
+        ------
+        InputError
+            Where a number is not finite, or the clock jumped ahead.
+        """
+        if not (np.all(np.isfinite(time)) and np.all(np.isfinite(rows))):
+            raise InputError(f"{self.name}: a sample is not finite; leave it out of the stream")
+        if len(time) == 0:
+            return
+        ahead = float(np.max(time)) - self.newest
+        if np.isfinite(self.newest) and ahead > LARGEST_JUMP:
+            raise InputError(
+                f"{self.name}: its clock jumped ahead by {ahead:.4g} s at {self.newest:.3f} s;"
+                " start a new navigator, or mend the clock"
+            )
+        fresh = time > self.settled
+        self.late += int(np.sum(~fresh))
+        self._waiting.append((time[fresh], rows[fresh]))
+        self.newest = max(self.newest, float(np.max(time)))
+
+    def rows(self) -> tuple[Array, Array]:
+        """Return all that is kept, in order of time; of equal stamps the first."""
+        if self._waiting:
+            time = np.concatenate([self._time, *(t for t, _ in self._waiting)])
+            rows = np.concatenate([self._rows, *(r for _, r in self._waiting)])
+            self._waiting.clear()
+            if np.any(np.diff(time) <= 0.0):
+                time, first = np.unique(time, return_index=True)
+                self.late += len(rows) - len(first)
+                rows = rows[first]
+            self._time, self._rows = time, rows
+        return self._time, self._rows
+
+    def between(self, begin: float, end: float) -> tuple[Array, Array]:
+        """Return the samples of a stretch, with the neighbours just outside it."""
+        time, rows = self.rows()
+        lo = max(int(np.searchsorted(time, begin, side="right")) - 1, 0)
+        hi = min(int(np.searchsorted(time, end)) + 1, len(time))
+        return time[lo:hi], rows[lo:hi]
+
+    def forget(self, before: float, settled: float) -> None:
+        """Drop what is older, but for the last sample of it; refuse what comes before settled."""
+        time, rows = self.rows()
+        lo = max(int(np.searchsorted(time, before, side="right")) - 1, 0)
+        self._time, self._rows = time[lo:], rows[lo:]
+        self.settled = max(self.settled, settled)
+
+    def __len__(self) -> int:
+        return len(self.rows()[0])

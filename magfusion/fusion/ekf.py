@@ -1,0 +1,96 @@
+"""The light estimator: an error-state Kalman filter, with filterpy as its arithmetic."""
+
+from dataclasses import replace
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+
+from magfusion.fusion.epoch import Rows, field_rows, joined, rest_rows
+from magfusion.fusion.factors import FieldFactors
+from magfusion.fusion.propagation import Propagated
+from magfusion.fusion.state import State, between, moved
+from magfusion.parameters import Block
+from magfusion.units import Array
+
+
+def updated(state: State, rows: Rows, blocks: tuple[Block, ...]) -> State:
+    """Return the state after one linear measurement: a Gauss-Newton step of the graph.
+
+    Parameters
+    ----------
+    state : State
+        The prediction, at which ``rows`` were linearised.
+    rows : Rows
+    blocks : tuple of Block
+    """
+    step, cov = _step(state.cov, rows)
+    return moved(replace(state, cov=cov), blocks, step)
+
+
+def _step(cov: Array, rows: Rows) -> tuple[Array, Array]:
+    size = len(cov)
+    kalman = ExtendedKalmanFilter(dim_x=size, dim_z=len(rows.error))
+    kalman.x = np.zeros(size)  # filterpy's own (n, 1) would broadcast to a matrix
+    kalman.P = cov
+    kalman.update(
+        -rows.error,
+        HJacobian=lambda _: rows.jacobian,
+        Hx=lambda step: rows.jacobian @ step,
+        R=np.eye(len(rows.error)),
+    )
+    return np.asarray(kalman.x), np.asarray(0.5 * (kalman.P + kalman.P.T))
+
+
+class ErrorStateFilter:
+    """State of now, updated epoch by epoch.
+
+    Parameters
+    ----------
+    state : State
+        The start.
+    blocks : tuple of Block
+        Calibration parameters in its tangent.
+    """
+
+    def __init__(self, state: State, blocks: tuple[Block, ...]) -> None:
+        self.blocks, self.state = blocks, state
+        self.lagged = state
+
+    def absorb(
+        self,
+        predicted: Propagated,
+        fields: FieldFactors | None,
+        rest_sigma: float | None,
+        about: State | None = None,
+    ) -> None:
+        """Take in what was measured at the end of an interval.
+
+        Parameters
+        ----------
+        predicted : Propagated
+            From ``state``.
+        fields : FieldFactors, optional
+            Of the epoch.
+        rest_sigma : float, optional
+            Standard deviation of the velocity, where the platform stands (m/s).
+        about : State, optional
+            Where to linearise, if the prediction is too wide for it; then three times.
+        """
+        prior = predicted.state
+        state = prior if about is None else replace(about, cov=prior.cov)
+        for _ in range(1 if about is None else 3):
+            parts = [] if fields is None else [field_rows(fields, state)]
+            parts += [] if rest_sigma is None else [rest_rows(state, rest_sigma)]
+            if not parts:
+                break
+            rows = joined(parts)
+            # Told about the prediction, which holds the prior.
+            back = between(prior, state, self.blocks)
+            told = Rows(rows.error - rows.jacobian @ back, rows.jacobian)
+            step, cov = _step(prior.cov, told)
+            state = moved(replace(prior, cov=cov), self.blocks, step)
+        self.state = self.lagged = state
+
+    def replace_state(self, state: State) -> None:
+        """Go on from another state."""
+        self.state = self.lagged = state

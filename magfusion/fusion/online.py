@@ -1,0 +1,505 @@
+"""Navigation as the data arrive: one interface for the fixed-lag smoother and the filter.
+
+`Navigator` knows no files.  Samples go in as they come; a state comes out at every field epoch, and
+on request at any time since.
+"""
+
+import pickle
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from magfusion.errors import EstimationError
+from magfusion.fixes.likelihood import fix_epochs
+from magfusion.fusion.buffers import Buffer
+from magfusion.fusion.ekf import ErrorStateFilter
+from magfusion.fusion.epoch import channel_distances, field_rows, single, without
+from magfusion.fusion.factors import FieldMeasurements
+from magfusion.fusion.navigator import SlidingWindow
+from magfusion.fusion.outset import Outset, find_outset
+from magfusion.fusion.propagation import Propagated, calibration_walk, propagate
+from magfusion.fusion.receive import OnlineReceiver
+from magfusion.fusion.state import State
+from magfusion.parameters import choose_blocks
+from magfusion.receiver.windows import LockinSettings
+from magfusion.records.samples import FieldSamples, ImuSamples
+from magfusion.site import Site
+from magfusion.strapdown import resting
+from magfusion.trajectory import Trajectory
+from magfusion.units import Array, BoolArray
+from magfusion.weights import measurement_cov, paired_whitening, sensor_positions, stacked
+
+GATE = 38.3  # chi square of six components, one in a million
+WIDE_POSITION, WIDE_ROTATION = 0.3, 0.2  # m, rad; beyond, the prediction is no place to linearise
+LOST_EPOCHS = 5  # in a row, most of whose channels were refused: the state is wrong, not they
+REST_SIGMA = 0.01  # m/s
+REST_SPAN = 1.0  # s
+RATE_SPAN = 0.08  # s; motion is slower, noise is not
+SPEED_SIGMA = 1.0  # m/s; of a state that was found again
+
+
+@dataclass(frozen=True)
+class NavigatorSettings:
+    """How to navigate.
+
+    Parameters
+    ----------
+    estimator : {'smoother', 'ekf'}
+    lag : float
+        Window of the smoother (s).
+    delay : float
+        How late samples may come and still be used in their order (s); so much later are states.
+    start_duration : float
+        Data gathered before the first state (s); longer where they leave it ambiguous.
+    longest_step : float
+        Without any field a state is made after so long (s).
+    estimate : tuple of str, optional
+        Groups of calibration parameters; None takes those that the site leaves open.
+    lockin : LockinSettings, optional
+    """
+
+    estimator: Literal["smoother", "ekf"] = "smoother"
+    lag: float = 4.0
+    delay: float = 0.0
+    start_duration: float = 6.0
+    longest_step: float = 10.0
+    estimate: tuple[str, ...] | None = None
+    lockin: LockinSettings | None = None
+
+
+class Navigator:
+    """A running estimate of the platform's motion.
+
+    Parameters
+    ----------
+    site : Site
+    settings : NavigatorSettings, optional
+
+    Attributes
+    ----------
+    counts : Counter
+        What was refused, lost and recovered, with the reason.
+    distortion : dict of str to float
+        By beacon, running mean of the squared innovation in units of its expectation.
+    """
+
+    def __init__(self, site: Site, settings: NavigatorSettings | None = None) -> None:
+        self.site = site
+        self.settings = NavigatorSettings() if settings is None else settings
+        self.blocks = choose_blocks(site, self.settings.estimate)
+        self.counts: Counter[str] = Counter()
+        self.distortion: dict[str, float] = {}
+        self._walk = calibration_walk(self.blocks)
+        self._imu = Buffer("imu", 6)
+        self._waveform = Buffer("magnetometer", 3)
+        self._fields: list[FieldSamples] = []
+        self._estimator: SlidingWindow | ErrorStateFilter | None = None
+        self._receiver: OnlineReceiver | None = None
+        self._applied_offset = site.platform.imu.time_offset
+        self._next_start = self.settings.start_duration
+        self._refused_in_a_row = 0
+        self._last_epoch_time = -np.inf
+        self._made: list[State] = []
+        self.rival_chi_square: float | None = None
+
+    # What goes in
+
+    def add_imu(self, time: Array, gyro_body: Array, accel_body: Array) -> None:
+        """Take inertial samples: times (k,), rates and specific forces (k, 3).
+
+        Raises
+        ------
+        InputError
+            Where a number is not finite or the clock jumped.
+        """
+        self._imu.add(
+            np.atleast_1d(time), np.hstack([np.atleast_2d(gyro_body), np.atleast_2d(accel_body)])
+        )
+        self._advance()
+
+    def add_magnetometer(self, time: Array, measured_sensor: Array) -> None:
+        """Take raw samples of the magnetometer: times (k,), fields (k, 3) (T).
+
+        Raises
+        ------
+        InputError
+            Where a number is not finite or the clock jumped.
+        """
+        self._waveform.add(np.atleast_1d(time), np.atleast_2d(measured_sensor))
+        self._advance()
+
+    def add_fields(self, samples: FieldSamples) -> None:
+        """Take demodulated phasors, channels in the site's order."""
+        for i in range(len(samples)):
+            one = _row(samples, i)
+            if self._estimator is not None and one.time[0] <= self._estimator.state.time:
+                self.counts["field too late"] += 1
+                continue
+            self._fields.append(one)
+        self._fields.sort(key=lambda s: float(s.time[0]))
+        self._advance()
+
+    # What comes out
+
+    @property
+    def started(self) -> bool:
+        """Whether there is a state."""
+        return self._estimator is not None
+
+    def take(self) -> list[State]:
+        """Return the states made since this was last asked."""
+        made, self._made = self._made, []
+        return made
+
+    def state(self, time: float | None = None) -> State:
+        """Return the state at a time, carried on by the inertial stream from the last epoch.
+
+        Parameters
+        ----------
+        time : float, optional
+            (s); the newest inertial sample where it is not given.
+
+        Raises
+        ------
+        EstimationError
+            Before there is a state.
+        """
+        if self._estimator is None:
+            raise EstimationError("there is no state yet: the navigator is still gathering data")
+        last = self._estimator.state
+        wanted = self._imu.newest + self._applied_offset if time is None else time
+        if wanted <= last.time:
+            return last
+        return self._propagated(wanted).state
+
+    @property
+    def lagged(self) -> State | None:
+        """State that left the smoother's window last; that of the filter is of now."""
+        return None if self._estimator is None else self._estimator.lagged
+
+    def checkpoint(self) -> bytes:
+        """Return everything needed to go on: `restored` makes a navigator of it."""
+        return pickle.dumps(self)
+
+    # How it goes on
+
+    def _advance(self) -> None:
+        if self._estimator is None and not self._begin():
+            return
+        while self._step():
+            pass
+
+    def _begin(self) -> bool:
+        """Find the first state, once enough has come."""
+        first = self._first_time()
+        reached = self._reached() - self.settings.delay
+        if not reached - first >= self._next_start:
+            return False
+        outset = find_outset(
+            self.site,
+            self._imu_samples(),
+            self._waveform,
+            self._fields,
+            reached,
+            self.settings.estimate,
+            self.settings.lockin,
+        )
+        if outset is None or (
+            outset.ambiguous and self._next_start < 4 * self.settings.start_duration
+        ):
+            self._next_start += 0.5 * self.settings.start_duration
+            self._forget_before_start()
+            return False
+        self._start_at(outset)
+        return True
+
+    def _first_time(self) -> float:
+        if self._fields:
+            return float(self._fields[0].time[0])
+        time, _ = self._waveform.rows()
+        return float(time[0]) if len(time) else np.inf
+
+    def _reached(self) -> float:
+        """Until when everything has come."""
+        inertial = self._imu.newest + self._applied_offset
+        heard = self._fields[-1].time[0] if self._fields else self._waveform.newest
+        return float(min(inertial, heard))
+
+    def _forget_before_start(self) -> None:
+        """Keep no more than four times what a start takes."""
+        oldest = self._reached() - 4.0 * self.settings.start_duration
+        for buffer in (self._imu, self._waveform):
+            buffer.forget(oldest, oldest)
+        self._fields = [s for s in self._fields if s.time[0] >= oldest]
+
+    def _start_at(self, outset: Outset) -> None:
+        state = outset.state
+        self._applied_offset = state.calibration.time_offset
+        self.rival_chi_square = outset.rival_chi_square
+        if self.settings.estimator == "ekf":
+            self._estimator = ErrorStateFilter(state, self.blocks)
+        else:
+            self._estimator = SlidingWindow(
+                state, self.blocks, self.settings.lag, self._walk, self._applied_offset
+            )
+        if outset.lockin is not None:
+            self._receiver = OnlineReceiver(
+                outset.lockin, outset.rate_hz, state.time + outset.lockin.step
+            )
+        self._fields = [s for s in self._fields if s.time[0] > state.time]
+        self._last_epoch_time = state.time
+        self._made.append(state)
+        self._forget(state.time)
+
+    def _step(self) -> bool:
+        """Process the next epoch, if all that it needs has come."""
+        assert self._estimator is not None
+        now = self._estimator.state.time
+        inertial = self._imu.newest + self._applied_offset - self.settings.delay
+        if self._receiver is not None and self._waveform.newest >= self._receiver.next_end:
+            return self._step_window(self._receiver, inertial)
+        if self._fields and self._fields[0].time[0] <= inertial:
+            return self._step_fields(self._fields.pop(0))
+        if inertial - now >= self.settings.longest_step:
+            self._absorb(now + self.settings.longest_step, None)
+            return True
+        return False
+
+    def _step_window(self, receiver: OnlineReceiver, inertial: float) -> bool:
+        ahead = self._waveform.newest - self.settings.delay
+        if min(inertial, ahead) < receiver.next_end:
+            return False
+        assert self._estimator is not None
+        half = receiver.settings.window / 2.0
+        begin, end = receiver.next_centre - half, receiver.next_centre + half
+        imu = self._imu_samples(self._estimator.state.time - 0.1, end + 0.1)
+        silent = _has_gap(imu.time + self._applied_offset, begin, end)
+        if receiver.next_centre <= self._estimator.state.time:
+            self.counts["window too late"] += 1
+        elif receiver.usable(self._waveform, silent):
+            self._absorb(receiver.next_centre, None)
+        receiver.skip()
+        return True
+
+    def _step_fields(self, samples: FieldSamples) -> bool:
+        assert self._estimator is not None
+        if samples.time[0] <= self._estimator.state.time:
+            self.counts["field too late"] += 1
+            return True
+        self._absorb(float(samples.time[0]), samples)
+        return True
+
+    def _absorb(self, time: float, samples: FieldSamples | None) -> None:
+        """Go on to a time and take in what was measured there."""
+        assert self._estimator is not None
+        predicted = self._propagated(time)
+        if predicted.bridged:
+            self.counts["inertial gap bridged"] += 1
+        measurements, samples = self._measured(predicted, samples)
+        about = None
+        if measurements is not None and samples is not None:
+            about = self._found(samples, predicted) if _wide(predicted.state) else None
+            measurements = self._gated(measurements, samples, predicted, about)
+            if self._refused_in_a_row >= LOST_EPOCHS and self._found_again(samples, predicted):
+                return
+        self._take_in(predicted, measurements, about)
+
+    def _take_in(
+        self, predicted: Propagated, measurements: FieldMeasurements | None, about: State | None
+    ) -> None:
+        assert self._estimator is not None
+        factors = None if measurements is None else single(measurements, self.blocks)
+        rest = REST_SIGMA if self._rests(predicted.state) else None
+        try:
+            self._estimator.absorb(predicted, factors, rest, about)
+        except EstimationError:
+            self.counts["update failed"] += 1
+            self._estimator.replace_state(predicted.state)
+        self._finish()
+
+    def _finish(self) -> None:
+        assert self._estimator is not None
+        self._made.append(self._estimator.state)
+        self._forget(self._estimator.state.time)
+
+    def _propagated(self, time: float) -> Propagated:
+        assert self._estimator is not None
+        state = self._estimator.state
+        begin, end = state.time - self._applied_offset, time - self._applied_offset
+        imu = self._imu_samples(begin, end)
+        return propagate(state, imu, time, self.site, self._applied_offset, self._walk)
+
+    def _imu_samples(self, begin: float = -np.inf, end: float = np.inf) -> ImuSamples:
+        time, rows = self._imu.between(begin, end)
+        return ImuSamples(time, rows[:, :3], rows[:, 3:])
+
+    def _forget(self, time: float) -> None:
+        reach = 2.0 + (0.0 if self._receiver is None else self._receiver.settings.window)
+        self._imu.forget(time - reach, time - self._applied_offset - 1.0)
+        self._waveform.forget(time - reach, time - reach)
+
+    # Measurements
+
+    def _measured(
+        self, predicted: Propagated, samples: FieldSamples | None
+    ) -> tuple[FieldMeasurements | None, FieldSamples | None]:
+        state = predicted.state
+        wave = None
+        if samples is None:
+            receiver = self._receiver
+            if receiver is None or receiver.next_centre != state.time:
+                return None, None  # only the clock went on
+            assert self._estimator is not None
+            half = receiver.settings.window / 2.0
+            before = self._estimator.state
+            imu = self._imu_samples(
+                min(before.time, state.time - half) - 0.1, state.time + half + 0.1
+            )
+            wave = receiver.demodulate(self._waveform, imu, before, state, self._applied_offset)
+            samples = wave.fields
+        pose = Trajectory(samples.time, state.world_from_body[None], state.position_world[None])
+        calibrated = state.calibration.site
+        cov = measurement_cov(calibrated, samples, sensor_world=sensor_positions(calibrated, pose))
+        step = max(state.time - self._last_epoch_time, 1e-6)
+        self._last_epoch_time = state.time
+        # Overlapping windows hold the same samples: that must not count twice.
+        cov = cov * max(1.0, float(samples.window[0]) / step)
+        shape = (*samples.phasor_sensor.shape[:2], 6)
+        measurements = FieldMeasurements(
+            time=samples.time,
+            measured=stacked(samples.phasor_sensor),
+            root=paired_whitening(cov, samples.valid),
+            rate_body=(self._rate(state.time) - state.gyro_bias_body)[None],
+            applied_offset=self._applied_offset,
+            by_time_offset=np.zeros(shape) if wave is None else stacked(wave.by_time_offset),
+        )
+        return measurements, samples
+
+    def _rate(self, time: float) -> Array:
+        stamp = time - self._applied_offset
+        _, rows = self._imu.between(stamp - RATE_SPAN / 2, stamp + RATE_SPAN / 2)
+        return np.asarray(np.mean(rows[:, :3], axis=0)) if len(rows) else np.zeros(3)
+
+    def _gated(
+        self,
+        measurements: FieldMeasurements,
+        samples: FieldSamples,
+        predicted: Propagated,
+        about: State | None,
+    ) -> FieldMeasurements:
+        """Refuse the channels that the prediction does not explain."""
+        state = predicted.state if about is None else about
+        rows = field_rows(single(measurements, self.blocks), state)
+        channels = len(self.site.channels)
+        distance = channel_distances(rows, state.cov, channels)
+        valid = samples.valid[0]
+        rejected: BoolArray = np.asarray(distance > GATE) & valid
+        self._note_distortion(distance, valid)
+        for name, _ in np.array(self.site.channels, dtype=object)[rejected]:
+            self.counts[f"outlier of {name}"] += 1
+        most = np.sum(rejected) > 0.5 * np.sum(valid)
+        self._refused_in_a_row = self._refused_in_a_row + 1 if most else 0
+        return without(measurements, rejected) if np.any(rejected) else measurements
+
+    def _note_distortion(self, distance: Array, valid: BoolArray) -> None:
+        for name in dict.fromkeys(beacon for beacon, _ in self.site.channels):
+            own = np.array([beacon == name for beacon, _ in self.site.channels]) & valid
+            if np.any(own):
+                level = float(np.mean(distance[own])) / 6.0
+                self.distortion[name] = 0.95 * self.distortion.get(name, level) + 0.05 * level
+
+    def _rests(self, state: State) -> bool:
+        """Tell whether the platform stands: the IMU is quiet and nothing says that it moves."""
+        stamp = state.time - self._applied_offset
+        time, rows = self._imu.between(stamp - REST_SPAN - 0.1, stamp + 0.1)
+        if len(time) < 10 or time[0] > stamp - REST_SPAN:
+            return False
+        still = resting(time, rows[:, :3], rows[:, 3:], REST_SPAN - 0.1)
+        if not still[np.searchsorted(time, stamp - REST_SPAN / 2)]:
+            return False
+        spread = state.cov[6:9, 6:9] + REST_SIGMA**2 * np.eye(3)
+        velocity = state.velocity_world
+        return bool(velocity @ np.linalg.solve(spread, velocity) < 12.0)
+
+    # Being lost, and found again
+
+    def _found(self, samples: FieldSamples, predicted: Propagated) -> State | None:
+        """Return where a fix finds the platform, if the prediction is too wide to tell."""
+        state = predicted.state
+        prior = Trajectory(
+            samples.time,
+            state.world_from_body[None],
+            state.position_world[None],
+            pose_cov=state.cov[None, :6, :6],
+        )
+        try:
+            fixes = fix_epochs(samples, state.calibration, prior=prior)
+        except EstimationError:
+            return None
+        best = fixes.best()
+        self.counts["found by a fix"] += 1
+        return replace(
+            state,
+            world_from_body=best.world_from_body[0],
+            position_world=best.position_world[0],
+        )
+
+    def _found_again(self, samples: FieldSamples, predicted: Propagated) -> bool:
+        """Give the pose up that explains nothing any more, and start from a fix."""
+        assert self._estimator is not None
+        try:
+            fixes = fix_epochs(samples, predicted.state.calibration)
+        except EstimationError:
+            return False
+        if not fixes.determined[0, 0]:
+            return False
+        best = fixes.best()
+        assert best.pose_cov is not None
+        cov = predicted.state.cov.copy()
+        cov[:9] = cov[:, :9] = 0.0
+        cov[:6, :6] = 4.0 * best.pose_cov[0]
+        cov[6:9, 6:9] = SPEED_SIGMA**2 * np.eye(3)
+        state = replace(
+            predicted.state,
+            world_from_body=best.world_from_body[0],
+            position_world=best.position_world[0],
+            velocity_world=np.zeros(3),
+            cov=cov,
+        )
+        self.counts["lost and found again"] += 1
+        self._refused_in_a_row = 0
+        self._estimator.replace_state(state)
+        self._finish()
+        return True
+
+
+def restored(checkpoint: bytes) -> Navigator:
+    """Return the navigator of a checkpoint.  Only open checkpoints that you have written."""
+    found = pickle.loads(checkpoint)
+    assert isinstance(found, Navigator)
+    return found
+
+
+def _row(samples: FieldSamples, i: int) -> FieldSamples:
+    rows = slice(i, i + 1)
+    return FieldSamples(
+        samples.time[rows],
+        samples.window[rows],
+        samples.channels,
+        samples.phasor_sensor[rows],
+        samples.phasor_cov[rows],
+    )
+
+
+def _wide(state: State) -> bool:
+    return state.position_sigma > WIDE_POSITION or state.rotation_sigma > WIDE_ROTATION
+
+
+def _has_gap(time: Array, begin: float, end: float) -> bool:
+    if len(time) < 2 or time[0] > begin + 0.02 or time[-1] < end - 0.02:
+        return True
+    step = float(np.median(np.diff(time)))
+    wide = np.diff(time) > 3.0 * step
+    return bool(np.any(wide & (time[:-1] < end) & (time[1:] > begin)))

@@ -1,0 +1,100 @@
+"""State of a running estimator, and the tangent space that its covariance lives in.
+
+Tangent: rotation and position (body axes, right perturbation of the pose, GTSAM's chart), velocity
+(world), accelerometer and gyro bias, then the calibration as `magfusion.parameters` has it.
+"""
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from magfusion.parameters import Block, Calibration, difference, retract
+from magfusion.trajectory import Trajectory
+from magfusion.units import Array
+
+MOTION = 15
+ROTATION, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
+ACCEL_BIAS, GYRO_BIAS = slice(9, 12), slice(12, 15)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Motion and calibration at one time.
+
+    Parameters
+    ----------
+    time : float
+        On the log's clock (s).
+    world_from_body : ndarray, shape (3, 3)
+    position_world, velocity_world : ndarray, shape (3,)
+        (m, m/s)
+    accel_bias_body, gyro_bias_body : ndarray, shape (3,)
+        (m/s^2, rad/s)
+    calibration : Calibration
+    cov : ndarray, shape (15 + calibration, 15 + calibration)
+    """
+
+    time: float
+    world_from_body: Array
+    position_world: Array
+    velocity_world: Array
+    accel_bias_body: Array
+    gyro_bias_body: Array
+    calibration: Calibration
+    cov: Array
+
+    @property
+    def position_sigma(self) -> float:
+        """Standard deviation of the position, largest axis (m)."""
+        return float(np.sqrt(np.max(np.linalg.eigvalsh(self.cov[POSITION, POSITION]))))
+
+    @property
+    def rotation_sigma(self) -> float:
+        """Standard deviation of the attitude, largest axis (rad)."""
+        return float(np.sqrt(np.max(np.linalg.eigvalsh(self.cov[ROTATION, ROTATION]))))
+
+
+def pose_of(state: State) -> gtsam.Pose3:
+    """Return the pose as GTSAM has it."""
+    return gtsam.Pose3(gtsam.Rot3(state.world_from_body), state.position_world)
+
+
+def moved(state: State, blocks: tuple[Block, ...], step: Array) -> State:
+    """Return the state moved by a tangent vector; the covariance stays."""
+    pose = pose_of(state).retract(step[:6])
+    return replace(
+        state,
+        world_from_body=pose.rotation().matrix(),
+        position_world=np.asarray(pose.translation()),
+        velocity_world=state.velocity_world + step[VELOCITY],
+        accel_bias_body=state.accel_bias_body + step[ACCEL_BIAS],
+        gyro_bias_body=state.gyro_bias_body + step[GYRO_BIAS],
+        calibration=retract(state.calibration, blocks, step[MOTION:]),
+    )
+
+
+def between(reference: State, state: State, blocks: tuple[Block, ...]) -> Array:
+    """Return the tangent vector that takes ``reference`` to ``state``: the inverse of `moved`."""
+    return np.concatenate(
+        [
+            pose_of(reference).localCoordinates(pose_of(state)),
+            state.velocity_world - reference.velocity_world,
+            state.accel_bias_body - reference.accel_bias_body,
+            state.gyro_bias_body - reference.gyro_bias_body,
+            difference(reference.calibration, state.calibration, blocks),
+        ]
+    )
+
+
+def as_trajectory(states: list[State]) -> Trajectory:
+    """Return states as a trajectory with biases and the covariance of the poses."""
+    return Trajectory(
+        time=np.array([s.time for s in states]),
+        world_from_body=np.array([s.world_from_body for s in states]).reshape(-1, 3, 3),
+        position_world=np.array([s.position_world for s in states]).reshape(-1, 3),
+        velocity_world=np.array([s.velocity_world for s in states]).reshape(-1, 3),
+        gyro_bias_body=np.array([s.gyro_bias_body for s in states]).reshape(-1, 3),
+        accel_bias_body=np.array([s.accel_bias_body for s in states]).reshape(-1, 3),
+        pose_cov=np.array([s.cov[:6, :6] for s in states]).reshape(-1, 6, 6),
+    )
