@@ -6,9 +6,10 @@ pose with dipoles, and again with one term for the coils' size, ``1 - kappa d^2/
 
 1. At 1.5 sizes the dipole's attitude is wrong by tens of degrees.  The error falls with the square
    of the distance: half a degree at ten sizes, a tenth at twenty to thirty.
-2. With the term it is some hundredths of a degree at five sizes, thousandths at ten.
-3. A calibration finds the two constants by itself, to some per cent, where the antenna's poses are
-   near enough to tell (`magfusion.calibration.antenna`).
+2. With the term it is a hundredth of a degree (circles) or three (squares) at five sizes, and at
+   most two thousandths at ten.
+3. A calibration at poses five sizes away finds the two constants by itself, within a per cent
+   (`magfusion.calibration.antenna`).
 """
 
 import argparse

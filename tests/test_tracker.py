@@ -264,6 +264,19 @@ def test_refined_poses_know_the_centres() -> None:
     np.testing.assert_allclose(found[1], true[1], rtol=0, atol=1e-9)
 
 
+def test_the_general_fix_knows_the_centres_too() -> None:
+    """Through `observe`, without the tracker's closed form; noise as good as none."""
+    rng = np.random.default_rng(10)
+    site = tracker_site(rng, centre=3e-3)
+    attitude, place = body_poses(site, 12, rng)
+    phasor = predict(site.beacons[0], site.platform.magnetometer, attitude, place)
+    cov = np.broadcast_to(1e-22 * np.eye(3), (12, 3, 3, 3)).copy()  # T^2
+    samples = FieldSamples(np.arange(12.0), np.ones(12), site.channels, phasor, cov)
+    fixes = fix_epochs(samples, initial_calibration(site, 0.0), survey_error=False)
+    np.testing.assert_allclose(fixes.position_world[:, 0], place, rtol=0, atol=1e-7)
+    assert np.max(between_deg(fixes.world_from_body[:, 0], attitude)) < 1e-5
+
+
 def test_a_runaway_is_no_pose() -> None:
     _, position, coupling = ideal(3)
     site = tracker_site(np.random.default_rng(9))

@@ -13,6 +13,8 @@ from tracker_antennas import Errors
 from tracker_near_field import learn_sizes
 from tracker_table1 import SCENARIO_A, SCENARIO_COMMON, SCENARIO_E, SCENARIO_F2, Row
 
+from magfusion.physics.solenoid import loop_field
+
 
 @pytest.fixture(scope="module")
 def independent() -> dict[str, Row]:
@@ -114,8 +116,6 @@ def test_one_term_repairs_it(near: tuple[tracker_near_field.Row, ...]) -> None:
 
 def test_the_exact_coupling_is_that_of_biot_and_savart() -> None:
     """A small receiving loop sees the field of the loop, another code."""
-    from magfusion.physics.solenoid import loop_field
-
     place, size = np.array([[0.1, 0.05, 0.2]]), tracker_near_field.SIZE
     seen = tracker_near_field.exact_couplings("circle", 1e-2, np.eye(3)[None], place)[0]
     for j, axis in enumerate(np.eye(3)):
