@@ -47,13 +47,14 @@ def test_rigid_calibration_does_not_help_independent_errors(independent: dict[st
 
 
 def test_six_points_and_the_joint_fit_reach_the_papers_factor(independent: dict[str, Row]) -> None:
-    ratios = [independent[level].ratio for level in ("P2", "P3", "P4", "P6", "J")]
+    ratios = [independent[level].ratio for level in ("P2", "P3", "P4", "P6", "J", "G")]
     assert ratios == sorted(ratios)
     assert independent["P6"].ratio == pytest.approx(5.1, abs=0.6)
     assert independent["J"].ratio == pytest.approx(6.8, abs=0.8)
     assert independent["J"].attitude_deg <= independent["P6"].attitude_deg
 
 
+@pytest.mark.slow
 def test_the_papers_calibration_helps_against_its_own_error() -> None:
     rows = {row.level: row for row in tracker_table1.run_levels(SCENARIO_F2)}
     assert rows["P2"].ratio == pytest.approx(4.6, abs=0.6)
@@ -61,14 +62,16 @@ def test_the_papers_calibration_helps_against_its_own_error() -> None:
 
 
 def test_the_printed_sum_of_offsets_mends_nothing() -> None:
-    rows = {row.level: row for row in tracker_table1.run_levels(SCENARIO_COMMON)}
+    config = replace(SCENARIO_COMMON, antennas=60)
+    rows = {row.level: row for row in tracker_table1.run_levels(config)}
     assert rows["P1"].position_mm == pytest.approx(7.1, abs=0.5)
     assert rows["P2"].position_mm == pytest.approx(0.30, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("errors", [Errors(gain=0.01), Errors(tilt_deg=0.3)], ids=["gain", "tilt"])
 def test_single_causes_are_beyond_a_rigid_calibration(errors: Errors) -> None:
-    config = replace(SCENARIO_A, errors=errors, snr_db=65.0, antennas=100)
+    config = replace(SCENARIO_A, errors=errors, snr_db=65.0, antennas=60)
     rows = {row.level: row for row in tracker_table1.run_levels(config)}
     assert 0.95 < rows["P2"].ratio < 1.2
     assert rows["P3"].ratio > 4.0
