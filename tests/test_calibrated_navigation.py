@@ -1,0 +1,53 @@
+"""What the calibration of the beacons is worth to who navigates by them."""
+
+import json
+import sys
+from pathlib import Path
+
+import calibrated_navigation
+import numpy as np
+import pytest
+from calibrated_navigation import PAPER, Config, means
+
+
+def test_calibration_leaves_nearly_what_exact_beacons_leave() -> None:
+    told = means(calibrated_navigation.run(Config(worlds=4, targets=60), workers=1))
+    for method in ("trilateration", "likelihood"):
+        geometric, calibrated, true = (told[s][method] for s in calibrated_navigation.SITES)
+        assert calibrated[0] < 0.4 * geometric[0]  # m
+        assert calibrated[1] < 0.4 * geometric[1]  # deg
+        assert calibrated[0] - true[0] < 0.01
+        assert calibrated[1] - true[1] < 0.3
+    for own in told.values():
+        assert own["likelihood"][0] < own["trilateration"][0]
+        assert own["likelihood"][1] < own["trilateration"][1]
+
+
+@pytest.mark.slow
+def test_an_amplitude_error_that_gives_the_papers_calibrated_gives_its_uncalibrated_figures() -> (
+    None
+):
+    worlds = 40
+    errors = calibrated_navigation.run(
+        Config(worlds=worlds, amplitude_error=0.0275, seed=2), workers=1
+    )
+    told = means(errors)
+    position, angle, spread, spread_deg = told["geometric"]["trilateration"]
+    paper_m, paper_deg = PAPER["geometric"]
+    # Selected to match.
+    assert told["calibrated"]["trilateration"][0] == pytest.approx(0.110, abs=0.008)
+    # Predicted.
+    assert abs(position - paper_m) < 3.0 * spread / np.sqrt(worlds)
+    assert abs(angle - paper_deg) < 3.0 * spread_deg / np.sqrt(worlds)
+    assert told["calibrated"]["likelihood"][0] < 0.3 * told["calibrated"]["trilateration"][0]
+
+
+def test_the_scenario_draws_and_ends_with_one_json_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    options = ["--worlds", "1", "--targets", "20", "--workers", "1", "-o", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["calibrated_navigation.py", *options])
+    calibrated_navigation.main()
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert set(told["0"]) == set(calibrated_navigation.SITES)
+    assert (tmp_path / "calibrated_navigation.png").read_bytes().startswith(b"\x89PNG")
