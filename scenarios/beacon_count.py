@@ -1,0 +1,152 @@
+"""What each further beacon is worth: the error with three to six (paper 004, figure 11).
+
+Three to six beacons stand evenly on a ring of 3.6 m radius around the square of 2 m in which the
+targets lie, in the fitted rooms of `algorithms_compared` (F1), whose lines are not aged here.
+
+1. Do more beacons lower the error of algorithm 3 as the paper prints?  By the same share: to about
+   two thirds from three to six.  The paper's own three beacons err by 0.069 m, 0.108 m and 0.110 m
+   in three places, so that only the ratios can be compared.
+2. And with a map and relative weights?  By nearly the same share, from a tenth of the error.  A
+   fourth beacon is worth less than a survey that is put to use.
+"""
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from algorithms_compared import (
+    MAPPED,
+    Outcome,
+    Task,
+    means,
+    standard_error,
+    try_world,
+)
+from scale import Scale, add_scale_options, chosen_scale, show_progress
+
+from magfusion.monte_carlo import run_many
+from magfusion.simulation.worlds import F1, ring
+from magfusion.units import Array
+
+COUNTS = (3, 4, 5, 6)
+PAPER = (0.110, 0.085, 0.077, 0.071)  # m
+METHODS = ("A3 differential", MAPPED)
+BOUND = "Cramér-Rao bound"
+
+
+@dataclass(frozen=True)
+class Config:
+    """Rooms for each number of beacons, and targets in each."""
+
+    worlds: int = 12
+    targets: int = 200
+    seed: int = 0
+
+
+def run(
+    config: Config, scale: Scale | None = None, methods: Sequence[str] = METHODS
+) -> dict[int, list[Outcome]]:
+    """Return what came out in every room with each number of beacons."""
+    scenario = replace(F1, line_bias_rms=0.0)
+    tasks = [
+        Task(scenario, config.targets, ring(count), tuple(methods))
+        for count in COUNTS
+        for _ in range(config.worlds)
+    ]
+    found = run_many(try_world, tasks, seed=config.seed, report=show_progress, **(scale or {}))
+    return {
+        count: found[i * config.worlds : (i + 1) * config.worlds] for i, count in enumerate(COUNTS)
+    }
+
+
+def errors(found: Mapping[int, Sequence[Outcome]], method: str) -> Array:
+    """Return mean errors in each room (m), shape (counts, worlds)."""
+    return np.array([means(outcomes, "position", method) for outcomes in found.values()])
+
+
+def bounds(found: Mapping[int, Sequence[Outcome]]) -> Array:
+    """Return the root mean square bound of position (m), shape (counts,)."""
+    return np.array(
+        [
+            np.sqrt(np.mean(np.concatenate([o.position_bound for o in outcomes]) ** 2))
+            for outcomes in found.values()
+        ]
+    )
+
+
+def report(found: Mapping[int, Sequence[Outcome]]) -> str:
+    """Return the table that a reader sees."""
+    lines = [
+        "mean position error (m), its standard error over rooms, and relative to three beacons",
+        f"  {'beacons':18}" + "".join(f"{count:>26}" for count in found),
+        _row("paper", PAPER),
+    ]
+    for method in METHODS:
+        error = errors(found, method)
+        spread = [standard_error(rooms) for rooms in error]
+        lines.append(_row(method, error.mean(axis=1), spread))
+    lines.append(_row(BOUND, bounds(found)))
+    return "\n".join(lines)
+
+
+def _row(name: str, value: Sequence[float] | Array, spread: Sequence[float] | None = None) -> str:
+    cells = ""
+    for i, error in enumerate(value):
+        doubt = "" if spread is None else f" ({spread[i]:.4f})"
+        cells += f"{f'{error:.4f}{doubt} {error / value[0]:.2f}':>26}"
+    return f"  {name:18}{cells}"
+
+
+def draw(path: Path, found: Mapping[int, Sequence[Outcome]]) -> None:
+    """Write the paper's figure 11 as a PNG."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 5.0), layout="constrained")
+    axis = figure.subplots()
+    axis.plot(COUNTS, PAPER, "k--o", label="paper")
+    for method in METHODS:
+        error = errors(found, method)
+        spread = [standard_error(rooms) for rooms in error]
+        axis.errorbar(COUNTS, error.mean(axis=1), spread, marker="o", capsize=3, label=method)
+    axis.plot(COUNTS, bounds(found), ":o", label=f"{BOUND}, noise alone")
+    axis.set(yscale="log", xticks=COUNTS, xlabel="beacons", ylabel="mean position error (m)")
+    axis.grid(visible=True, which="both", alpha=0.3)
+    axis.legend()
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+
+
+def main() -> None:
+    """Print the table and one JSON line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seed", type=int, default=Config.seed)
+    parser.add_argument("--quick", action="store_true", help="two rooms of fifty targets")
+    parser.add_argument("-o", "--output", type=Path, help="directory of the picture")
+    add_scale_options(parser)
+    given = parser.parse_args()
+    small = Config(worlds=2, targets=50) if given.quick else Config()
+    config = replace(small, seed=given.seed)
+    found = run(config, chosen_scale(given))
+    print(report(found))
+    if given.output is not None:
+        given.output.mkdir(parents=True, exist_ok=True)
+        draw(given.output / "figure_11.png", found)
+    result = {method: errors(found, method).mean(axis=1).tolist() for method in METHODS}
+    print(
+        json.dumps(
+            {
+                "beacons": COUNTS,
+                "paper_m": PAPER,
+                "position_m": result,
+                "bound_rms_m": bounds(found).tolist(),
+                "worlds": config.worlds,
+                "seed": config.seed,
+            }
+        )
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,156 @@
+"""Paper 004's algorithms beside maximum likelihood: the figures of the independent analysis."""
+
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import algorithms_compared
+import numpy as np
+import pytest
+from algorithms_compared import (
+    MAPPED,
+    METHODS,
+    ML,
+    PUBLISHED,
+    Config,
+    Outcome,
+    bounds,
+    likelihood_at_tilts,
+    means,
+    report,
+    run,
+    summary,
+    worst_ratio,
+)
+
+DISTURBED = ("S1", "F1", "F2", "P0", "P1", "P2")
+A1, A2, A3 = PUBLISHED
+Found = Mapping[str, Sequence[Outcome]]
+
+
+def position(outcomes: Sequence[Outcome], method: str) -> float:
+    return float(np.mean(means(outcomes, "position", method)))
+
+
+# Quick ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def quiet() -> list[Outcome]:
+    """Noise alone, the methods that need no map."""
+    config = Config(worlds=2, targets=800, scenarios=("S0",))
+    return run(config, {"workers": 1}, (*PUBLISHED, "A2 kNN nT", ML, "MLrel"))["S0"]
+
+
+def test_in_noise_alone_likelihood_meets_the_bound(quiet: list[Outcome]) -> None:
+    bound_m, bound_deg = bounds(quiet)
+    sums = summary(quiet)
+    assert sums[ML]["position_rms_m"] / bound_m == pytest.approx(1.0, rel=0.05)
+    attitude = np.concatenate([o.geodesic[ML] for o in quiet])
+    assert np.sqrt(np.mean(attitude**2)) / bound_deg == pytest.approx(1.0, rel=0.05)
+    assert sums[ML]["position_m"] <= 0.15 * sums[A3]["position_m"]
+    # No estimator that knows only the survey comes near.
+    assert all(sums[name]["position_rms_m"] > 5.0 * bound_m for name in PUBLISHED)
+
+
+@pytest.mark.parametrize(
+    ("method", "expected_m"),
+    [(A1, 0.023), (A2, 0.109), ("A2 kNN nT", 0.439), (A3, 0.0078), ("MLrel", 0.0014)],
+)
+def test_in_noise_alone_each_method_errs_as_the_independent_analysis_found(
+    quiet: list[Outcome], method: str, expected_m: float
+) -> None:
+    assert position(quiet, method) == pytest.approx(expected_m, rel=0.1)
+
+
+def test_attitude_by_likelihood_does_not_depend_on_the_attitude() -> None:
+    errors = list(likelihood_at_tilts(Config(tilted=300)).values())
+    assert np.mean(errors) == pytest.approx(0.040, rel=0.1)  # deg
+    assert np.ptp(errors) < 1e-3
+
+
+def test_in_a_fitted_room_the_algorithms_come_in_the_papers_order() -> None:
+    kept = run(Config(worlds=4, targets=100, scenarios=("F1",)), {"workers": 1}, PUBLISHED)["F1"]
+    disturbed = {name: position(kept, name) for name in PUBLISHED}
+    assert disturbed[A3] < disturbed[A2] < disturbed[A1]
+
+
+def test_with_a_smooth_gain_error_plain_likelihood_loses_to_algorithm_3() -> None:
+    kept = run(Config(worlds=4, targets=100, scenarios=("S1",)), {"workers": 1}, (A3, ML))["S1"]
+    assert position(kept, ML) > 1.5 * position(kept, A3)
+
+
+def test_the_report_tells_where_plain_likelihood_is_worse_and_draws_both_figures(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    found = run(Config(worlds=2, targets=50, scenarios=("F1",)), {"workers": 1})
+    plain, mapped, paper = (position(found["F1"], name) for name in (ML, MAPPED, A3))
+    assert mapped < 0.5 * paper < paper < plain
+    monkeypatch.setattr(algorithms_compared, "run", lambda *_: found)
+    monkeypatch.setattr(algorithms_compared, "likelihood_at_tilts", lambda _: {0.0: 0.04})
+    monkeypatch.setattr(sys, "argv", ["algorithms_compared.py", "--quick", "-o", str(tmp_path)])
+    algorithms_compared.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.split()[:1] == ["F1"] and "WORSE" in line for line in lines)
+    figures = json.loads(lines[-1])["scenarios"]["F1"]
+    assert set(figures) == set(METHODS)
+    assert figures[ML]["position_m"] == pytest.approx(plain, rel=1e-12)
+    assert (tmp_path / "figure_7.png").stat().st_size > 10_000
+    assert (tmp_path / "figure_8.png").stat().st_size > 10_000
+
+
+def test_one_world_has_no_standard_error_and_is_refused(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["algorithms_compared.py", "--worlds", "1"])
+    with pytest.raises(SystemExit) as ended:
+        algorithms_compared.main()
+    assert ended.value.code == 2
+    assert "--worlds must be at least 2" in capsys.readouterr().err
+
+
+# The figures ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def full() -> dict[str, list[Outcome]]:
+    return run(Config())
+
+
+@pytest.mark.slow
+def test_the_algorithms_err_in_the_fitted_rooms_as_the_paper_prints(full: Found) -> None:
+    found = [position(full["F1"], name) for name in PUBLISHED]
+    assert found[0] == pytest.approx(0.32, rel=0.30)
+    assert found[1] == pytest.approx(0.116, rel=0.12)
+    assert found[2] == pytest.approx(0.063, rel=0.25)
+    assert found[2] < found[1] < found[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", DISTURBED)
+def test_a_map_and_relative_weights_halve_the_best_published_error(
+    full: Found, scenario: str
+) -> None:
+    overall, worst = worst_ratio(full[scenario], MAPPED)
+    assert overall <= 0.5
+    assert worst < 1.0  # better in every single room
+
+
+@pytest.mark.slow
+def test_likelihood_meets_the_bound_over_all_quiet_rooms(full: Found) -> None:
+    assert summary(full["S0"])[ML]["position_rms_m"] / bounds(full["S0"])[0] == pytest.approx(
+        1.0, rel=0.05
+    )
+    assert position(full["S0"], ML) <= 0.15 * position(full["S0"], A3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scenario", "expected_m"), [("S1", 0.152), ("F1", 0.087), ("P0", 0.028)])
+def test_plain_likelihood_loses_to_algorithm_3_where_the_model_is_wrong(
+    full: Found, scenario: str, expected_m: float
+) -> None:
+    assert position(full[scenario], ML) == pytest.approx(expected_m, rel=0.35)
+    assert position(full[scenario], ML) > position(full[scenario], A3)
+    told = report({scenario: full[scenario]}, {})
+    assert "plain ML is WORSE than the paper" in told
