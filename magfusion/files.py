@@ -52,7 +52,7 @@ def read_yaml(path: Path, model: type[Model]) -> Model:
     try:
         return model.model_validate(content)
     except ValidationError as error:
-        raise InputError(f"{path}: {_sentence(error, model)}") from None
+        raise InputError(f"{path}: {sentence(error, model)}") from None
 
 
 def write_yaml(content: dict[str, Any], path: Path) -> None:
@@ -146,7 +146,8 @@ def _parse(text: str, path: Path) -> object:
         raise InputError(f"{path}: is nested too deeply; write the keys plainly.") from error
 
 
-def _sentence(error: ValidationError, model: type[BaseModel]) -> str:
+def sentence(error: ValidationError, model: type[BaseModel], whole: str = "file") -> str:
+    """Return what is wrong, and the remedy, of content that does not fit its model."""
     first, others = error.errors(include_url=False)[0], error.error_count() - 1
     place = "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in first["loc"]).lstrip(".")
     if first["type"] == "missing":
@@ -160,7 +161,7 @@ def _sentence(error: ValidationError, model: type[BaseModel]) -> str:
     else:
         remedy = re.sub(r"^(Input|String|List) should", "it should", first["msg"])
         what = f"found {_shortened(first['input'])}; {remedy}"
-    more = f" (and {others} more in this file)" if others else ""
+    more = f" (and {others} more in this {whole})" if others else ""
     return f"{place}: {what}{more}." if place else f"{what}{more}."
 
 

@@ -80,6 +80,7 @@ class SlidingWindow:
         self.applied_offset = applied_offset
         self.blocks, self.lag, self.calibration_noise = blocks, lag, calibration_noise
         self.state = self.lagged = state
+        self.left: list[State] = []  # the window, in order of time
         self.nodes: list[Node] = []
         self.prior = _prior_of(state)
 
@@ -108,7 +109,7 @@ class SlidingWindow:
         EstimationError
             Where the window cannot be solved; it is then as it was.
         """
-        kept = (self.nodes, self.prior, self.state, self.lagged)
+        kept = (self.nodes, self.prior, self.state, self.lagged, self.left)
         if not self.nodes:
             nothing = _nothing(self.state, self.applied_offset)
             self.nodes = [Node(self.state, nothing, None, None)]
@@ -121,12 +122,13 @@ class SlidingWindow:
             while self.nodes[-1].state.time - self.nodes[0].state.time > self.lag:
                 self._drop_first()
         except (RuntimeError, np.linalg.LinAlgError) as error:
-            self.nodes, self.prior, self.state, self.lagged = kept
+            self.nodes, self.prior, self.state, self.lagged, self.left = kept
             reason = str(error).strip().splitlines()[0]
             raise EstimationError(f"the window could not be solved ({reason})") from error
 
     def replace_state(self, state: State) -> None:
         """Go on from another state, with its covariance for all that was known."""
+        self.left = [*self.left, *(n.state for n in self.nodes if n.state.time < state.time)]
         self.nodes, self.prior = [], _prior_of(state)
         self.state = self.lagged = state
 
@@ -205,6 +207,7 @@ class SlidingWindow:
         root, right = _widened(root, right, noise)
         self.prior = Prior(second.state, root, right)
         self.lagged = replace(first.state, cov=self.lagged.cov)
+        self.left = [*self.left, self.lagged]
         self.nodes = self.nodes[1:]
 
 

@@ -179,6 +179,23 @@ class Navigator:
         """State that left the smoother's window last; that of the filter is of now."""
         return None if self._estimator is None else self._estimator.lagged
 
+    def take_lagged(self) -> list[State]:
+        """Return the states that left the smoother's window since this was last asked.
+
+        Their covariance is not theirs: the window has eliminated them.  A filter has none.
+        """
+        if not isinstance(self._estimator, SlidingWindow):
+            return []
+        left, self._estimator.left = self._estimator.left, []
+        return left
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """All that was refused, lost or recovered, with the reason: `counts`, windows, samples."""
+        late = {f"{b.name} sample too late": b.late for b in (self._imu, self._waveform) if b.late}
+        dropped = {} if self._receiver is None else self._receiver.dropped
+        return {**self.counts, **{f"window: {k}": v for k, v in dropped.items()}, **late}
+
     def checkpoint(self) -> bytes:
         """Return everything needed to go on: `restored` makes a navigator of it."""
         return pickle.dumps(self)
