@@ -14,8 +14,8 @@ from gtsam.symbol_shorthand import B, V, X
 from magfusion.errors import EstimationError
 from magfusion.fusion.factors import CALIBRATION_KEY, FieldFactors, FieldMeasurements
 from magfusion.fusion.propagation import Propagated
-from magfusion.fusion.state import MOTION, State, between, moved, pose_of
-from magfusion.parameters import Block, dimension
+from magfusion.fusion.state import MOTION, State, between, moved_to, pose_of
+from magfusion.parameters import Block, dimension, retract
 from magfusion.units import Array
 
 ITERATIONS_FAR = 4  # where the prediction is too wide to linearise at
@@ -149,12 +149,11 @@ class SlidingWindow:
         for key, part in _split(step, last, self.calibration_key):
             given.insert(key, part)
         steps = solved.optimize(given)
-        calibration_step = step[MOTION:]
+        calibration = retract(self.nodes[0].state.calibration, self.blocks, step[MOTION:])
         nodes = []
         for i, node in enumerate(self.nodes):
             motion = np.concatenate([steps.at(X(i)), steps.at(V(i)), steps.at(B(i))])
-            whole = np.concatenate([motion, calibration_step])
-            nodes.append(replace(node, state=moved(node.state, self.blocks, whole)))
+            nodes.append(replace(node, state=moved_to(node.state, calibration, motion)))
         self.nodes = nodes
         self.state = replace(nodes[-1].state, cov=0.5 * (cov + cov.T))
 
@@ -197,16 +196,25 @@ class SlidingWindow:
         factor.getb()[...] = right
         return factor
 
+    def _cov_of_first(self) -> Array:
+        """Return the covariance of the first state, the whole window and its past considered."""
+        later = range(len(self.nodes) - 1, 0, -1)
+        _, rest = _eliminated(self._linearized(self.nodes), _keys(later, None))
+        information, _ = rest.hessian(_keys([0], self.calibration_key))
+        cov = np.linalg.inv(information)
+        return np.asarray(0.5 * (cov + cov.T))
+
     def _drop_first(self) -> None:
         """Leave what the first node tells as a prior of the second."""
         first, second = self.nodes[:2]
+        cov = self._cov_of_first()
         graph = self._linearized([first, replace(second, rest_sigma=None, fields=_blank(second))])
         _, rest = graph.eliminatePartialSequential(_keys([0], None), gtsam.EliminateQR)
         root, right = rest.jacobian(_keys([1], self.calibration_key))
         noise = self.calibration_noise * (second.state.time - first.state.time)
         root, right = _widened(root, right, noise)
         self.prior = Prior(second.state, root, right)
-        self.lagged = replace(first.state, cov=self.lagged.cov)
+        self.lagged = replace(first.state, cov=cov)
         self.left = [*self.left, self.lagged]
         self.nodes = self.nodes[1:]
 

@@ -62,6 +62,12 @@ def pose_of(state: State) -> gtsam.Pose3:
 
 def moved(state: State, blocks: tuple[Block, ...], step: Array) -> State:
     """Return the state moved by a tangent vector; the covariance stays."""
+    calibration = retract(state.calibration, blocks, step[MOTION:])
+    return moved_to(state, calibration, step[:MOTION])
+
+
+def moved_to(state: State, calibration: Calibration, step: Array) -> State:
+    """Return the state with its motion moved by a tangent vector (15,), and another calibration."""
     pose = pose_of(state).retract(step[:6])
     return replace(
         state,
@@ -70,7 +76,7 @@ def moved(state: State, blocks: tuple[Block, ...], step: Array) -> State:
         velocity_world=state.velocity_world + step[VELOCITY],
         accel_bias_body=state.accel_bias_body + step[ACCEL_BIAS],
         gyro_bias_body=state.gyro_bias_body + step[GYRO_BIAS],
-        calibration=retract(state.calibration, blocks, step[MOTION:]),
+        calibration=calibration,
     )
 
 
