@@ -443,7 +443,8 @@ def _draw_bars(
         axis.set(yscale="log", ylabel=label)
         axis.grid(visible=True, axis="y", alpha=0.3)
     axes[1].set_xticks(np.arange(len(found)), list(found))
-    axes[0].legend(ncols=4, fontsize=8)
+    handles, names = axes[0].get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside upper center", ncols=len(colours), fontsize=8)
     figure.savefig(path, dpi=110, metadata={"Software": None})
 
 

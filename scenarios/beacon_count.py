@@ -8,6 +8,8 @@ targets lie, in the fitted rooms of `algorithms_compared` (F1), whose lines are 
    in three places, so that only the ratios can be compared.
 2. And with a map and relative weights?  By nearly the same share, from a tenth of the error.  A
    fourth beacon is worth less than a survey that is put to use.
+
+The workers of a ``--cluster`` need this directory on their PYTHONPATH.
 """
 
 import argparse
