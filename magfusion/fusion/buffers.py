@@ -7,7 +7,33 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.units import Array
 
-LARGEST_JUMP = 60.0  # s; a stamp farther ahead of its stream is a clock that jumped
+LARGEST_JUMP = 60.0  # s; a stamp farther from the newest of all streams is a clock that jumped
+
+
+def check_clock(name: str, time: Array, newest: float) -> None:
+    """Refuse samples of a clock that jumped, ahead or back.
+
+    Parameters
+    ----------
+    name : str
+        Of the stream.
+    time : ndarray, shape (k,)
+    newest : float
+        Stamp of all streams (s): one that was silent for long has not jumped.
+
+    Raises
+    ------
+    InputError
+    """
+    if len(time) == 0 or not np.isfinite(newest):
+        return
+    for ahead in (float(np.max(time)) - newest, float(np.min(time)) - newest):
+        if abs(ahead) > LARGEST_JUMP:
+            way = "ahead" if ahead > 0.0 else "back"
+            raise InputError(
+                f"{name}: its clock jumped {way} by {abs(ahead):.4g} s at {newest:.3f} s;"
+                " start a new navigator, or mend the clock"
+            )
 
 
 class Buffer:
@@ -36,18 +62,12 @@ class Buffer:
         Raises
         ------
         InputError
-            Where a number is not finite, or the clock jumped ahead.
+            Where a number is not finite.
         """
         if not (np.all(np.isfinite(time)) and np.all(np.isfinite(rows))):
             raise InputError(f"{self.name}: a sample is not finite; leave it out of the stream")
         if len(time) == 0:
             return
-        ahead = float(np.max(time)) - self.newest
-        if np.isfinite(self.newest) and ahead > LARGEST_JUMP:
-            raise InputError(
-                f"{self.name}: its clock jumped ahead by {ahead:.4g} s at {self.newest:.3f} s;"
-                " start a new navigator, or mend the clock"
-            )
         fresh = time > self.settled
         self.late += int(np.sum(~fresh))
         self._waiting.append((time[fresh], rows[fresh]))

@@ -13,7 +13,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError
 from magfusion.fixes.likelihood import fix_epochs
-from magfusion.fusion.buffers import Buffer
+from magfusion.fusion.buffers import Buffer, check_clock
 from magfusion.fusion.ekf import ErrorStateFilter
 from magfusion.fusion.epoch import channel_distances, field_rows, single, without
 from magfusion.fusion.factors import FieldMeasurements
@@ -114,9 +114,9 @@ class Navigator:
         InputError
             Where a number is not finite or the clock jumped.
         """
-        self._imu.add(
-            np.atleast_1d(time), np.hstack([np.atleast_2d(gyro_body), np.atleast_2d(accel_body)])
-        )
+        stamps = np.atleast_1d(time)
+        check_clock("imu", stamps, self._newest)
+        self._imu.add(stamps, np.hstack([np.atleast_2d(gyro_body), np.atleast_2d(accel_body)]))
         self._advance()
 
     def add_magnetometer(self, time: Array, measured_sensor: Array) -> None:
@@ -127,11 +127,20 @@ class Navigator:
         InputError
             Where a number is not finite or the clock jumped.
         """
-        self._waveform.add(np.atleast_1d(time), np.atleast_2d(measured_sensor))
+        stamps = np.atleast_1d(time)
+        check_clock("magnetometer", stamps, self._newest)
+        self._waveform.add(stamps, np.atleast_2d(measured_sensor))
         self._advance()
 
     def add_fields(self, samples: FieldSamples) -> None:
-        """Take demodulated phasors, channels in the site's order."""
+        """Take demodulated phasors, channels in the site's order.
+
+        Raises
+        ------
+        InputError
+            Where the clock jumped.
+        """
+        check_clock("fields", samples.time, self._newest)
         for i in range(len(samples)):
             one = _row(samples, i)
             if self._estimator is not None and one.time[0] <= self._estimator.state.time:
@@ -140,6 +149,12 @@ class Navigator:
             self._fields.append(one)
         self._fields.sort(key=lambda s: float(s.time[0]))
         self._advance()
+
+    @property
+    def _newest(self) -> float:
+        """Newest stamp of all streams (s)."""
+        heard = self._fields[-1].time[0] if self._fields else -np.inf
+        return float(max(self._imu.newest, self._waveform.newest, heard))
 
     # What comes out
 
@@ -182,7 +197,7 @@ class Navigator:
     def take_lagged(self) -> list[State]:
         """Return the states that left the smoother's window since this was last asked.
 
-        Their covariance is not theirs: the window has eliminated them.  A filter has none.
+        A filter has none.
         """
         if not isinstance(self._estimator, SlidingWindow):
             return []
