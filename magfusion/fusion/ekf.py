@@ -13,20 +13,6 @@ from magfusion.parameters import Block
 from magfusion.units import Array
 
 
-def updated(state: State, rows: Rows, blocks: tuple[Block, ...]) -> State:
-    """Return the state after one linear measurement: a Gauss-Newton step of the graph.
-
-    Parameters
-    ----------
-    state : State
-        The prediction, at which ``rows`` were linearised.
-    rows : Rows
-    blocks : tuple of Block
-    """
-    step, cov = _step(state.cov, rows)
-    return moved(replace(state, cov=cov), blocks, step)
-
-
 def _step(cov: Array, rows: Rows) -> tuple[Array, Array]:
     size = len(cov)
     kalman = ExtendedKalmanFilter(dim_x=size, dim_z=len(rows.error))

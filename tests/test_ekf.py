@@ -1,0 +1,185 @@
+"""One update of the filter is one Gauss-Newton step of the graph, for every measurement."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from magfusion.fusion.ekf import ErrorStateFilter
+from magfusion.fusion.epoch import field_rows, single
+from magfusion.fusion.factors import FieldMeasurements
+from magfusion.fusion.navigator import SlidingWindow
+from magfusion.fusion.propagation import calibration_walk, propagate
+from magfusion.fusion.state import MOTION, State, between, moved
+from magfusion.parameters import GROUPS, choose_blocks, dimension, initial_calibration, prior_sigma
+from magfusion.records.samples import ImuSamples
+from magfusion.simulation.demo_site import demo_site
+from magfusion.simulation.log import simulate_fields
+from magfusion.trajectory import Trajectory
+from magfusion.weights import measurement_cov, paired_whitening, stacked
+
+SEED = 11
+
+
+def a_site(synchronised=True):
+    site = demo_site(coil_radius=None)
+    beacons = tuple(replace(b, synchronised=synchronised) for b in site.beacons)
+    return replace(site, beacons=beacons)
+
+
+def a_state(site, blocks, rng):
+    size = MOTION + dimension(blocks)
+    root = rng.normal(size=(size, size)) / np.sqrt(size)
+    scale = np.concatenate(
+        [np.repeat([0.02, 0.03, 0.1, 0.05, 0.005], 3), np.minimum(prior_sigma(blocks), 0.3)]
+    )
+    cov = scale[:, None] * (0.2 * root @ root.T + np.eye(size)) * scale
+    return State(
+        time=3.0,
+        world_from_body=Rotation.from_rotvec([0.3, -0.2, 1.1]).as_matrix(),
+        position_world=np.array([2.0, 1.5, 1.1]),
+        velocity_world=np.array([0.4, -0.3, 0.1]),
+        accel_bias_body=np.array([0.02, -0.01, 0.03]),
+        gyro_bias_body=np.array([0.002, 0.001, -0.003]),
+        calibration=initial_calibration(site, 1.0),
+        cov=cov,
+    )
+
+
+def an_imu(begin, end, rng):
+    time = np.arange(begin - 0.1, end + 0.1, 0.005)
+    gyro = np.array([0.3, -0.2, 0.5]) + 0.1 * rng.normal(size=(len(time), 3))
+    accel = np.array([0.2, 0.1, 9.8]) + 0.3 * rng.normal(size=(len(time), 3))
+    return ImuSamples(time, gyro, accel)
+
+
+def an_epoch(site, state, blocks, rng):
+    """Return the factors of an epoch measured somewhat beside the state."""
+    true = moved(state, blocks, 0.3 * np.sqrt(np.diag(state.cov)) * rng.normal(size=len(state.cov)))
+    pose = Trajectory(np.array([state.time]), true.world_from_body[None], true.position_world[None])
+    samples = simulate_fields(site, pose, 1e-9, rng)
+    cov = measurement_cov(site, samples)
+    return single(
+        FieldMeasurements(
+            time=samples.time,
+            measured=stacked(samples.phasor_sensor),
+            root=paired_whitening(cov, samples.valid),
+            rate_body=np.array([[0.3, -0.2, 0.5]]),
+            applied_offset=site.platform.imu.time_offset,
+            by_time_offset=1e-7 * rng.normal(size=(1, len(site.channels), 6)),
+        ),
+        blocks,
+    )
+
+
+def one_interval(groups, synchronised=True, seed=SEED):
+    """Return a start, where the IMU leads from it, and an epoch measured there."""
+    rng = np.random.default_rng(seed)
+    site = a_site(synchronised)
+    blocks = choose_blocks(site, groups)
+    start = a_state(site, blocks, rng)
+    later = start.time + 0.4
+    predicted = propagate(
+        start, an_imu(start.time, later, rng), later, site, site.platform.imu.time_offset
+    )
+    return start, blocks, predicted, an_epoch(site, predicted.state, blocks, rng)
+
+
+MEASUREMENTS = {
+    "fields, calibration known": ((), True, True, None),
+    "fields and beacons": (("beacons", "moments"), True, True, None),
+    "fields and everything": (GROUPS, True, True, None),
+    "fields of free oscillators": (("beacons", "moments", "phase"), False, True, None),
+    "rest": (("beacons",), True, False, 0.01),
+    "fields at rest": (GROUPS, False, True, 0.01),
+}
+
+
+@pytest.mark.parametrize(
+    ("groups", "synchronised", "with_fields", "rest"), MEASUREMENTS.values(), ids=MEASUREMENTS
+)
+def test_one_update_of_the_filter_is_one_gauss_newton_step_of_the_graph(
+    groups, synchronised, with_fields, rest
+):
+    start, blocks, predicted, epoch = one_interval(groups, synchronised)
+    fields = epoch if with_fields else None
+    light = ErrorStateFilter(start, blocks)
+    light.absorb(predicted, fields, rest)
+    window = SlidingWindow(
+        start, blocks, 10.0, np.zeros(dimension(blocks)), epoch.measurements.applied_offset
+    )
+    window.absorb(predicted, fields, rest)
+    sigma = np.sqrt(np.diag(light.state.cov))
+    apart = between(light.state, window.state, blocks) / sigma
+    went = between(predicted.state, light.state, blocks) / sigma
+    assert np.max(np.abs(apart)) < 1e-9 * max(1.0, np.max(np.abs(went)))
+    scaled = (window.state.cov - light.state.cov) / np.outer(sigma, sigma)
+    assert np.max(np.abs(scaled)) < 1e-9
+
+
+def test_the_step_of_the_test_is_a_long_one():
+    start, blocks, predicted, epoch = one_interval(GROUPS)
+    light = ErrorStateFilter(start, blocks)
+    light.absorb(predicted, epoch, None)
+    went = between(predicted.state, light.state, blocks)
+    assert np.max(np.abs(went) / np.sqrt(np.diag(light.state.cov))) > 1.0
+
+
+def test_moving_there_and_asking_the_way_are_inverse():
+    start, blocks, _, _ = one_interval(GROUPS)
+    step = 0.1 * np.random.default_rng(2).normal(size=len(start.cov))
+    assert np.max(np.abs(between(start, moved(start, blocks, step), blocks) - step)) < 1e-12
+
+
+def test_the_rows_of_an_epoch_are_its_derivative():
+    _, blocks, predicted, epoch = one_interval(GROUPS)
+    state = predicted.state
+    rows = field_rows(epoch, state)
+    scale = 1e-6 * np.sqrt(np.diag(state.cov))
+    for k in range(len(state.cov)):
+        if 6 <= k < MOTION:
+            continue  # velocity and biases act through the time offset alone, to second order
+        step = np.zeros(len(state.cov))
+        step[k] = scale[k]
+        ahead, behind = (
+            field_rows(epoch, moved(state, blocks, sign * step)).error for sign in (1.0, -1.0)
+        )
+        found = (ahead - behind) / (2.0 * scale[k])
+        size = np.max(np.abs(rows.jacobian[:, k]))
+        assert np.max(np.abs(found - rows.jacobian[:, k])) < 1e-5 * size
+
+
+def test_the_calibration_gains_variance_only_where_things_drift():
+    site = a_site(synchronised=False)
+    blocks = choose_blocks(site, GROUPS)
+    walk = calibration_walk(blocks)
+    for block in blocks:
+        drifts = block.kind in ("log_moment", "phase", "drift")
+        assert np.all((walk[block.columns] > 0.0) == drifts)
+
+
+def test_the_covariance_carried_on_is_that_of_many_runs():
+    """Monte Carlo of the IMU's noise: transition and noise are those of the strapdown itself."""
+    rng = np.random.default_rng(5)
+    site = a_site()
+    blocks = ()
+    start = a_state(site, blocks, rng)
+    start = replace(start, cov=1e-16 * np.eye(MOTION))
+    model = site.platform.imu
+    quiet = an_imu(start.time, start.time + 0.5, rng)
+    later, rate = start.time + 0.5, 200.0
+    mean = propagate(start, quiet, later, site, 0.0).state
+    spread = np.sqrt(rate) * np.array([model.gyro_noise, model.accel_noise])
+    steps = []
+    for _ in range(400):
+        noisy = ImuSamples(
+            quiet.time,
+            quiet.gyro_body + spread[0] * rng.normal(size=quiet.gyro_body.shape),
+            quiet.accel_body + spread[1] * rng.normal(size=quiet.accel_body.shape),
+        )
+        steps.append(between(mean, propagate(start, noisy, later, site, 0.0).state, blocks))
+    found = np.std(np.array(steps)[:, :9], axis=0)
+    # Means of neighbouring samples carry a little less noise at the interval's ends.
+    ratio = found / np.sqrt(np.diag(mean.cov)[:9])
+    assert np.all((ratio > 0.85) & (ratio < 1.15))
