@@ -27,13 +27,15 @@ def check_clock(name: str, time: Array, newest: float) -> None:
     """
     if len(time) == 0 or not np.isfinite(newest):
         return
-    for ahead in (float(np.max(time)) - newest, float(np.min(time)) - newest):
-        if abs(ahead) > LARGEST_JUMP:
-            way = "ahead" if ahead > 0.0 else "back"
-            raise InputError(
-                f"{name}: its clock jumped {way} by {abs(ahead):.4g} s at {newest:.3f} s;"
-                " start a new navigator, or mend the clock"
-            )
+    later = np.sort(np.append(time[time > newest], newest))
+    ahead = float(np.max(np.diff(later), initial=0.0))
+    back = newest - float(np.max(time))
+    if max(ahead, back) > LARGEST_JUMP:
+        way = "back" if back > ahead else "ahead"
+        raise InputError(
+            f"{name}: its clock jumped {way} by {max(ahead, back):.4g} s at {newest:.3f} s;"
+            " start a new navigator, or mend the clock"
+        )
 
 
 class Buffer:
