@@ -165,7 +165,7 @@ def _held_figures(log: Log, site: Site, settings: SmootherSettings, result: Smoo
 
 
 def _refuse_divergence(result: Smoothed) -> None:
-    """Refuse a result that neither converged nor explains the fields."""
+    """Refuse a result that neither converged nor explains the fields, or had no start."""
     residual = (
         float(np.sqrt(np.nanmean(result.residual**2)))
         if np.isfinite(result.residual).any()
@@ -175,6 +175,12 @@ def _refuse_divergence(result: Smoothed) -> None:
         raise EstimationError(
             f"the smoother did not converge (residual {residual:.3g} where about 1 is expected):"
             " add a beacon or a coil, or check the survey"
+        )
+    if not result.converged and not result.start.determined.any():
+        # The start was arbitrary then: where the loop happened to stop, it still is.
+        raise EstimationError(
+            "no epoch alone determines its pose, and the motion did not either (the smoother did"
+            " not converge): add a beacon or a coil"
         )
 
 

@@ -12,7 +12,7 @@ from magfusion.parameters import initial_calibration
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import draw_drives, perturb_site, simulate_fields
 from magfusion.simulation.motion import random_walk_motion
-from magfusion.site import BeaconSigma, Site
+from magfusion.site import BeaconSigma, MagnetometerSigma, Site
 from magfusion.units import DEGREE
 
 RUNS = 60
@@ -55,3 +55,22 @@ def test_the_covariance_of_a_fix_holds_the_error_of_the_survey(
 def test_a_fix_that_takes_the_survey_for_exact_is_found_out() -> None:
     _, high = average_nees_bounds(6, RUNS, 0.999)
     assert mean_nees(surveyed(4, synchronised=True), survey_error=False) > 10.0 * high
+
+
+def test_a_survey_that_is_exact_adds_nothing_to_the_covariance() -> None:
+    site, sensor = surveyed(4, synchronised=True), demo_site().platform.magnetometer
+    exact = BeaconSigma(np.zeros(3), np.zeros(3), np.zeros(2))
+    none = MagnetometerSigma(np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.zeros(3))
+    site = replace(
+        site,
+        beacons=tuple(replace(b, sigma=exact) for b in site.beacons),
+        platform=replace(site.platform, magnetometer=replace(sensor, sigma=none)),
+    )
+    rng = np.random.default_rng(1)
+    truth = random_walk_motion(rng, 20.0, DEMO_BOX_WORLD).trajectory(np.array([6.0, 9.0]))
+    samples = simulate_fields(site, truth, NOISE, rng)
+    with_survey, without = (
+        fix_epochs(samples, initial_calibration(site, 0.0), survey_error=on) for on in (True, False)
+    )
+    assert with_survey.determined[:, 0].all()
+    np.testing.assert_allclose(with_survey.pose_cov[:, 0], without.pose_cov[:, 0], rtol=1e-6)

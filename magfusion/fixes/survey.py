@@ -71,7 +71,7 @@ def whitened(root: Array, columns: Array) -> Array:
     """
     m, channels, _, width = columns.shape
     halves = columns.reshape(m, channels, 2, 3, width)
-    return np.asarray((root[:, :, None] @ halves).reshape(m, -1, width))
+    return np.asarray((root[:, :, None] @ halves).reshape(m, 6 * channels, width))
 
 
 def honest_covariance(

@@ -10,7 +10,7 @@ from magfusion.parameters import Calibration
 from magfusion.records.samples import ImuSamples
 from magfusion.strapdown import attitude_at, attitude_from_gyro
 from magfusion.trajectory import Trajectory
-from magfusion.units import Array, IntArray
+from magfusion.units import Array, BoolArray, IntArray
 
 SPEED_SIGMA = 1.0  # m/s; of the platform between two epochs
 POSITION_SIGMA = 0.1  # m; added to the fixes' own, which calibration errors exceed
@@ -36,12 +36,15 @@ class Start:
         Hypothesis of each epoch.
     cost : float
         Chi square of the chain.
+    determined : bool ndarray, shape (n,)
+        False where the epoch alone leaves a direction of its pose open.
     """
 
     states: Trajectory
     phase: Array
     chosen: IntArray
     cost: float
+    determined: BoolArray
 
 
 def choose_chains(
@@ -97,6 +100,7 @@ def _start(fixes: Fixes, chosen: IntArray, cost: float) -> Start:
         phase=fixes.phase[rows, chosen],
         chosen=chosen,
         cost=cost,
+        determined=fixes.determined[rows, chosen],
     )
 
 
