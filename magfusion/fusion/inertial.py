@@ -83,9 +83,10 @@ def _in_gap(time: Array, grid: Array) -> BoolArray:
     return np.asarray(spacing[holding] > GAP_SAMPLES * usual)
 
 
-def _parameters(
+def preintegration_parameters(
     imu: ImuModel, gravity: float, *, bridge: bool
 ) -> gtsam.PreintegrationCombinedParams:
+    """Return GTSAM's noise of an inertial stream; ``bridge`` for a stretch without samples."""
     parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
     gyro = max(imu.gyro_noise, BRIDGE_GYRO_NOISE) if bridge else imu.gyro_noise
     accel = max(imu.accel_noise, BRIDGE_ACCEL_NOISE) if bridge else imu.accel_noise
@@ -118,8 +119,8 @@ def preintegrate(
     list
         One for each interval.
     """
-    usual = _parameters(imu, gravity, bridge=False)
-    wide = _parameters(imu, gravity, bridge=True)
+    usual = preintegration_parameters(imu, gravity, bridge=False)
+    wide = preintegration_parameters(imu, gravity, bridge=True)
     gyro, accel, dt = increments.gyro_body, increments.accel_body, increments.dt.tolist()
     out = []
     for i, (lo, hi) in enumerate(
