@@ -47,15 +47,20 @@ class Job:
     topics: Topics | None = None
 
 
-_RESULT = {"trajectory.tum", "trajectory.parquet", "site.yaml", "run.rrd", "report.json"}
+_SITE = {"site.yaml", "site_field_map.parquet"}
+_RESULT = {"trajectory.tum", "trajectory.parquet", *_SITE, "run.rrd", "report.json"}
 _TABLES = {"imu.parquet", "magnetometer.parquet", "fields.parquet", "truth.parquet"}
-_LOG = {"log.yaml", "site.yaml", "true_site.yaml", "report.json", *_TABLES}
+_TRUE_SITE = {"true_site.yaml", "true_site_field_map.parquet"}
+_LOG = {"log.yaml", *_SITE, *_TRUE_SITE, "report.json", *_TABLES}
+_UNFINISHED = {"checkpoint.bin", "checkpoint.rows"}  # of magfusion navigate while it runs
 _WRITTEN = {
     "smooth": _RESULT | {"fixes.parquet"},
     "fix": _RESULT | {"fixes.parquet"},
+    "navigate": _RESULT | {"lagged.parquet"} | _UNFINISHED,
     "simulate": _LOG,
     "demodulate": _LOG,
     "survey": {"survey.parquet", "survey.png", "report.json"},
+    "calibrate log": {"site.yaml", "site_field_map.parquet", "calibration.png", "report.json"},
     "calibrate beacon": {"site.yaml", "site_field_map.parquet", "beacon.png", "report.json"},
     "calibrate antenna": {"site.yaml", "site_field_map.parquet", "antenna.png", "report.json"},
     "calibrate fieldmap": {"site.yaml", "site_field_map.parquet", "field_map.png", "report.json"},
@@ -73,6 +78,8 @@ _WRITTEN = {
 
 def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
     """Tell whether a directory holds nothing but an earlier result of these jobs."""
+    if "navigate" in kinds and {entry.name for entry in path.iterdir()} <= _UNFINISHED:
+        return True
     try:
         report = json.loads((path / "report.json").read_text(encoding="utf-8"))
         job = report["job"]
@@ -110,8 +117,14 @@ def named(place: Path | str) -> Iterator[None]:
         raise InputError(f"{place}: {error}") from error
 
 
-def read_job(job: Job) -> tuple[Log, Site]:
+def read_job(job: Job, *, unknown: bool = False) -> tuple[Log, Site]:
     """Read the log and the site of a job, and see that they belong together.
+
+    Parameters
+    ----------
+    job : Job
+    unknown : bool
+        Whether the job can do with beacons that were never surveyed.
 
     Raises
     ------
@@ -125,7 +138,7 @@ def read_job(job: Job) -> tuple[Log, Site]:
             f"{job.log_path}: holds no site.yaml; name the site's file with --site SITE.yaml"
         )
     site_path = job.log_path / "site.yaml" if job.site_path is None else job.site_path
-    site = load_site(site_path)
+    site = load_site(site_path, unknown=unknown)
     log = _open(job)
     if log.waveform is not None:
         with named(site_path):
