@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from magfusion.field_map import FieldMap
-from magfusion.units import Array, ComplexArray
+from magfusion.units import Array, ComplexArray, IntArray
 
 
 def _zeros3() -> Array:
@@ -41,6 +41,38 @@ class Coil:
     length: float | None = None
     frequency_hz: float | None = None
     slot: int | None = None
+
+
+@dataclass(frozen=True)
+class Slots:
+    """Time division: the coils of a beacon are driven in turn, slot after slot, cycle after cycle.
+
+    Parameters
+    ----------
+    duration : float
+        Of one slot (s).
+    count : int
+        Slots in a cycle; those that no coil names are silent.
+    start : float
+        When slot 0 of a cycle begins on the log's clock (s).
+    """
+
+    duration: float
+    count: int
+    start: float = 0.0
+
+    @property
+    def cycle(self) -> float:
+        """Duration of a cycle (s)."""
+        return self.duration * self.count
+
+    def running(self, time: Array) -> IntArray:
+        """Return the number of the slot at each time, counted on since ``start``.
+
+        Modulo ``count`` it is the slot in its cycle; a time that rounding takes from the beginning
+        of a slot belongs to that slot.
+        """
+        return np.floor((time - self.start) / self.duration + 1e-6).astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +112,9 @@ class Beacon:
     sigma : BeaconSigma
     field_map : FieldMap, optional
         How its field differs from the model where it was surveyed.
+    slots : Slots, optional
+        When its coils are driven, where they are driven in turn and that is known; a frequency of
+        zero then means pulses of direct current.
     """
 
     name: str
@@ -90,6 +125,7 @@ class Beacon:
     synchronised: bool
     sigma: BeaconSigma
     field_map: FieldMap | None = None
+    slots: Slots | None = None
 
     @cached_property
     def tones(self) -> tuple[tuple[float, int | None], ...]:

@@ -24,6 +24,7 @@ from magfusion.site import (
     MagnetometerSigma,
     Platform,
     Site,
+    Slots,
 )
 from magfusion.site_schema import (
     BeaconEntry,
@@ -140,6 +141,9 @@ def _beacon(entry: BeaconEntry) -> Beacon:
         frequency_hz=entry.frequency_hz,
         coils=tuple(_coil(c) for c in entry.coils),
         synchronised=entry.synchronised,
+        slots=None
+        if entry.slots is None
+        else Slots(entry.slots.duration_s, entry.slots.count, entry.slots.start_s),
         sigma=BeaconSigma(
             position_world=sigma.position_m,
             rotation_beacon=sigma.rotation_deg * DEGREE,
@@ -237,6 +241,7 @@ def _beacon_entry(beacon: Beacon) -> dict[str, Any]:
         "rpy_deg": _rpy_deg(beacon.world_from_beacon),
         "frequency_hz": float(beacon.frequency_hz),
         "coils": [_coil_entry(c) for c in beacon.coils],
+        **_slots_entry(beacon),
         "synchronised": bool(beacon.synchronised),
         "sigma": {
             "position_m": _sigma_entry(beacon.sigma.position_world),
@@ -244,6 +249,14 @@ def _beacon_entry(beacon: Beacon) -> dict[str, Any]:
             "log_moment": _sigma_entry(beacon.sigma.log_moment),
         },
     }
+
+
+def _slots_entry(beacon: Beacon) -> dict[str, Any]:
+    slots = beacon.slots
+    if slots is None:
+        return {}
+    times = {"duration_s": float(slots.duration), "count": int(slots.count)}
+    return {"slots": times | {"start_s": float(slots.start)}}
 
 
 def _coil_entry(coil: Coil) -> dict[str, Any]:

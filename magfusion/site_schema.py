@@ -6,8 +6,15 @@ import sys
 from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import AfterValidator, Field, PlainValidator, ValidationError, model_validator
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic import (
+    AfterValidator,
+    Field,
+    PlainValidator,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
+from pydantic_core import InitErrorDetails, PydanticCustomError, PydanticKnownError
 
 from magfusion.files import StrictModel
 from magfusion.units import Array
@@ -161,6 +168,14 @@ class CoilEntry(StrictModel):
     slot: Annotated[int, Field(ge=0)] | None = None
 
 
+class SlotsEntry(StrictModel):
+    """When the coils of a beacon are driven, one after the other."""
+
+    duration_s: _Positive
+    count: Annotated[int, Field(ge=1, le=1000)]
+    start_s: float = 0.0
+
+
 class BeaconSigmaEntry(StrictModel):
     """Priors of a beacon's calibration; an absent one is zero, which means known."""
 
@@ -171,16 +186,36 @@ class BeaconSigmaEntry(StrictModel):
     )
 
 
+def _direct_current_only_in_slots(value: float, info: ValidationInfo) -> float:
+    if value < 0.0 or (value == 0.0 and info.data.get("slots") is None):
+        raise PydanticKnownError("greater_than", {"gt": 0})
+    return value
+
+
 class BeaconEntry(StrictModel):
     """One beacon with its coils."""
 
     name: Annotated[str, Field(min_length=1)]
     position_m: _Vector
     rpy_deg: _Vector
-    frequency_hz: _Positive
+    slots: SlotsEntry | None = None
+    frequency_hz: Annotated[float, AfterValidator(_direct_current_only_in_slots)]
     coils: Annotated[list[CoilEntry], _some("coil")]
     synchronised: bool = True
     sigma: BeaconSigmaEntry = Field(default_factory=BeaconSigmaEntry)
+
+    @model_validator(mode="after")
+    def _coils_fit_the_slots(self) -> Self:
+        if self.slots is None:
+            return self
+        for i, coil in enumerate(self.coils):
+            if coil.slot is None or coil.slot >= self.slots.count:
+                remedy = f"give one of the beacon's {self.slots.count} slots, counted from 0"
+                raise _refusal_at(("coils", i, "slot"), coil.slot, remedy)
+        if not self.synchronised:
+            remedy = "write true: slots are counted on the log's clock, which the drive must keep"
+            raise _refusal_at(("synchronised",), False, remedy)
+        return self
 
     @model_validator(mode="after")
     def _one_sigma_per_coil(self) -> Self:
