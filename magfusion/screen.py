@@ -10,28 +10,49 @@ from rich.table import Table
 from magfusion.report import Figures
 
 _ERRORS = {
-    "position (m)": ("ate_m", "aligned_ate_m", "held_ate_m", "position_sigma_median_m"),
+    "position (m)": (
+        "ate_m",
+        "aligned_ate_m",
+        "held_ate_m",
+        "lagged_ate_m",
+        "position_sigma_median_m",
+    ),
     "attitude (deg)": (
         "attitude_rmse_deg",
         "aligned_attitude_rmse_deg",
         "held_attitude_rmse_deg",
+        "lagged_attitude_rmse_deg",
         "attitude_sigma_median_deg",
     ),
-    "step, position (m)": ("rpe_translation_m", "", "held_rpe_translation_m", ""),
-    "step, attitude (deg)": ("rpe_rotation_deg", "", "held_rpe_rotation_deg", ""),
+    "step, position (m)": (
+        "rpe_translation_m",
+        "",
+        "held_rpe_translation_m",
+        "lagged_rpe_translation_m",
+        "",
+    ),
+    "step, attitude (deg)": (
+        "rpe_rotation_deg",
+        "",
+        "held_rpe_rotation_deg",
+        "lagged_rpe_rotation_deg",
+        "",
+    ),
 }
-_COLUMNS = ("rms", "aligned", "survey held", "claimed sigma per axis")
+_COLUMNS = ("rms", "aligned", "survey held", "lagged", "claimed sigma per axis")
 # Told in tables or sentences, or of interest only in report.json.
 _ELSEWHERE = re.compile(
     r"ambiguity.*|"
-    r"job|log|notes|ate_m|attitude_rmse_deg|aligned_.*|rpe_.*|held_.*|.*_sigma_median_.*|cost|failed|"
+    r"job|log|notes|ate_m|attitude_rmse_deg|aligned_.*|rpe_.*|held_.*|lagged_.*|.*_sigma_median_.*|cost|failed|"
     r"nees_median|(position|attitude)_inside_3_sigma|start_.*|rival_.*|ambiguous|not_compared|"
     r"(windows|epochs)_dropped_.*|determined|undetermined|time_offset_s|passes|iterations|.*\..*"
 )
 _USUAL = {"coupling": "tight", "converged": True, "windows_dropped": 0, "epochs_dropped": 0}
 _USUAL |= {"intervals_bridged": 0}
 _USUAL |= {"ambiguous_epochs": 0, "undetermined_epochs": 0}
-_LISTED = re.compile(r"(?P<name>residual_rms|sigma|points_hearing)_(?P<part>.+?)(?P<unit>_t)?")
+_LISTED = re.compile(
+    r"(?P<name>residual_rms|sigma|points_hearing|distortion)_(?P<part>.+?)(?P<unit>_t)?"
+)
 _PART = re.compile(r"_([xyz]|\d)(?=(_m|_deg|_ppm)?$)|(?<=_[xyz])[xyz]$")
 POOR_FIT = 3.0  # whitened residual, one where noise and model are as declared
 
@@ -102,7 +123,9 @@ def _sentences(figures: Figures, key: str) -> list[str]:
 
 
 def _errors(figures: Figures) -> Table:
-    used = [k for k in range(4) if any(names[k] in figures for names in _ERRORS.values())]
+    used = [
+        k for k in range(len(_COLUMNS)) if any(names[k] in figures for names in _ERRORS.values())
+    ]
     table = Table("", *(_COLUMNS[k] for k in used), box=None)
     for label, names in _ERRORS.items():
         if any(name in figures for name in names):

@@ -30,6 +30,7 @@ FLOORS = (
         "match_plot",
         "survey_plot",
         "view_coverage",
+        "view_live",
     },
     {"pipeline", "jobs", "screen", "options"},
     {"demo"},
@@ -98,7 +99,8 @@ def test_the_drawn_imports_leave_no_circle() -> None:
 
 
 def test_only_the_view_imports_rerun() -> None:
-    assert _importers("rerun") <= {"magfusion/view.py", "magfusion/view_coverage.py"}
+    views = {"view", "view_coverage", "view_live"}
+    assert _importers("rerun") <= {f"magfusion/{name}.py" for name in views}
 
 
 def test_only_the_plot_imports_matplotlib() -> None:

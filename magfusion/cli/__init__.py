@@ -10,6 +10,7 @@ from magfusion.cli import (
     calibrate_commands,
     log_commands,
     match_commands,
+    online_commands,
     plan_commands,
     result_commands,
 )
@@ -20,6 +21,7 @@ COMMANDS = (
     calibrate_commands,
     log_commands,
     match_commands,
+    online_commands,
     plan_commands,
     result_commands,
 )  # imported, they are registered
