@@ -9,6 +9,7 @@ from magfusion.records.samples import Waveform
 from magfusion.simulation.disturbance import Ambient, Spheres
 from magfusion.simulation.field import Drives, phasors_world
 from magfusion.simulation.motion import Motion
+from magfusion.simulation.slots import check_slots, slot_gates
 from magfusion.site import Site
 from magfusion.units import Array
 
@@ -74,8 +75,8 @@ def simulate_waveform(
     Raises
     ------
     InputError
-        If the rate is too low for the tones, coils are driven in time slots, whose schedule no
-        site declares, or the motion leads through iron.
+        If the rate is too low for the tones or slots, coils are driven in time slots whose schedule
+        the site does not declare, or the motion leads through iron.
     """
     _check_tones(site, rate_hz)
     count = int(np.floor(duration * rate_hz * (1.0 + 1e-12)))
@@ -112,11 +113,7 @@ def _check_tones(site: Site, rate_hz: float) -> None:
                 f"magnetometer_rate_hz: found {rate_hz} Hz and a tone of {highest} Hz in beacon "
                 f"{beacon.name}; give at least {LEAST_SAMPLES_PER_CYCLE * highest} Hz"
             )
-        if any(slot is not None for _, slot in beacon.tones):
-            raise InputError(
-                f"beacons.{beacon.name}: found coils in time slots, of which no waveform can be "
-                "simulated; give each coil a frequency_hz instead"
-            )
+        check_slots(beacon, rate_hz)
 
 
 def _beacons_world(
@@ -126,10 +123,11 @@ def _beacons_world(
     first = 0
     for beacon, drift in zip(site.beacons, drives.drift, strict=True):
         phasors = phasors_world(beacon, point_world, spheres)
+        gates = slot_gates(beacon, time)
         for k, frequency_hz in enumerate(beacon.tone_frequencies_hz):
             turns = 2.0 * np.pi * frequency_hz * (1.0 + drift) * time
             carrier = np.exp(1j * (turns + drives.phase[first + k]))
-            field_world += np.real(phasors[:, k] * carrier[:, None])
+            field_world += np.real(phasors[:, k] * (gates[:, k] * carrier)[:, None])
         first += len(beacon.tones)
     return field_world
 
