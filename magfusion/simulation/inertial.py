@@ -36,6 +36,15 @@ class BiasInstability:
     accel: float
     time: float
 
+    @property
+    def sigma(self) -> Array:
+        """Standard deviation of the process: gyro (rad/s), accelerometer (m/s^2)."""
+        return np.array([self.gyro, self.accel]) / _PEAK_HEIGHT
+
+    def decay(self, rate_hz: float) -> float:
+        """Return what is left of the process one sample later."""
+        return float(np.exp(-_PEAK_TIME / (self.time * rate_hz)))
+
 
 class SimulatedImu(NamedTuple):
     """Samples and the true biases in them, shape (n, 3) each (rad/s, m/s^2)."""
@@ -92,8 +101,9 @@ def simulate_imu(
     gyro_bias = _bias_walk(rng, count, rate_hz, imu.gyro_bias_sigma, imu.gyro_bias_walk)
     accel_bias = _bias_walk(rng, count, rate_hz, imu.accel_bias_sigma, imu.accel_bias_walk)
     if instability is not None:
-        gyro_bias += _instability(rng, count, rate_hz, instability.gyro, instability.time)
-        accel_bias += _instability(rng, count, rate_hz, instability.accel, instability.time)
+        decay = instability.decay(rate_hz)
+        for bias, sigma in zip((gyro_bias, accel_bias), instability.sigma, strict=True):
+            bias += _instability(rng, count, sigma, decay)
     white = np.sqrt(rate_hz) * rng.normal(size=(2, count, 3))
     gyro = motion.rate_body(instant) + gyro_bias + imu.gyro_noise * white[0]
     force = motion.specific_force_body(instant, gravity)
@@ -110,12 +120,8 @@ def _bias_walk(
     return np.asarray(np.cumsum(steps, axis=0))
 
 
-def _instability(
-    rng: np.random.Generator, count: int, rate_hz: float, floor: float, peak_time: float
-) -> Array:
+def _instability(rng: np.random.Generator, count: int, sigma: float, decay: float) -> Array:
     """Return a stationary first-order Gauss-Markov process, shape (count, 3)."""
-    sigma = floor / _PEAK_HEIGHT
-    decay = np.exp(-_PEAK_TIME / (peak_time * rate_hz))
     drive = rng.normal(0.0, sigma * np.sqrt(1.0 - decay**2), (count, 3))
     drive[0] = rng.normal(0.0, sigma, 3)
     return np.asarray(lfilter([1.0], [1.0, -decay], drive, axis=0))

@@ -1,0 +1,404 @@
+"""Days of samples, made piece by piece: mostly at rest, a walk every hour, and all that drifts.
+
+All randomness belongs to blocks of a minute, each with a generator of its own, so that neither the
+length of the pieces nor where a run is taken up again changes a sample.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.signal import lfilter
+
+from magfusion.errors import InputError
+from magfusion.records.samples import FieldSamples, ImuSamples
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD
+from magfusion.simulation.disturbance import DayNight
+from magfusion.simulation.drift import (
+    COPPER_PER_KELVIN,
+    Clock,
+    DailySwing,
+    Drift,
+    Wander,
+    WarmUp,
+    draw_drift,
+)
+from magfusion.simulation.inertial import BiasInstability
+from magfusion.simulation.log import draw_drives, perturb_site, simulate_fields
+from magfusion.simulation.motion import Motion, Rests, random_walk_motion
+from magfusion.site import ImuModel, Site
+from magfusion.trajectory import Trajectory
+from magfusion.units import NANOTESLA, Array, BoolArray, ComplexArray
+
+BLOCK = 60.0  # s
+HOUR = 3600.0  # s
+MOST_HOURS = 1000.0
+SCHEDULE = Rests(start=40.0, move=180.0, pause=3420.0)
+MARGIN = 10.0  # s before and after a walk in which fields come as often as in it
+DAYTIME = 14.0 * HOUR  # loudest and warmest; the run starts at midnight
+HEAT = WarmUp(rise=20.0, time_constant=90.0 * 60.0)
+CURRENT_PER_KELVIN = 1e-4  # what a current source loses
+_WORLD, _IMU, _FIELDS = range(3)  # first key of each stream of random numbers
+
+
+def usual_drift(drive: str, clock_rate: float) -> Drift:
+    """Return what drifts: moments, their gain, one clock for all drives, the sensor's scale.
+
+    Parameters
+    ----------
+    drive : {'current', 'voltage'}
+        A voltage drives less current through warmer copper.
+    clock_rate : float
+        Relative error of the drives' common clock.
+    """
+    return Drift(
+        coils=HEAT,
+        fading_per_kelvin=COPPER_PER_KELVIN if drive == "voltage" else CURRENT_PER_KELVIN,
+        gain=Wander(rms=0.003, time_constant=4.0 * HOUR),
+        clock=Clock(rate=clock_rate, walk=1e-9),
+        sensor=DailySwing(amplitude=4.0, warmest_time=DAYTIME),
+        scale_per_kelvin=5e-5,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class EnduranceConfig:
+    """What happens in the hours.
+
+    Parameters
+    ----------
+    hours : float
+    drift : Drift
+        Of moments and sensor, and of the clock that all drives have in common; beacons that are not
+        synchronised part from it besides, each at a rate of its own.
+    schedule : Rests
+        Walks, and the rests between them.
+    box_world : ndarray, shape (2, 3)
+        Where the platform goes (m).
+    speed : float
+        (m/s)
+    imu_rate_hz : float
+    instability : BiasInstability, optional
+        Of the IMU, beside its bias walk.
+    noise : DayNight
+        Of the field.
+    window : float
+        Of a phasor (s).
+    rest_interval, walk_interval : float
+        Between two phasors (s).
+    """
+
+    hours: float
+    drift: Drift = field(default_factory=lambda: usual_drift("current", 0.0))
+    schedule: Rests = SCHEDULE
+    box_world: Array = field(default_factory=lambda: DEMO_BOX_WORLD)
+    speed: float = 0.5
+    imu_rate_hz: float = 100.0
+    instability: BiasInstability | None = None
+    noise: DayNight = field(
+        default_factory=lambda: DayNight(0.2 * NANOTESLA, 0.4 * NANOTESLA, DAYTIME)
+    )
+    window: float = 0.4
+    rest_interval: float = 60.0
+    walk_interval: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be simulated."""
+        if not 0.0 < self.hours <= MOST_HOURS:
+            raise InputError(f"hours: found {self.hours:g}; give more than 0 and at most 1000")
+        for name in ("rest_interval", "walk_interval"):
+            ratio = BLOCK / getattr(self, name)
+            if ratio < 1.0 or abs(ratio - round(ratio)) > 1e-9:
+                raise InputError(f"{name}: found {getattr(self, name):g} s; give a part of 60 s")
+
+    @property
+    def blocks(self) -> int:
+        """Number of blocks."""
+        return max(1, round(self.hours * HOUR / BLOCK))
+
+    def active(self, time: Array) -> BoolArray:
+        """Tell at which times the platform walks, or is about to, or just has."""
+        rests = self.schedule
+        cycle = rests.move + rests.pause
+        since = (time - rests.start + MARGIN) % cycle
+        walks = time >= rests.start - MARGIN
+        return np.asarray(walks & (since <= rests.move + 2.0 * MARGIN))
+
+
+@dataclass(frozen=True, eq=False)
+class Biases:
+    """Where the bias processes are between two blocks: walks and Gauss-Markov parts, (2, 3) each.
+
+    First the gyro's (rad/s), then the accelerometer's (m/s^2).
+    """
+
+    walk: Array
+    wander: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Some minutes of samples and what was true.
+
+    Parameters
+    ----------
+    first : int
+        First block.
+    imu : ImuSamples
+    fields : FieldSamples
+    gyro_bias_body, accel_bias_body : ndarray, shape (n, 3)
+        At the inertial samples (rad/s, m/s^2).
+    after : Biases
+        Where to go on.
+    """
+
+    first: int
+    imu: ImuSamples
+    fields: FieldSamples
+    gyro_bias_body: Array
+    accel_bias_body: Array
+    after: Biases
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """One draw of everything that is true for the whole run; a few megabytes for 48 hours.
+
+    Parameters
+    ----------
+    config : EnduranceConfig
+    site : Site
+        As the estimator knows it.
+    true_site : Site
+    motion : Motion
+    log_gain : ndarray, shape (blocks + 1, beacons)
+        Of the moments, at the blocks' edges.
+    phase : ndarray, shape (blocks + 1, channels)
+        Beyond what is declared (rad).
+    scale : ndarray, shape (blocks + 1,)
+        Of the magnetometer.
+    seed : tuple of int
+    """
+
+    config: EnduranceConfig
+    site: Site
+    true_site: Site
+    motion: Motion
+    log_gain: Array
+    phase: Array
+    scale: Array
+    seed: tuple[int, ...]
+
+    def start(self) -> Biases:
+        """Return the biases at the beginning."""
+        rng = _generator(self.seed, _WORLD, 1)
+        imu = self.true_site.platform.imu
+        first = np.array([[imu.gyro_bias_sigma], [imu.accel_bias_sigma]])
+        walk = first * rng.standard_normal((2, 3))
+        return Biases(walk, _wander_sigma(self.config.instability) * rng.standard_normal((2, 3)))
+
+    def stretch(self, first: int, count: int, before: Biases) -> Stretch:
+        """Return some blocks of samples.
+
+        Parameters
+        ----------
+        first, count : int
+            Blocks; no more than there are.
+        before : Biases
+            From the stretch before.
+        """
+        count = min(count, self.config.blocks - first)
+        inertial, fields = [], []
+        still: dict[int, ComplexArray] = {}
+        for block in range(first, first + count):
+            made = self._inertial(block, before)
+            before = made[-1]
+            inertial.append(made)
+            fields.append(self._fields(block, still))
+        time, gyro, accel, gyro_bias, accel_bias = (
+            np.concatenate([made[i] for made in inertial]) for i in range(5)
+        )
+        return Stretch(
+            first=first,
+            imu=ImuSamples(time, gyro, accel),
+            fields=_joined(fields),
+            gyro_bias_body=gyro_bias,
+            accel_bias_body=accel_bias,
+            after=before,
+        )
+
+    def truth(self, stretch: Stretch, time: Array) -> Trajectory:
+        """Return what was true at times within a stretch."""
+        biases = (
+            np.stack([np.interp(time, stretch.imu.time, axis) for axis in stream.T], axis=1)
+            for stream in (stretch.gyro_bias_body, stretch.accel_bias_body)
+        )
+        gyro_bias, accel_bias = biases
+        poses = self.motion.trajectory(time)
+        return replace(poses, gyro_bias_body=gyro_bias, accel_bias_body=accel_bias)
+
+    def _inertial(
+        self, block: int, before: Biases
+    ) -> tuple[Array, Array, Array, Array, Array, Biases]:
+        rng, imu = _generator(self.seed, _IMU, block), self.true_site.platform.imu
+        rate_hz = self.config.imu_rate_hz
+        begin, end = (round(k * BLOCK * rate_hz) for k in (block, block + 1))
+        time = np.arange(begin, end) / rate_hz
+        ideal = self._ideal(time + imu.time_offset)
+        bias, after = _carried_on(before, imu, self.config.instability, rate_hz, len(time), rng)
+        white = np.sqrt(rate_hz) * rng.standard_normal((2, len(time), 3))
+        gyro = ideal[0] + bias[0] + imu.gyro_noise * white[0]
+        accel = ideal[1] + bias[1] + imu.accel_noise * white[1]
+        return time, gyro, accel, bias[0], bias[1], after
+
+    def _ideal(self, time: Array) -> tuple[Array, Array]:
+        """Return rate and specific force; what does not move is asked once."""
+        asked = time if np.any(self.config.active(time)) else time[:1]
+        return (
+            self.motion.rate_body(asked),
+            self.motion.specific_force_body(asked, self.true_site.gravity),
+        )
+
+    def _fields(self, block: int, still: dict[int, ComplexArray]) -> FieldSamples:
+        config, site = self.config, self.true_site
+        time = self._field_times(block)
+        rng = _generator(self.seed, _FIELDS, block)
+        place = time / BLOCK
+        edges = np.arange(block, block + 2)
+        log_gain, phase, scale = (
+            _between(edges, known[block : block + 2], place)
+            for known in (self.log_gain, self.phase, self.scale[:, None])
+        )
+        owner = [i for i, b in enumerate(site.beacons) for _ in b.tones]
+        drive = scale * np.exp(log_gain[:, owner] + 1j * phase)
+        seen = drive[..., None] * self._undisturbed(time, still)
+        sigma = config.noise.density(time) / np.sqrt(config.window)
+        noise = sigma[:, None, None] * rng.standard_normal((2, *seen.shape))
+        cov = sigma[:, None, None, None] ** 2 * np.eye(3)
+        return FieldSamples(
+            time=time,
+            window=np.full(len(time), config.window),
+            channels=site.channels,
+            phasor_sensor=seen + noise[0] + 1j * noise[1],
+            phasor_cov=np.broadcast_to(cov, (*seen.shape, 3)).copy(),
+        )
+
+    def _undisturbed(self, time: Array, still: dict[int, ComplexArray]) -> ComplexArray:
+        """Return the phasors as declared; those of a rest are reckoned once, at its middle."""
+        if np.any(self.config.active(time)):
+            return self._phasors(time)
+        rests = self.config.schedule
+        cycle = rests.move + rests.pause
+        rest = int(np.floor((time[0] - rests.start) / cycle))
+        if rest not in still:
+            middle = rests.start + rest * cycle + rests.move + 0.5 * rests.pause
+            still[rest] = self._phasors(np.array([max(middle, 0.0)]))
+        return np.repeat(still[rest], len(time), axis=0)
+
+    def _phasors(self, time: Array) -> ComplexArray:
+        poses = self.motion.trajectory(time)
+        rng = np.random.default_rng(0)  # of noise that is none
+        return simulate_fields(self.true_site, poses, 0.0, rng).phasor_sensor
+
+    def _field_times(self, block: int) -> Array:
+        config = self.config
+        within = np.arange(round(BLOCK / config.walk_interval)) * config.walk_interval
+        often = block * BLOCK + within
+        every = round(config.rest_interval / config.walk_interval)
+        seldom = np.arange(len(often)) % every == 0
+        return np.asarray(often[config.active(often) | seldom])
+
+
+def draw_endurance(site: Site, config: EnduranceConfig, seed: tuple[int, ...]) -> World:
+    """Draw a world.
+
+    Parameters
+    ----------
+    site : Site
+        As the estimator knows it; the true calibration is drawn from its sigmas.
+    config : EnduranceConfig
+    seed : tuple of int
+
+    Raises
+    ------
+    InputError
+        If the site or the configuration cannot be simulated.
+    """
+    site_rng, motion_rng, drift_rng, clock_rng = _generator(seed, _WORLD, 0).spawn(4)
+    true_site = perturb_site(site, site_rng)
+    motion = random_walk_motion(
+        motion_rng,
+        config.blocks * BLOCK,
+        config.box_world,
+        config.speed,
+        rests=config.schedule,
+    )
+    edges = BLOCK * np.arange(config.blocks + 1)
+    drawn = draw_drift(config.drift, edges, len(site.beacons), drift_rng)
+    tones_hz = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
+    drives = draw_drives(site, clock_rng)
+    tones = [len(b.tones) for b in site.beacons]
+    own = [
+        np.zeros(len(edges))
+        if beacon.synchronised
+        else Clock(float(rate), 1e-9).lead(edges, clock_rng)
+        for beacon, rate in zip(site.beacons, drives.drift, strict=True)
+    ]
+    lead = drawn.lead[:, None] + np.repeat(np.stack(own, axis=1), tones, axis=1)
+    return World(
+        config=config,
+        site=site,
+        true_site=true_site,
+        motion=motion,
+        log_gain=drawn.log_gain,
+        phase=drives.phase + 2.0 * np.pi * lead * tones_hz,
+        scale=drawn.sensor_scale,
+        seed=seed,
+    )
+
+
+def _generator(seed: tuple[int, ...], stream: int, block: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream, block)))
+
+
+def _wander_sigma(instability: BiasInstability | None) -> Array:
+    """Return the standard deviation of the Gauss-Markov parts, (2, 1)."""
+    if instability is None:
+        return np.zeros((2, 1))
+    return np.asarray(instability.sigma[:, None])
+
+
+def _carried_on(
+    before: Biases,
+    imu: ImuModel,
+    instability: BiasInstability | None,
+    rate_hz: float,
+    count: int,
+    rng: np.random.Generator,
+) -> tuple[Array, Biases]:
+    """Return the biases at the samples of a block, (2, n, 3), and where they have got to."""
+    steps = np.array([imu.gyro_bias_walk, imu.accel_bias_walk]) / np.sqrt(rate_hz)
+    walk = steps[:, None, None] * rng.standard_normal((2, count, 3))
+    np.cumsum(walk, axis=1, out=walk)
+    walk += before.walk[:, None]
+    if instability is None:
+        return walk, Biases(walk[:, -1], before.wander)
+    decay = instability.decay(rate_hz)
+    sigma = _wander_sigma(instability)[..., None] * np.sqrt(1.0 - decay**2)
+    drive = sigma * rng.standard_normal((2, count, 3))
+    wander, _ = lfilter([1.0], [1.0, -decay], drive, axis=1, zi=decay * before.wander[:, None])
+    return walk + wander, Biases(walk[:, -1], wander[:, -1])
+
+
+def _between(edges: Array, known: Array, place: Array) -> Array:
+    share = (place - edges[0])[:, None]
+    return np.asarray((1.0 - share) * known[0] + share * known[1])
+
+
+def _joined(parts: list[FieldSamples]) -> FieldSamples:
+    return FieldSamples(
+        time=np.concatenate([p.time for p in parts]),
+        window=np.concatenate([p.window for p in parts]),
+        channels=parts[0].channels,
+        phasor_sensor=np.concatenate([p.phasor_sensor for p in parts]),
+        phasor_cov=np.concatenate([p.phasor_cov for p in parts]),
+    )
