@@ -3,11 +3,14 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
 from magfusion.field_map import FieldMap
 from magfusion.units import Array, ComplexArray, IntArray
+
+Unknown = Literal["pose", "position", "attitude"]
 
 
 def _zeros3() -> Array:
@@ -115,6 +118,8 @@ class Beacon:
     slots : Slots, optional
         When its coils are driven, where they are driven in turn and that is known; a frequency of
         zero then means pulses of direct current.
+    unknown : {"pose", "position", "attitude"}, optional
+        What was never surveyed, so that a log must place it; the values in its stead are NaN.
     """
 
     name: str
@@ -126,6 +131,7 @@ class Beacon:
     sigma: BeaconSigma
     field_map: FieldMap | None = None
     slots: Slots | None = None
+    unknown: Unknown | None = None
 
     @cached_property
     def tones(self) -> tuple[tuple[float, int | None], ...]:

@@ -37,12 +37,14 @@ from magfusion.site_schema import (
 from magfusion.units import DEGREE, Array
 
 
-def load_site(path: Path) -> Site:
+def load_site(path: Path, *, unknown: bool = False) -> Site:
     """Read a site from its YAML file.
 
     Parameters
     ----------
     path : Path
+    unknown : bool
+        Whether beacons that were never surveyed are accepted; few jobs can do with them.
 
     Returns
     -------
@@ -57,6 +59,8 @@ def load_site(path: Path) -> Site:
         of range; the sentence names the file, the key's path, what was found and the remedy.
     """
     entry = read_yaml(path, SiteEntry)
+    if not unknown:
+        _refuse_unknown(entry, path)
     location = _location(entry.world)
     maps = _field_maps(entry, path)
     return Site(
@@ -70,6 +74,16 @@ def load_site(path: Path) -> Site:
         location=location,
         calibration=entry.calibration,
     )
+
+
+def _refuse_unknown(entry: SiteEntry, path: Path) -> None:
+    for i, beacon in enumerate(entry.beacons):
+        if beacon.unknown is not None:
+            raise InputError(
+                f"{path}: beacons[{i}].unknown: this job needs the {beacon.unknown} of beacon"
+                f" {beacon.name}; find it by magfusion smooth or calibrate log, which write it"
+                " into their site.yaml."
+            )
 
 
 def save_site(site: Site, path: Path) -> None:
@@ -136,8 +150,11 @@ def _beacon(entry: BeaconEntry) -> Beacon:
     sigma = entry.sigma
     return Beacon(
         name=entry.name,
-        position_world=entry.position_m,
-        world_from_beacon=_matrix(entry.rpy_deg),
+        position_world=np.full(3, np.nan) if entry.position_m is None else entry.position_m,
+        world_from_beacon=np.full((3, 3), np.nan)
+        if entry.rpy_deg is None
+        else _matrix(entry.rpy_deg),
+        unknown=entry.unknown,
         frequency_hz=entry.frequency_hz,
         coils=tuple(_coil(c) for c in entry.coils),
         synchronised=entry.synchronised,
@@ -235,10 +252,16 @@ def _world_entry(site: Site) -> dict[str, Any]:
 
 
 def _beacon_entry(beacon: Beacon) -> dict[str, Any]:
+    place: dict[str, Any] = {}
+    if beacon.unknown is not None:
+        place["unknown"] = beacon.unknown
+    if beacon.unknown in (None, "attitude"):
+        place["position_m"] = _plain(beacon.position_world)
+    if beacon.unknown in (None, "position"):
+        place["rpy_deg"] = _rpy_deg(beacon.world_from_beacon)
     return {
         "name": beacon.name,
-        "position_m": _plain(beacon.position_world),
-        "rpy_deg": _rpy_deg(beacon.world_from_beacon),
+        **place,
         "frequency_hz": float(beacon.frequency_hz),
         "coils": [_coil_entry(c) for c in beacon.coils],
         **_slots_entry(beacon),

@@ -3,7 +3,7 @@
 import datetime
 import math
 import sys
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -196,13 +196,26 @@ class BeaconEntry(StrictModel):
     """One beacon with its coils."""
 
     name: Annotated[str, Field(min_length=1)]
-    position_m: _Vector
-    rpy_deg: _Vector
+    position_m: Annotated[Array | None, _array(3)] = None
+    rpy_deg: Annotated[Array | None, _array(3)] = None
+    unknown: Literal["pose", "position", "attitude"] | None = None
     slots: SlotsEntry | None = None
     frequency_hz: Annotated[float, AfterValidator(_direct_current_only_in_slots)]
     coils: Annotated[list[CoilEntry], _some("coil")]
     synchronised: bool = True
     sigma: BeaconSigmaEntry = Field(default_factory=BeaconSigmaEntry)
+
+    @model_validator(mode="after")
+    def _surveyed_or_unknown(self) -> Self:
+        for key, part in (("position_m", "position"), ("rpy_deg", "attitude")):
+            value, unknown = getattr(self, key), self.unknown in ("pose", part)
+            if value is None and not unknown:
+                detail = InitErrorDetails(type="missing", loc=(key,), input=None)
+                raise ValidationError.from_exception_data("site", [detail])
+            if value is not None and unknown:
+                remedy = f"remove it or unknown: {self.unknown}, which says that it is not known"
+                raise _refusal_at((key,), value.tolist(), remedy)
+        return self
 
     @model_validator(mode="after")
     def _coils_fit_the_slots(self) -> Self:

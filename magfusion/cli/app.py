@@ -104,7 +104,7 @@ def log_job(
     job = Job(log, site, place, None, start, end, topics_option(topics))
     if window is None and step is None and mains_hz == 50.0:
         return job
-    usual = default_settings(read_job(job)[1], mains_hz).window
+    usual = default_settings(read_job(job, unknown=True)[1], mains_hz).window
     return replace(job, lockin=lockin_option(usual, window, step, mains_hz))
 
 
