@@ -6,7 +6,7 @@ targets lie, in the fitted rooms of `algorithms_compared` (F1), whose lines are 
 1. Do more beacons lower the error of algorithm 3 as the paper prints?  By the same share: to about
    two thirds from three to six.  The paper's own three beacons err by 0.069 m, 0.108 m and 0.110 m
    in three places, so that only the ratios can be compared.
-2. And with a map and relative weights?  By nearly the same share, from a tenth of the error.  A
+2. And with a map and relative weights?  By nearly the same share, from an eighth of the error.  A
    fourth beacon is worth less than a survey that is put to use.
 
 The workers of a ``--cluster`` need this directory on their PYTHONPATH.
