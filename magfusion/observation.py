@@ -336,6 +336,67 @@ def _seen(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class EarthObservation:
+    """Predicted steady field with its Jacobian blocks, by what is on the other side of each.
+
+    Parameters
+    ----------
+    measured_sensor : ndarray, shape (..., 3)
+        (T), measured axes.
+    platform_rotation : ndarray, shape (..., 3, 3)
+        Right perturbation of world_from_body (T/rad).
+    matrix : ndarray, shape (..., 3, 9)
+        Magnetometer matrix, row by row (T).
+    sensor_rotation : ndarray, shape (..., 3, 3)
+        Right perturbation of body_from_sensor (T/rad).
+    offset : ndarray, shape (..., 3, 3)
+        Of the magnetometer.
+    earth_world : ndarray, shape (..., 3, 3)
+        The field itself, world axes.
+    """
+
+    measured_sensor: Array
+    platform_rotation: Array
+    matrix: Array
+    sensor_rotation: Array
+    offset: Array
+    earth_world: Array
+
+
+def observe_earth(
+    magnetometer: Magnetometer, world_from_body: Array, earth_field_world: Array
+) -> EarthObservation:
+    """Predict the steady part of what a magnetometer reads, with the Jacobian in the same call.
+
+    ::
+
+        m = S sensor_from_body body_from_world e + offset
+
+    Parameters
+    ----------
+    magnetometer : Magnetometer
+    world_from_body : ndarray, shape (..., 3, 3)
+    earth_field_world : ndarray, shape (3,)
+        (T)
+    """
+    mounting, matrix = magnetometer.body_from_sensor, magnetometer.matrix
+    measured_from_body = matrix @ mounting.T
+    in_body = earth_field_world @ world_from_body
+    in_sensor = in_body @ mounting
+    by_matrix = np.zeros((*in_sensor.shape, 3, 3))
+    for row in range(3):
+        by_matrix[..., row, row, :] = in_sensor
+    return EarthObservation(
+        measured_sensor=in_sensor @ matrix.T + magnetometer.offset,
+        platform_rotation=measured_from_body @ skew(in_body),
+        matrix=by_matrix.reshape(*in_sensor.shape, 9),
+        sensor_rotation=matrix @ skew(in_sensor),
+        offset=np.broadcast_to(np.eye(3), (*in_sensor.shape, 3)),
+        earth_world=measured_from_body @ np.swapaxes(world_from_body, -1, -2),
+    )
+
+
 def model_error_cov(phasor_sensor: ComplexArray, model_error: float | Array) -> Array:
     """Return the variance that an inexact field model adds to each component of a phasor.
 

@@ -3,7 +3,7 @@
 A site's calibration lives in one tangent vector, the same for the fix, the smoother and the
 filter: a beacon's rotation in beacon axes and its position in world axes, log-moments, drive phase
 and drift, magnetometer matrix, the sensor's rotation in sensor axes and its position in body axes,
-and the IMU's time offset.
+and the IMU's time offset; where the Earth field is measured, it and the magnetometer's offset too.
 """
 
 from collections.abc import Callable, Iterable
@@ -11,16 +11,26 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.observation import Observation, observe, observe_from, predict
 from magfusion.site import Beacon, Site
+from magfusion.site_moves import (
+    beacon_difference,
+    earth_difference,
+    magnetometer_difference,
+    moved_beacon,
+    moved_earth,
+    moved_magnetometer,
+)
 from magfusion.units import Array, ComplexArray
 
-GROUPS = ("beacons", "moments", "phase", "magnetometer", "extrinsics", "time-offset")
+GROUPS = ("beacons", "moments", "phase", "magnetometer", "extrinsics", "time-offset", "earth")
 
 PHASE_SIGMA = 1e2  # rad; wide enough to be no information
 DRIFT_SIGMA = 2e-5  # relative; ordinary crystal oscillators
+# What a building's iron makes of the declared Earth field, outside of steel halls and machines.
+DECLINATION_SIGMA = np.deg2rad(3.0)
+STRENGTH_SIGMA = 0.02  # of its size, horizontal and vertical part alike
 _BY_PHASOR = ("phase", "drift", "gain")  # kinds whose Jacobian is the phasor but for a factor
 
 # A survey this good is held at its declared values; what it may still be wrong by is considered in
@@ -30,9 +40,12 @@ NEGLIGIBLE = {
     "rotation": 1.75e-3,  # rad
     "log_moment": 2e-3,
     "matrix": 1e-3,
+    "offset": 5e-9,  # T
     "time_offset": 1e-4,  # s
     "phase": 0.0,
     "drift": 0.0,
+    "declination": 0.0,
+    "strength": 0.0,
 }
 
 
@@ -99,7 +112,7 @@ def initial_calibration(site: Site, reference_time: float) -> Calibration:
     )
 
 
-def _candidates(site: Site) -> Iterable[tuple[str, str, str, Array]]:
+def _candidates(site: Site, earth: bool) -> Iterable[tuple[str, str, str, Array]]:
     for beacon in site.beacons:
         yield "beacons", beacon.name, "rotation", beacon.sigma.rotation_beacon
         yield "beacons", beacon.name, "position", beacon.sigma.position_world
@@ -109,12 +122,20 @@ def _candidates(site: Site) -> Iterable[tuple[str, str, str, Array]]:
             yield "phase", beacon.name, "drift", np.array([DRIFT_SIGMA])
     sigma = site.platform.magnetometer.sigma
     yield "magnetometer", "magnetometer", "matrix", sigma.matrix.ravel()
+    if earth:
+        yield "magnetometer", "magnetometer", "offset", sigma.offset
     yield "extrinsics", "sensor", "rotation", sigma.rotation_sensor
     yield "extrinsics", "sensor", "position", sigma.position_body
     yield "time-offset", "imu", "time_offset", np.array([site.platform.imu.time_offset_sigma])
+    if earth and site.earth_field_world is not None:
+        size = float(np.linalg.norm(site.earth_field_world))
+        yield "earth", "earth", "declination", np.array([DECLINATION_SIGMA])
+        yield "earth", "earth", "strength", np.full(2, STRENGTH_SIGMA * size)
 
 
-def choose_blocks(site: Site, groups: Iterable[str] | None = None) -> tuple[Block, ...]:
+def choose_blocks(
+    site: Site, groups: Iterable[str] | None = None, *, earth: bool = False
+) -> tuple[Block, ...]:
     """Choose the calibration parameters to estimate.
 
     Parameters
@@ -123,6 +144,8 @@ def choose_blocks(site: Site, groups: Iterable[str] | None = None) -> tuple[Bloc
         Its sigmas are the priors; a parameter whose sigma is zero is known and never chosen.
     groups : iterable of str, optional
         Any of `GROUPS`.  None takes every parameter whose sigma is not negligible.
+    earth : bool
+        Whether the Earth field is measured: it and the magnetometer's offset may then be chosen.
 
     Returns
     -------
@@ -136,14 +159,17 @@ def choose_blocks(site: Site, groups: Iterable[str] | None = None) -> tuple[Bloc
     def chosen(group: str, kind: str, sigma: float) -> bool:
         return sigma > NEGLIGIBLE[kind] if wanted is None else group in wanted
 
-    return _blocks(site, chosen)
+    return _blocks(site, chosen, earth)
 
 
-def held_blocks(site: Site, estimated: tuple[Block, ...]) -> tuple[Block, ...]:
+def held_blocks(
+    site: Site, estimated: tuple[Block, ...], *, earth: bool = False
+) -> tuple[Block, ...]:
     """Return the parameters that are uncertain but not among those estimated."""
     # Not by name alone: a beacon may be called sensor.
     known = {block[:3] for block in estimated}
-    free = [b for b in _blocks(site, lambda _group, _kind, _sigma: True) if b[:3] not in known]
+    every = _blocks(site, lambda _group, _kind, _sigma: True, earth)
+    free = [block for block in every if block[:3] not in known]
     start, out = 0, []
     for block in free:
         out.append(block._replace(columns=slice(start, start + len(block.sigma))))
@@ -151,10 +177,12 @@ def held_blocks(site: Site, estimated: tuple[Block, ...]) -> tuple[Block, ...]:
     return tuple(out)
 
 
-def _blocks(site: Site, chosen: Callable[[str, str, float], bool]) -> tuple[Block, ...]:
+def _blocks(
+    site: Site, chosen: Callable[[str, str, float], bool], earth: bool
+) -> tuple[Block, ...]:
     blocks: list[Block] = []
     start = 0
-    for group, owner, kind, sigma in _candidates(site):
+    for group, owner, kind, sigma in _candidates(site, earth):
         largest = float(np.max(sigma))
         if largest > 0.0 and chosen(group, kind, largest):
             columns = slice(start, start + len(sigma))
@@ -174,33 +202,6 @@ def prior_sigma(blocks: tuple[Block, ...]) -> Array:
     return np.concatenate([b.sigma for b in blocks]) if blocks else np.zeros(0)
 
 
-def _turn(rotation: Array, vector: Array) -> Array:
-    return np.asarray(rotation @ Rotation.from_rotvec(vector).as_matrix())
-
-
-def _moved_beacon(beacon: Beacon, kind: str, step: Array) -> Beacon:
-    if kind == "rotation":
-        return replace(beacon, world_from_beacon=_turn(beacon.world_from_beacon, step))
-    if kind == "position":
-        return replace(beacon, position_world=beacon.position_world + step)
-    coils = tuple(
-        replace(coil, moment_beacon=coil.moment_beacon * np.exp(change))
-        for coil, change in zip(beacon.coils, step, strict=True)
-    )
-    return replace(beacon, coils=coils)
-
-
-def _moved_magnetometer(site: Site, kind: str, step: Array) -> Site:
-    sensor = site.platform.magnetometer
-    if kind == "matrix":
-        sensor = replace(sensor, matrix=sensor.matrix + step.reshape(3, 3))
-    elif kind == "rotation":
-        sensor = replace(sensor, body_from_sensor=_turn(sensor.body_from_sensor, step))
-    else:
-        sensor = replace(sensor, position_body=sensor.position_body + step)
-    return replace(site, platform=replace(site.platform, magnetometer=sensor))
-
-
 def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) -> Calibration:
     """Return the calibration moved by a tangent vector, shape (dimension,)."""
     site, phase, drift = calibration.site, calibration.phase.copy(), calibration.drift.copy()
@@ -211,7 +212,9 @@ def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) ->
         if block.kind == "time_offset":
             time_offset += float(part[0])
         elif block.group in ("magnetometer", "extrinsics"):
-            site = _moved_magnetometer(site, block.kind, part)
+            site = moved_magnetometer(site, block.kind, part)
+        elif block.group == "earth":
+            site = moved_earth(site, block.kind, part)
         elif block.kind == "phase":
             phase[[owner == block.owner for owner, _ in site.channels]] += part
         elif block.kind == "gain":
@@ -220,7 +223,7 @@ def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) ->
             drift[names.index(block.owner)] += float(part[0])
         else:
             index = names.index(block.owner)
-            moved = _moved_beacon(site.beacons[index], block.kind, part)
+            moved = moved_beacon(site.beacons[index], block.kind, part)
             site = replace(site, beacons=(*site.beacons[:index], moved, *site.beacons[index + 1 :]))
     return replace(
         calibration,
@@ -235,44 +238,29 @@ def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) ->
 def difference(reference: Calibration, moved: Calibration, blocks: tuple[Block, ...]) -> Array:
     """Return the tangent vector that takes ``reference`` to ``moved``: the inverse of `retract`."""
     step = np.zeros(dimension(blocks))
-    names = [b.name for b in reference.site.beacons]
-    old_sensor, new_sensor = (c.site.platform.magnetometer for c in (reference, moved))
     for block in blocks:
         if block.kind == "time_offset":
             value: Array = np.array([moved.time_offset - reference.time_offset])
-        elif block.group == "magnetometer":
-            value = (new_sensor.matrix - old_sensor.matrix).ravel()
-        elif block.group == "extrinsics" and block.kind == "rotation":
-            value = _rotation_between(old_sensor.body_from_sensor, new_sensor.body_from_sensor)
-        elif block.group == "extrinsics":
-            value = new_sensor.position_body - old_sensor.position_body
+        elif block.group in ("magnetometer", "extrinsics"):
+            value = magnetometer_difference(reference.site, moved.site, block.kind)
+        elif block.group == "earth":
+            value = earth_difference(reference.site, moved.site, block.kind)
         else:
-            i = names.index(block.owner)
-            value = _beacon_difference(reference, moved, block, i)
+            value = _beacon_difference(reference, moved, block)
         step[block.columns] = value
     return step
 
 
-def _rotation_between(old: Array, new: Array) -> Array:
-    return np.asarray(Rotation.from_matrix(old.T @ new).as_rotvec())
-
-
-def _beacon_difference(old: Calibration, new: Calibration, block: Block, index: int) -> Array:
-    a, b = old.site.beacons[index], new.site.beacons[index]
-    if block.kind == "rotation":
-        return _rotation_between(a.world_from_beacon, b.world_from_beacon)
-    if block.kind == "position":
-        return b.position_world - a.position_world
+def _beacon_difference(old: Calibration, new: Calibration, block: Block) -> Array:
+    index = [b.name for b in old.site.beacons].index(block.owner)
     if block.kind == "drift":
         return np.asarray(new.drift[[index]] - old.drift[[index]])
+    mine = [owner == block.owner for owner, _ in old.site.channels]
     if block.kind == "phase":
-        mine = [owner == block.owner for owner, _ in old.site.channels]
         return np.asarray(new.phase[mine] - old.phase[mine])
     if block.kind == "gain":
-        mine = [owner == block.owner for owner, _ in old.site.channels]
         return np.asarray((new.log_gain - old.log_gain)[mine][:1])
-    sizes = [np.linalg.norm(c.moments_beacon, axis=1) for c in (a, b)]
-    return np.asarray(np.log(sizes[1] / sizes[0]))
+    return beacon_difference(old.site.beacons[index], new.site.beacons[index], block.kind)
 
 
 def predict_channels(
@@ -371,6 +359,8 @@ def _block_jacobian(
     """Return the columns of a block, shape (n, tones, 3, columns); None where it has no bearing."""
     if block.group in ("beacons", "moments"):
         return None if block.owner != beacon.name else _own(beacon, block, seen)
+    if block.group == "earth" or block.kind == "offset":
+        return None  # no part of a phasor
     if block.kind == "matrix":
         return seen.matrix
     if block.kind == "time_offset":

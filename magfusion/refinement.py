@@ -6,12 +6,19 @@ import numpy as np
 
 from magfusion.parameters import Block, Calibration, difference
 from magfusion.site import Beacon, Site
-from magfusion.units import DEGREE, Array
+from magfusion.units import DEGREE, NANOTESLA, Array
 
 DETERMINED_RATIO = 0.5  # posterior over prior sigma below which the data, not the prior, spoke
 
 _AXES = ("x", "y", "z")
-_DISPLAY = {"rotation": ("deg", DEGREE), "phase": ("deg", DEGREE), "drift": ("ppm", 1e-6)}
+_DISPLAY = {
+    "rotation": ("deg", DEGREE),
+    "phase": ("deg", DEGREE),
+    "declination": ("deg", DEGREE),
+    "drift": ("ppm", 1e-6),
+    "offset": ("nt", NANOTESLA),
+    "strength": ("nt", NANOTESLA),
+}
 _UNITS = {"position": "m", "time_offset": "s"}
 
 
@@ -46,7 +53,7 @@ def _component_names(block: Block) -> list[str]:
     tail = f"_{unit}" if unit else ""
     if block.kind == "matrix":
         return [f"{block.name}_{row}{column}" for row in _AXES for column in _AXES]
-    if block.kind in ("rotation", "position"):
+    if block.kind in ("rotation", "position", "offset"):
         return [f"{block.name}_{axis}{tail}" for axis in _AXES]
     if count == 1:
         return [f"{block.name}{tail}"]
@@ -82,11 +89,14 @@ def refined_site(
     """Return the site with the fitted values and their posterior sigmas.
 
     Drive phase and drift of an unsynchronised beacon belong to the log, not to the site: they are
-    told in the site's ``calibration`` record and nowhere else.
+    told in the site's ``calibration`` record and nowhere else.  An Earth field that was estimated
+    takes the place of the location's.
     """
     site, sigma = fitted.site, np.sqrt(np.diagonal(cov))
     for block in blocks:
         site = _with_sigma(site, block, sigma[block.columns])
+    if any(block.group == "earth" for block in blocks):
+        site = replace(site, location=None)
     imu = replace(site.platform.imu, time_offset=fitted.time_offset)
     for block in blocks:
         if block.kind == "time_offset":
@@ -115,6 +125,7 @@ def _with_sigma(site: Site, block: Block, sigma: Array) -> Site:
     sensor = site.platform.magnetometer
     changed = {
         "matrix": {"matrix": sigma.reshape(3, 3)} if len(sigma) == 9 else {},
+        "offset": {"offset": sigma},
         "rotation": {"rotation_sensor": sigma},
         "position": {"position_body": sigma},
     }[block.kind]

@@ -17,7 +17,7 @@ from magfusion.receiver.windows import (
     channel_frequencies_hz,
     sample_rate_hz,
 )
-from magfusion.records.samples import FieldSamples, ImuSamples, Waveform
+from magfusion.records.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
 from magfusion.site import Magnetometer, Site
 from magfusion.strapdown import attitude_at, attitude_from_gyro
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
@@ -75,6 +75,8 @@ class WindowOperator:
 class _Fit:
     phasor: ComplexArray
     unit_variance: Array
+    constant: Array
+    constant_variance: Array
     elapsed: Array
     weight: BoolArray
     design: Array
@@ -155,16 +157,36 @@ def demodulate(operator: WindowOperator, measured_sensor: Array) -> FieldSamples
     -------
     FieldSamples
     """
-    phasor, unit, noise = _fit_all(operator, measured_sensor)
+    return demodulate_with_steady(operator, measured_sensor)[0]
+
+
+def demodulate_with_steady(
+    operator: WindowOperator, measured_sensor: Array
+) -> tuple[FieldSamples, SteadyFields]:
+    """Turn raw samples into phasors and the steady field beside them, each with covariance.
+
+    Parameters
+    ----------
+    operator, measured_sensor
+        As in `demodulate`.  For the steady field the known offset, or a prediction, should have
+        been taken off: the gyro turns with the samples what does not turn with the platform.
+
+    Returns
+    -------
+    FieldSamples, SteadyFields
+    """
+    phasor, unit, noise, constant, constant_variance = _fit_all(operator, measured_sensor)
     centre, settings = operator.windows.centre, operator.settings
     smooth = smoothed_over_windows(noise, centre, settings.step, settings.noise_windows)
-    return FieldSamples(
+    samples = FieldSamples(
         time=centre,
         window=np.full(len(centre), settings.window),
         channels=operator.channels,
         phasor_sensor=phasor,
         phasor_cov=unit[..., None, None] * smooth,
     )
+    beside = constant_variance[:, None, None] * np.mean(smooth, axis=1)
+    return samples, SteadyFields(centre, constant, beside)
 
 
 def _turner(
@@ -184,14 +206,18 @@ def _turner(
     return turn
 
 
-def _fit_all(operator: WindowOperator, measured: Array) -> tuple[ComplexArray, Array, Array]:
+def _fit_all(
+    operator: WindowOperator, measured: Array
+) -> tuple[ComplexArray, Array, Array, Array, Array]:
     shape = (len(operator.windows.centre), len(operator.frequencies_hz))
     phasor = np.empty((*shape, 3), dtype=np.complex128)
     unit = np.empty(shape)
     noise = np.empty((*shape, 3, 3))
+    constant, constant_variance = np.empty((shape[0], 3)), np.empty(shape[0])
     for rows in chunks(len(operator.windows.centre)):
         fit = fit_windows(operator, rows, measured)
         phasor[rows], unit[rows] = fit.phasor, fit.unit_variance
+        constant[rows], constant_variance[rows] = fit.constant, fit.constant_variance
         noise[rows] = noise_beside_tones(
             operator.frequencies_hz,
             operator.nuisance_hz,
@@ -201,7 +227,7 @@ def _fit_all(operator: WindowOperator, measured: Array) -> tuple[ComplexArray, A
             fit.inverse,
             fit.turned,
         )
-    return phasor, unit, noise
+    return phasor, unit, noise, constant, constant_variance
 
 
 def fit_windows(operator: WindowOperator, rows: slice, measured_sensor: Array) -> _Fit:
@@ -224,8 +250,10 @@ def fit_windows(operator: WindowOperator, rows: slice, measured_sensor: Array) -
     phasor = (cosine - 1j * sine) * reference[..., None]
     diagonal = np.einsum("nii->ni", inverse)
     unit = 0.5 * (diagonal[:, 2 : 2 + n] + diagonal[:, 2 + n : 2 + 2 * n])
-    real = [np.asarray(part, dtype=np.float64) for part in (unit, elapsed, design, inverse, turned)]
-    return _Fit(phasor, real[0], real[1], weight, *real[2:])
+    steady = coefficients[:, 0], diagonal[:, 0]
+    real = [np.asarray(p, dtype=np.float64) for p in (unit, *steady, elapsed)]
+    rest = [np.asarray(part, dtype=np.float64) for part in (design, inverse, turned)]
+    return _Fit(phasor, *real, weight, *rest)
 
 
 def _design(elapsed: Array, window: float, frequencies: Array, nuisances: Array) -> Array:

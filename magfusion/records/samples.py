@@ -94,6 +94,28 @@ class FieldSamples:
 
 
 @dataclass(frozen=True, eq=False)
+class SteadyFields:
+    """Steady part of the waveform, one row for each window: the Earth field and the offset.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Centre of the window, seconds since the log's epoch.
+    measured_sensor : ndarray, shape (n, 3)
+        (T), measured axes at the centre.
+    cov : ndarray, shape (n, 3, 3)
+        Of the instrument's noise alone (T^2).
+    """
+
+    time: Array
+    measured_sensor: Array
+    cov: Array
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, eq=False)
 class Log:
     """One recording; streams that it does not hold are None.
 
