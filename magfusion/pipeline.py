@@ -13,6 +13,7 @@ from magfusion.fixes.ambiguity import relations
 from magfusion.fixes.fix import Fixes
 from magfusion.fusion.batch import Smoothed, SmootherSettings, smooth
 from magfusion.fusion.inertial import motion_at
+from magfusion.fusion.self_survey import smooth_and_place
 from magfusion.fusion.source import first_fixes, phasors
 from magfusion.job import Job, claim, named, read_estimate, read_job
 from magfusion.parameters import initial_calibration
@@ -30,6 +31,7 @@ from magfusion.report import (
     dropped_figures,
     error_figures,
     fix_figures,
+    placement_figures,
     smoothed_figures,
     write_report,
 )
@@ -109,15 +111,17 @@ def run_smooth(
         In the latter case the single-epoch fixes have been saved in the output directory.
     """
     claimed = claim(job.output, "smooth", "fix")
-    log, site = read_job(job)
+    log, site = read_job(job, unknown=True)
     began = time.perf_counter()
     settings = replace(settings, lockin=job.lockin)
     try:
         with named(job.log_path):
-            result = smooth(log, site, settings, report)
+            result, placed = smooth_and_place(log, site, settings, report)
         _refuse_divergence(result)
     except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
         reason = _reason(error)
+        if any(beacon.unknown is not None for beacon in site.beacons):
+            raise EstimationError(f"{job.log_path}: {reason}") from error
         with claimed as directory:
             _save_fixes_instead(directory, job, log, site, reason)
         raise EstimationError(
@@ -127,8 +131,8 @@ def run_smooth(
     figures |= smoothed_figures(result)
     figures["elapsed_s"] = time.perf_counter() - began
     errors, compared = compared_with_truth(result.states, log)
-    figures |= compared
-    if errors is not None:
+    figures |= compared | placement_figures(placed, result.calibration.site)
+    if errors is not None and not placed:
         figures |= _held_figures(log, site, settings, result)
     told = findings(result.declared, result.calibration, result.blocks, result.calibration_cov)
     refined = refined_site(

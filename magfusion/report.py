@@ -8,11 +8,13 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.evaluation.errors import TrajectoryErrors, trajectory_errors
+from magfusion.evaluation.observability import Observability, observability
 from magfusion.fixes.ambiguity import ambiguity_figures, relations
 from magfusion.fixes.fix import Fixes
 from magfusion.fusion.batch import Smoothed
+from magfusion.fusion.self_survey import Placement
 from magfusion.records.samples import Log
-from magfusion.refinement import findings
+from magfusion.refinement import DETERMINED_RATIO, Finding, findings
 from magfusion.site import Site
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array
@@ -95,12 +97,57 @@ def smoothed_figures(result: Smoothed) -> Figures:
         sigma = np.sqrt(np.diagonal(result.states.pose_cov, axis1=1, axis2=2))
         figures["position_sigma_median_m"] = float(np.median(sigma[:, 3:]))
         figures["attitude_sigma_median_deg"] = float(np.rad2deg(np.median(sigma[:, :3])))
+    if result.blocks:
+        known = observability(result.calibration, result.blocks, result.calibration_cov)
+        figures |= observability_figures(told, known)
     for found in told:
         figures[found.name] = found.change
         figures[f"{found.name}_sigma"] = found.sigma
         figures[f"{found.name}_prior_sigma"] = found.prior_sigma
     figures["determined"] = [f.name for f in told if f.determined]
     figures["undetermined"] = [f.name for f in told if not f.determined]
+    return figures
+
+
+def observability_figures(told: list[Finding], found: Observability) -> Figures:
+    """Return what a log determined of the calibration, parameter by parameter and in words."""
+    figures: Figures = {
+        "directions": len(found.direction_ratio),
+        "directions_determined": found.determined,
+        "directions_gauge": len(found.gauge),
+    }
+    beside = found.ratio_but_for_gauge
+    for one, ratio, rest in zip(told, found.ratio, beside, strict=True):
+        figures[f"{one.name}_ratio"] = float(ratio)
+        figures[f"{one.name}_ratio_but_for_gauge"] = float(rest) if np.isfinite(rest) else None
+    figures["determined_but_for_gauge"] = [
+        one.name for one, rest in zip(told, beside, strict=True) if rest < DETERMINED_RATIO
+    ]
+    figures["gauge"] = [open_.words for open_ in found.gauge]
+    figures["weakest_directions"] = [open_.words for open_ in found.weakest]
+    return figures
+
+
+def placement_figures(placed: tuple[Placement, ...], site: Site) -> Figures:
+    """Return where beacons of unknown place were found, with what else would explain the log."""
+    figures: Figures = {}
+    if placed:
+        figures["placed"] = [placement.name for placement in placed]
+    final = {beacon.name: beacon for beacon in site.beacons}
+    for placement in placed:
+        for axis, value in zip("xyz", final[placement.name].position_world, strict=True):
+            figures[f"placed_{placement.name}_{axis}_m"] = float(value)
+        chi_square = [one.chi_square for one in placement.hypotheses]
+        figures[f"hypotheses_{placement.name}"] = [
+            f"beacon {placement.name} at ({', '.join(f'{x:.2f}' for x in place)}) m:"
+            f" chi square larger by {one.chi_square:.3g}"
+            f" ({'whole log' if one.smoothed else 'along the first trajectory'})"
+            for one in placement.hypotheses
+            for place in [one.beacon.position_world]
+        ]
+        figures[f"hypotheses_{placement.name}_rival_chi_square"] = (
+            chi_square[1] if len(chi_square) > 1 else None
+        )
     return figures
 
 

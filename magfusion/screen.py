@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from magfusion.report import Figures
+from magfusion.report import AMBIGUOUS_CHI_SQUARE, Figures
 
 _ERRORS = {
     "position (m)": (
@@ -45,7 +45,8 @@ _ELSEWHERE = re.compile(
     r"ambiguity.*|"
     r"job|log|notes|ate_m|attitude_rmse_deg|aligned_.*|rpe_.*|held_.*|lagged_.*|.*_sigma_median_.*|cost|failed|"
     r"nees_median|(position|attitude)_inside_3_sigma|start_.*|rival_.*|ambiguous|not_compared|"
-    r"(windows|epochs)_dropped_.*|determined|undetermined|time_offset_s|passes|iterations|.*\..*"
+    r"(windows|epochs)_dropped_.*|gauge|weakest_directions|missing_motion|hypotheses_.*|placed.*|"
+    r"directions.*|nearest_m_.*|motion_.*|cross_.*|determined_but_for_gauge|determined|undetermined|time_offset_s|passes|iterations|.*\..*"
 )
 _USUAL = {"coupling": "tight", "converged": True, "windows_dropped": 0, "epochs_dropped": 0}
 _USUAL |= {"intervals_bridged": 0}
@@ -54,6 +55,13 @@ _LISTED = re.compile(
     r"(?P<name>residual_rms|sigma|points_hearing|distortion)_(?P<part>.+?)(?P<unit>_t)?"
 )
 _PART = re.compile(r"_([xyz]|\d)(?=(_m|_deg|_ppm)?$)|(?<=_[xyz])[xyz]$")
+_TOLD_OF_DIRECTIONS = {"gauge": "open", "weakest_directions": "open"}
+_TOLD_OF_DIRECTIONS |= {"missing_motion": "missing motion"}
+_SCORES = {
+    "aligned_ate_m": "position, aligned (m)",
+    "aligned_attitude_rmse_deg": "attitude, aligned (deg)",
+    "residual_rms": "residual (sigma)",
+}
 POOR_FIT = 3.0  # whitened residual, one where noise and model are as declared
 
 
@@ -74,9 +82,16 @@ def show(figures: Figures, output: Path | None, console: Console | None = None) 
     for table in (_errors(figures), _others(figures), _calibration(figures)):
         if table.row_count:
             console.print(table)
+    if (transfer := _transfer(figures)).row_count:
+        console.print(transfer)
+    for sentence in _directions(figures):
+        console.print(sentence, soft_wrap=True, markup=False)
     for sentence in remarks(figures):
         console.print(f"note: {sentence}", style="yellow", soft_wrap=True, markup=False)
-    for sentence in _sentences(figures, "ambiguity_settled"):
+    settled = _sentences(figures, "ambiguity_settled") + [
+        _place(figures, name) for name in _sentences(figures, "placed")
+    ]
+    for sentence in settled:
         console.print(sentence, soft_wrap=True, markup=False)
     if output is not None:
         console.print(f"results in {output}", soft_wrap=True, markup=False)
@@ -107,6 +122,7 @@ def remarks(figures: Figures) -> list[str]:
             " every pose that explains them; add a beacon, or smooth, so that the motion decides."
         )
     out += _sentences(figures, "ambiguity")
+    out += [s for name in _sentences(figures, "placed") for s in _rival_places(figures, name)]
     if figures.get("undetermined_epochs"):
         out.append(
             f"{figures['undetermined_epochs']} of {epochs} epochs leave a direction of the pose"
@@ -115,6 +131,23 @@ def remarks(figures: Figures) -> list[str]:
     if figures.get("not_compared"):
         out.append(f"There is no comparison with the truth: {figures['not_compared']}")
     return out
+
+
+def _place(figures: Figures, name: str) -> str:
+    found = ", ".join(f"{_float(figures[f'placed_{name}_{axis}_m']):.3f}" for axis in "xyz")
+    tried = len(_sentences(figures, f"hypotheses_{name}"))
+    return f"beacon {name} was placed at ({found}) m; {tried} place(s) explained its field"
+
+
+def _rival_places(figures: Figures, name: str) -> list[str]:
+    told = _sentences(figures, f"hypotheses_{name}")
+    rival = figures.get(f"hypotheses_{name}_rival_chi_square")
+    if rival is None or _float(rival) > AMBIGUOUS_CHI_SQUARE:
+        return []
+    return [
+        f"The log leaves more than one place for beacon {name} ({'; '.join(told)}); record more"
+        " motion, in all three directions."
+    ]
 
 
 def _sentences(figures: Figures, key: str) -> list[str]:
@@ -173,6 +206,27 @@ def _calibration(figures: Figures) -> Table:
         prior = dict.fromkeys(_number(figures[f"{key}_prior_sigma"], 2) for key in keys)
         row = (" ".join(change), _number(max(sigma), 2), " ".join(prior))
         table.add_row(stem, *row, verdict)
+    return table
+
+
+def _directions(figures: Figures) -> list[str]:
+    """Return what the log told of the calibration's directions, and what it could not."""
+    if "directions" not in figures or figures["job"] != "calibrate log":
+        return []
+    told, count = figures["directions_determined"], figures["directions"]
+    out = [f"{told} of {count} directions of the calibration are determined"]
+    for key, label in _TOLD_OF_DIRECTIONS.items():
+        out += [f"{label}: {sentence}" for sentence in _sentences(figures, key)]
+    return out
+
+
+def _transfer(figures: Figures) -> Table:
+    """Return how a calibration by one part of the log serves on another part."""
+    table = Table("other part of the log", "survey held", "calibrated", box=None)
+    for key, label in _SCORES.items():
+        if f"cross_declared_{key}" in figures:
+            both = (figures[f"cross_{which}_{key}"] for which in ("declared", "calibrated"))
+            table.add_row(label, *map(_number, both))
     return table
 
 

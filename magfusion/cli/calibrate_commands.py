@@ -9,19 +9,26 @@ from magfusion.cli.app import (
     AsJson,
     End,
     LogPath,
+    MainsHz,
     Output,
     SitePath,
     Start,
+    Step,
     TopicNames,
+    Window,
     calibrate,
     log_job,
     progress,
     show_result,
 )
+from magfusion.fusion.batch import SmootherSettings
 from magfusion.jobs.calibrate_antenna import AntennaSettings, run_calibrate_antenna
 from magfusion.jobs.calibrate_beacon import run_calibrate_beacon
 from magfusion.jobs.calibrate_fieldmap import MapSource, run_calibrate_fieldmap
+from magfusion.jobs.calibrate_log import run_calibrate_log
 from magfusion.jobs.calibrate_magnetometer import run_calibrate_magnetometer
+from magfusion.options import groups_option
+from magfusion.parameters import GROUPS
 from magfusion.units import DEGREE
 
 
@@ -86,6 +93,38 @@ def magnetometer(
     """Calibrate the magnetometer on a log of slow turning by hand, in the Earth's field."""
     job = log_job("magnetometer", log, site, output, None, None, 50.0, start, end, topics)
     show_result(run_calibrate_magnetometer(job, positions=positions), output, as_json)
+
+
+@calibrate.command(name="log")
+def by_log(
+    log: LogPath,
+    output: Output = Path("calibration"),
+    site: SitePath = None,
+    estimate: Annotated[
+        str | None,
+        typer.Option(
+            help=f"Calibration to estimate: any of {','.join(GROUPS)}; default: what the site's"
+            " sigmas leave open."
+        ),
+    ] = None,
+    cross_validate: Annotated[
+        int | None,
+        typer.Option(help="Calibrate on each of so many parts of the log, score on the others."),
+    ] = None,
+    window: Window = None,
+    step: Step = None,
+    mains_hz: MainsHz = 50.0,
+    start: Start = None,
+    end: End = None,
+    topics: TopicNames = None,
+    as_json: AsJson = False,
+) -> None:
+    """Refine the site by a log of ordinary motion, and tell what motion is missing."""
+    job = log_job("calibration", log, site, output, window, step, mains_hz, start, end, topics)
+    settings = SmootherSettings(estimate=groups_option(estimate))
+    with progress() as report:
+        figures = run_calibrate_log(job, settings, parts=cross_validate, report=report)
+    show_result(figures, output, as_json)
 
 
 @calibrate.command()

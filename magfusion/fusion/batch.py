@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from magfusion.errors import EstimationError
+from magfusion.errors import EstimationError, InputError
 from magfusion.fixes.fix import Fixes
 from magfusion.fixes.problem import nuisance_blocks
 from magfusion.fixes.survey import survey_jacobians
@@ -165,6 +165,12 @@ def smooth(
         Where the graph cannot be solved.
     """
     settings = SmootherSettings() if settings is None else settings
+    for beacon in site.beacons:
+        if beacon.unknown is not None:
+            raise InputError(
+                f"the {beacon.unknown} of beacon {beacon.name} is unknown; place it by"
+                " magfusion.fusion.self_survey.smooth_and_place"
+            )
     job = _prepared(log, site, settings, report)
     return _loose(job) if settings.coupling == "loose" else _tight(job)
 

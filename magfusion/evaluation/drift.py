@@ -1,0 +1,199 @@
+"""Whether an error grows with time: slopes with their standard errors, Allan deviation, verdicts.
+
+Neighbouring errors of one run are alike, so that a slope's standard error comes from the scatter
+between independent worlds, or, where there is one alone, between means of long blocks.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.stats import t as student
+
+from magfusion.units import Array, BoolArray
+
+DAY = 86_400.0  # s
+BLOCKS = 12  # of a single world's errors
+CONFIDENCE = 0.95
+# Columns of an error, as of the estimators' states.
+ATTITUDE, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
+ACCEL_BIAS, GYRO_BIAS = slice(9, 12), slice(12, 15)
+
+Verdict = Literal["pass", "fail", "undecided"]
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorSeries:
+    """Errors of the states of one run.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    measured : ndarray of bool, shape (n,)
+        Whether a field was measured there; the states between are carried on by the IMU.
+    error, sigma : ndarray, shape (n, 15)
+        Attitude (rad) and position (m) in body axes, velocity (m/s), biases of the accelerometer
+        (m/s^2) and the gyro (rad/s).
+    pose_nees, bias_nees : ndarray, shape (n,)
+        Normalised errors squared, of six degrees of freedom each.
+    """
+
+    time: Array
+    measured: BoolArray
+    error: Array
+    sigma: Array
+    pose_nees: Array
+    bias_nees: Array
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def rows(self, chosen: BoolArray) -> "ErrorSeries":
+        """Return some of the states."""
+        return ErrorSeries(
+            self.time[chosen],
+            self.measured[chosen],
+            self.error[chosen],
+            self.sigma[chosen],
+            self.pose_nees[chosen],
+            self.bias_nees[chosen],
+        )
+
+    def size(self, part: slice) -> Array:
+        """Return the length of a part of the error, shape (n,)."""
+        return np.asarray(np.linalg.norm(self.error[:, part], axis=1))
+
+
+@dataclass(frozen=True)
+class Slope:
+    """Growth of an error in a day.
+
+    Parameters
+    ----------
+    per_day : float
+    standard_error : float
+    freedom : int
+        Degrees of freedom of the standard error.
+    """
+
+    per_day: float
+    standard_error: float
+    freedom: int
+
+    @property
+    def margin(self) -> float:
+        """Half the interval that holds the true slope with `CONFIDENCE`."""
+        quantile = student.ppf(0.5 + 0.5 * CONFIDENCE, self.freedom)
+        return float(quantile * self.standard_error)
+
+    def verdict(self, limit: float) -> Verdict:
+        """Tell whether the slope is within plus or minus a limit.
+
+        It passes only where all of its interval does, and fails where none of it does: a run too
+        short to tell is not one that has passed.
+        """
+        return within(abs(self.per_day) - self.margin, abs(self.per_day) + self.margin, limit)
+
+
+def within(low: float, high: float, limit: float) -> Verdict:
+    """Tell whether an interval lies below a limit: all of it, none of it, or neither."""
+    if high < limit:
+        return "pass"
+    return "fail" if low > limit else "undecided"
+
+
+def slope_of_one(time: Array, value: Array, blocks: int = BLOCKS) -> Slope:
+    """Return the slope of one world's errors, by the means of blocks of equal length.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    value : ndarray, shape (n,)
+    blocks : int
+        Each much longer than what is correlated, as far as the data allow.
+
+    Raises
+    ------
+    ValueError
+        Where fewer than three blocks hold any value.
+    """
+    edges = np.linspace(time[0], time[-1], blocks + 1)
+    own = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, blocks - 1)
+    filled = np.unique(own)
+    if len(filled) < 3:
+        raise ValueError(f"at least three blocks must hold values; got {len(filled)}")
+    days = np.array([np.mean(time[own == k]) for k in filled]) / DAY
+    means = np.array([np.mean(value[own == k]) for k in filled])
+    centred = days - np.mean(days)
+    spread = float(np.sum(centred**2))
+    rate = float(np.sum(centred * means)) / spread
+    left = means - np.mean(means) - rate * centred
+    freedom = len(filled) - 2
+    return Slope(rate, float(np.sqrt(np.sum(left**2) / freedom / spread)), freedom)
+
+
+def slope_over_worlds(times: Sequence[Array], values: Sequence[Array]) -> Slope:
+    """Return the mean slope of several worlds, its standard error from their scatter.
+
+    Parameters
+    ----------
+    times, values : sequence of ndarray, shape (n,)
+        One of each world (s); a single one is left to `slope_of_one`.
+    """
+    if len(values) == 1:
+        return slope_of_one(times[0], values[0])
+    rates = [np.polyfit(t / DAY, v, 1)[0] for t, v in zip(times, values, strict=True)]
+    error = float(np.std(rates, ddof=1) / np.sqrt(len(rates)))
+    return Slope(float(np.mean(rates)), error, len(rates) - 1)
+
+
+def allan_deviation(value: Array, step: float, points: int = 40) -> tuple[Array, Array]:
+    """Return averaging times and the overlapping Allan deviation of a series.
+
+    The deviation at m samples is the root of half the mean squared difference of neighbouring means
+    of m samples (IEEE Std 952-1997, annex C): it falls as 1 / sqrt(m) for white errors, and rises
+    as sqrt(m / 3) for a random walk.
+
+    Parameters
+    ----------
+    value : ndarray, shape (n,) or (n, axes)
+        At equal distances; axes are averaged in square.
+    step : float
+        (s)
+    points : int
+        At most so many times, in equal ratios.
+
+    Returns
+    -------
+    time, deviation : ndarray, shape (m,)
+        Up to a third of the series (s; unit of the values).
+    """
+    columns = value.reshape(len(value), -1)
+    most = len(columns) // 3
+    if most < 1:
+        return np.empty(0), np.empty(0)
+    counts = np.unique(np.geomspace(1, most, points).astype(int))
+    total = np.concatenate([np.zeros((1, columns.shape[1])), np.cumsum(columns, axis=0)])
+    found = []
+    for m in counts:
+        mean = (total[m:] - total[:-m]) / m
+        found.append(np.sqrt(0.5 * np.mean((mean[m:] - mean[:-m]) ** 2)))
+    return counts * step, np.array(found)
+
+
+def evenly(series: ErrorSeries, interval: float) -> ErrorSeries:
+    """Return the measured states at multiples of an interval (s): one weight for all hours."""
+    off = np.abs(series.time / interval - np.round(series.time / interval))
+    return series.rows(series.measured & (off * interval < 1e-6))
+
+
+def in_windows(time: Array, value: Array, edges: Array) -> Array:
+    """Return the mean of each window, NaN where it is empty, shape (windows,)."""
+    own = np.searchsorted(edges, time, side="right") - 1
+    out = np.full(len(edges) - 1, np.nan)
+    for k in np.unique(own[(own >= 0) & (own < len(out))]):
+        out[k] = np.mean(value[own == k])
+    return out

@@ -1,0 +1,431 @@
+"""What a log tells of the calibration: how many directions, which not, and why, in words.
+
+The posterior is compared with the prior: in the tangent space scaled by the prior's sigmas the
+eigenvalues of the posterior covariance are the squared ratios of posterior to prior sigma, one
+where the log said nothing.  Some of these directions are gauge: they leave every measurement as it
+is, so that no log can tell them, and only a better survey helps.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.observation import skew
+from magfusion.parameters import Block, Calibration, dimension, prior_sigma
+from magfusion.refinement import DETERMINED_RATIO
+from magfusion.site import Beacon
+from magfusion.units import DEGREE, Array
+
+TOLD = 5  # weakest directions that are put in words
+NOTHING_SAID = 0.95  # ratio from which directions are alike, so that they may be mixed at will
+SHARE_NAMED = 0.08  # of a direction's square, from which a parameter is named
+MOST_NAMED = 4
+NEARLY_NULL = 0.03  # relative change of a drive that passes for none: coils differ by percents
+SMALLEST_TOLD = 1e-4  # m, rad or relative; a common shift below it is of no interest
+_AXES = "xyz"
+_UNITS = {"position": ("cm", 1e-2), "rotation": ("deg", DEGREE), "relative": ("%", 1e-2)}
+_UNITS |= {"phase": ("deg", DEGREE), "drift": ("ppm", 1e-6), "time_offset": ("ms", 1e-3)}
+_UNITS |= {"log_moment": ("%", 1e-2), "matrix": ("%", 1e-2)}
+
+
+class Gauge(NamedTuple):
+    """A way to move the calibration that changes no measurement, or hardly any.
+
+    Parameters
+    ----------
+    name : str
+        E.g. ``all beacons shifted together along x``.
+    remedy : str
+    kind : str
+        What the amplitude is: position, rotation or relative.
+    direction : ndarray, shape (dimension,)
+        Tangent vector of amplitude one.
+    exact : bool
+        False where gravity or acceleration may tell.
+    """
+
+    name: str
+    remedy: str
+    kind: str
+    direction: Array
+    exact: bool = True
+
+
+class Weakness(NamedTuple):
+    """A direction of the calibration that the log left open.
+
+    Parameters
+    ----------
+    words : str
+    ratio : float
+        Posterior over prior sigma along it.
+    direction : ndarray, shape (dimension,)
+        Tangent vector, one posterior sigma long.
+    """
+
+    words: str
+    ratio: float
+    direction: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Observability:
+    """What a log determined of the calibration.
+
+    Parameters
+    ----------
+    ratio : ndarray, shape (dimension,)
+        Posterior over prior sigma of each parameter.
+    ratio_but_for_gauge : ndarray, shape (dimension,)
+        The same, the open gauge taken out of both; NaN where nothing of the parameter is left.
+    direction_ratio : ndarray, shape (dimension,)
+        Posterior over prior sigma of each direction, ascending.
+    gauge : tuple of Weakness
+        Gauge directions, which are open whatever the log.
+    weakest : tuple of Weakness
+        The weakest of the other directions that are open.
+    """
+
+    ratio: Array
+    ratio_but_for_gauge: Array
+    direction_ratio: Array
+    gauge: tuple[Weakness, ...]
+    weakest: tuple[Weakness, ...]
+
+    @property
+    def determined(self) -> int:
+        """Number of directions that the log determined."""
+        return int(np.sum(self.direction_ratio < DETERMINED_RATIO))
+
+
+def observability(calibration: Calibration, blocks: tuple[Block, ...], cov: Array) -> Observability:
+    """Compare the posterior of a calibration with its prior.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Where the covariance was taken.
+    blocks : tuple of Block
+        With the prior's sigmas.
+    cov : ndarray, shape (dimension, dimension)
+        Posterior.
+
+    Returns
+    -------
+    Observability
+    """
+    prior = prior_sigma(blocks)
+    scaled = cov / prior[:, None] / prior
+    size = dimension(blocks)
+    known, nearly, basis = _open_gauge(calibration, blocks, scaled, prior)
+    left = np.eye(size) - basis @ basis.T
+    reduced = left @ scaled @ left
+    share = np.diagonal(left)
+    share = np.where(share > 1e-6, share, np.nan)
+    others = _weakest(blocks, calibration, scaled, basis, prior)
+    value = np.linalg.eigvalsh(scaled) if size else np.zeros(0)
+    return Observability(
+        ratio=np.sqrt(np.diagonal(scaled)),
+        ratio_but_for_gauge=np.sqrt(np.diagonal(reduced) / share),
+        direction_ratio=np.sqrt(np.maximum(value, 0.0)),
+        gauge=known,
+        weakest=tuple(sorted(nearly + others, key=lambda one: -one.ratio)[:TOLD]),
+    )
+
+
+def gauge_basis(calibration: Calibration, blocks: tuple[Block, ...]) -> Array:
+    """Return the gauge directions that no log tells, orthonormal where the prior's sigmas are one.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    blocks : tuple of Block
+
+    Returns
+    -------
+    ndarray, shape (dimension, gauges)
+        What gravity or acceleration may tell is not among them.
+    """
+    prior = prior_sigma(blocks)
+    columns = [q for gauge, q, _ in _orthonormal(calibration, blocks, prior) if gauge.exact]
+    return np.stack(columns, axis=1) if columns else np.zeros((len(prior), 0))
+
+
+def _orthonormal(
+    calibration: Calibration, blocks: tuple[Block, ...], prior: Array
+) -> Iterator[tuple[Gauge, Array, float]]:
+    """Yield each gauge with what it adds to those before it, and the length of that."""
+    known: Array = np.zeros((len(prior), 0))
+    for gauge in gauges(calibration, blocks):
+        scaled = gauge.direction / prior
+        rest = scaled - known @ (known.T @ scaled)
+        rest = rest - known @ (known.T @ rest)
+        length = float(np.linalg.norm(rest))
+        if length > 1e-6 * float(np.linalg.norm(scaled)):
+            known = np.column_stack([known, rest / length])
+            yield gauge, rest / length, length
+
+
+def _open_gauge(
+    calibration: Calibration, blocks: tuple[Block, ...], scaled: Array, prior: Array
+) -> tuple[tuple[Weakness, ...], tuple[Weakness, ...], Array]:
+    """Return the gauges that are open, those that are nearly one, and their orthonormal basis."""
+    known: list[Weakness] = []
+    nearly: list[Weakness] = []
+    columns = []
+    for gauge, column, length in _orthonormal(calibration, blocks, prior):
+        ratio = float(np.sqrt(max(column @ scaled @ column, 0.0)))
+        if ratio < DETERMINED_RATIO:
+            continue
+        columns.append(column)
+        amplitude = ratio / length
+        if amplitude > SMALLEST_TOLD:
+            unit, scale = _UNITS[gauge.kind]
+            words = f"{gauge.name} by {amplitude / scale:.2g} {unit}: {gauge.remedy}"
+            told = known if gauge.exact else nearly
+            told.append(Weakness(words, ratio, ratio * column * prior))
+    basis = np.stack(columns, axis=1) if columns else np.zeros((len(prior), 0))
+    return tuple(known), tuple(nearly), basis
+
+
+def gauges(calibration: Calibration, blocks: tuple[Block, ...]) -> list[Gauge]:
+    """Return the gauge directions of what is estimated, those that are nearly one last.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    blocks : tuple of Block
+        A gauge that would move what is not among them is none.
+    """
+    beacons = calibration.site.beacons
+    found = [*_shifts(beacons, blocks), *_turns(beacons, blocks, (2,))]
+    found += [*_of_sensor(calibration, blocks)]
+    for beacon in beacons:
+        found += _of_drive(beacon, blocks)
+    return found + _turns(beacons, blocks, (0, 1)) + _scale(beacons, blocks)
+
+
+def _scale(beacons: tuple[Beacon, ...], blocks: tuple[Block, ...]) -> list[Gauge]:
+    """Return what the field cannot tell: the whole world larger, and its moments with the cube."""
+    parts: dict[tuple[str, str, str], Array] = {}
+    for b in beacons:
+        parts["beacons", b.name, "position"] = b.position_world
+        parts["moments", b.name, "log_moment"] = np.full(len(b.coils), 3.0)
+    direction = _joined(blocks, parts)
+    name = "all distances larger together and the moments with their cube"
+    remedy = "acceleration alone tells; move farther and faster, or measure a distance"
+    return [] if direction is None else [Gauge(name, remedy, "relative", direction, False)]
+
+
+def _joined(blocks: tuple[Block, ...], parts: dict[tuple[str, str, str], Array]) -> Array | None:
+    """Return the tangent vector of these parts; None where one of them is not estimated."""
+    out, left = np.zeros(dimension(blocks)), dict(parts)
+    for block in blocks:
+        value = left.pop(block[:3], None)
+        if value is not None:
+            out[block.columns] = value
+    return None if any(np.any(value != 0.0) for value in left.values()) else out
+
+
+def _shifts(beacons: tuple[Beacon, ...], blocks: tuple[Block, ...]) -> list[Gauge]:
+    found = []
+    for axis, step in zip(_AXES, np.eye(3), strict=True):
+        direction = _joined(blocks, {("beacons", b.name, "position"): step for b in beacons})
+        if direction is not None:
+            name = f"all beacons shifted together along {axis}"
+            remedy = "gauge: no log can tell; survey one beacon better"
+            found.append(Gauge(name, remedy, "position", direction))
+    return found
+
+
+def _turns(
+    beacons: tuple[Beacon, ...], blocks: tuple[Block, ...], axes: tuple[int, ...]
+) -> list[Gauge]:
+    found = []
+    for k in axes:
+        axis_world = np.eye(3)[k]
+        parts: dict[tuple[str, str, str], Array] = {}
+        for b in beacons:
+            parts["beacons", b.name, "position"] = np.cross(axis_world, b.position_world)
+            parts["beacons", b.name, "rotation"] = b.world_from_beacon.T @ axis_world
+        direction = _joined(blocks, parts)
+        if direction is None:
+            continue
+        if k == 2:
+            name = "all beacons turned together about the vertical"
+            remedy = "gauge: no log can tell; survey the bearing between two beacons better"
+        else:
+            name = f"all beacons tilted together about {_AXES[k]}"
+            remedy = "gravity alone tells; stand still, in several attitudes"
+        found.append(Gauge(name, remedy, "rotation", direction, exact=k == 2))
+    return found
+
+
+def _of_sensor(calibration: Calibration, blocks: tuple[Block, ...]) -> Iterator[Gauge]:
+    matrix = calibration.site.platform.magnetometer.matrix
+    place = ("magnetometer", "magnetometer", "matrix")
+    moments: dict[tuple[str, str, str], Array] = {
+        ("moments", b.name, "log_moment"): np.ones(len(b.coils)) for b in calibration.site.beacons
+    }
+    direction = _joined(blocks, moments | {place: -matrix.ravel()})
+    if direction is not None:
+        name = "all moments larger together and the magnetometer's gain smaller"
+        remedy = "gauge: no log can tell; measure one beacon's moment, or the gain"
+        yield Gauge(name, remedy, "relative", direction)
+    for axis, step in zip(_AXES, np.eye(3), strict=True):
+        turned = {("extrinsics", "sensor", "rotation"): step}
+        direction = _joined(blocks, turned | {place: (matrix @ skew(step)).ravel()})
+        if direction is not None:
+            name = f"the mounting turned about the sensor's {axis} and the matrix turned back"
+            remedy = "gauge: no log can tell; hold one of the two"
+            yield Gauge(name, remedy, "rotation", direction)
+
+
+def _of_drive(beacon: Beacon, blocks: tuple[Block, ...]) -> list[Gauge]:
+    """Return turns of one beacon that its coils' currents undo, as that of a rotating one."""
+    drive = beacon.moments_beacon.T @ beacon.excitation  # (3, tones)
+    turned = [(skew(axis) @ drive).ravel() for axis in np.eye(3)]
+    shifted = [
+        np.where(np.arange(len(beacon.tones)) == k, 1j * drive, 0.0).ravel()
+        for k in range(0 if beacon.synchronised else len(beacon.tones))
+    ]
+    grown = [
+        (beacon.moments_beacon[j][:, None] * beacon.excitation[j]).ravel()
+        for j in range(len(beacon.coils))
+    ]
+    change = np.stack([*turned, *shifted, *grown], axis=1)
+    change = np.concatenate([change.real, change.imag]) / np.linalg.norm(drive)
+    _, size, right = np.linalg.svd(change, full_matrices=True)
+    size = np.concatenate([size, np.zeros(len(right) - len(size))])
+    found = []
+    for step in right[size < NEARLY_NULL]:
+        turn = float(np.linalg.norm(step[:3]))
+        tones = len(shifted)
+        step = np.where(np.abs(step) < NEARLY_NULL, 0.0, step)
+        parts = {("beacons", beacon.name, "rotation"): step[:3]}
+        if tones:
+            parts["phase", beacon.name, "phase"] = step[3 : 3 + tones]
+        parts["moments", beacon.name, "log_moment"] = step[3 + tones :]
+        direction = _joined(blocks, parts)
+        if direction is None or turn < NEARLY_NULL:
+            continue
+        against = " against its drive phase" if tones else ""
+        name = f"beacon {beacon.name} turned about its own axis{against}"
+        remedy = "gauge: its field does not change; nothing depends on it"
+        found.append(Gauge(name, remedy, "rotation", direction / turn))
+    return found
+
+
+def _weakest(
+    blocks: tuple[Block, ...],
+    calibration: Calibration,
+    scaled: Array,
+    gauge: Array,
+    prior: Array,
+) -> tuple[Weakness, ...]:
+    """Return the weakest directions beside the gauge, weakest first."""
+    size = len(prior)
+    if size == gauge.shape[1]:
+        return ()
+    beside = np.linalg.svd(np.column_stack([gauge, np.zeros(size)]), full_matrices=True)[0]
+    beside = beside[:, gauge.shape[1] :]
+    value, vector = np.linalg.eigh(beside.T @ scaled @ beside)
+    ratio, column = np.sqrt(np.maximum(value, 0.0))[::-1], (beside @ vector)[:, ::-1]
+    alike = int(np.sum(ratio > NOTHING_SAID))
+    if alike > 1:
+        column = np.column_stack([_simplest(column[:, :alike]), column[:, alike:]])
+        ratio = np.sqrt(np.einsum("ik,ij,jk->k", column, scaled, column))
+    open_ = np.flatnonzero(ratio > DETERMINED_RATIO)
+    order = open_[np.argsort(-ratio[open_], kind="stable")][:TOLD]
+    names = parameter_names(blocks, calibration)
+    return tuple(
+        Weakness(
+            _in_words(column[:, k], float(ratio[k]), blocks, names, prior),
+            float(ratio[k]),
+            ratio[k] * column[:, k] * prior,
+        )
+        for k in order
+    )
+
+
+def _simplest(basis: Array, rounds: int = 50) -> Array:
+    """Return a basis of the same space whose vectors have few large components each (varimax)."""
+    turn = np.eye(basis.shape[1])
+    for _ in range(rounds):
+        turned = basis @ turn
+        target = turned**3 - turned * np.mean(turned**2, axis=0)
+        left, _, right = np.linalg.svd(basis.T @ target)
+        turn = left @ right
+    return np.asarray(basis @ turn)
+
+
+def parameter_names(
+    blocks: tuple[Block, ...], calibration: Calibration
+) -> list[tuple[str, str, float]]:
+    """Return what each parameter is called, its unit, and the size of the unit in SI.
+
+    Parameters
+    ----------
+    blocks : tuple of Block
+    calibration : Calibration
+    """
+    coils = {b.name: len(b.coils) for b in calibration.site.beacons}
+    return [
+        (_called(block, i, coils.get(block.owner, 1)), *_UNITS[block.kind])
+        for block in blocks
+        for i in range(len(block.sigma))
+    ]
+
+
+def _called(block: Block, i: int, coils: int) -> str:
+    if block.group == "magnetometer":
+        row, column = divmod(i, 3)
+        if row == column:
+            return f"the magnetometer's gain on {_AXES[row]}"
+        return f"{_AXES[column]} in the magnetometer's {_AXES[row]}"
+    if block.group == "extrinsics":
+        if block.kind == "position":
+            return f"the lever arm along {_AXES[i]}"
+        return f"the mounting's turn about the sensor's {_AXES[i]}"
+    if block.kind == "time_offset":
+        return "the IMU's time offset"
+    owner = f"beacon {block.owner}"
+    if block.kind == "position":
+        return f"the height of {owner}" if i == 2 else f"{_AXES[i]} of {owner}"
+    if block.kind == "rotation":
+        return f"the turn of {owner} about its {_AXES[i]}"
+    if block.kind == "drift":
+        return f"the clock of {owner}"
+    of_coil = f"coil {i} of {owner}" if coils > 1 else owner
+    what = "drive phase" if block.kind == "phase" else "moment"
+    return f"the {what} of {owner if what == 'drive phase' else of_coil}"
+
+
+def _in_words(
+    column: Array,
+    ratio: float,
+    blocks: tuple[Block, ...],
+    names: list[tuple[str, str, float]],
+    prior: Array,
+) -> str:
+    moved = ratio * column * prior
+    parts = [(column[k] ** 2, moved[k], *names[k]) for k in range(len(column))]
+    for block in blocks[::-1]:
+        if block.kind == "log_moment" and _alike(moved[block.columns]):
+            share, mean = np.sum(column[block.columns] ** 2), np.mean(moved[block.columns])
+            told = f"the moments of beacon {block.owner}"
+            parts[block.columns] = [(share, mean, told, *_UNITS["log_moment"])]
+    parts.sort(key=lambda part: -part[0])
+    named = [part for part in parts[:MOST_NAMED] if part[0] > SHARE_NAMED] or parts[:1]
+    sign = np.sign(named[0][1]) or 1.0
+    texts = [f"{name} by {sign * size / scale:+.2g} {unit}" for _, size, name, unit, scale in named]
+    told = texts[0] if len(texts) == 1 else f"{texts[0]} against {', '.join(texts[1:])}"
+    return f"{told} (sigma {ratio:.2f} of the survey's)"
+
+
+def _alike(values: Array) -> bool:
+    """Tell whether the coils of a beacon go together."""
+    low, high = np.min(values), np.max(values)
+    return len(values) > 1 and bool(low * high > 0.0 and abs(low - high) < 0.5 * abs(low + high))

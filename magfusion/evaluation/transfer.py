@@ -1,0 +1,66 @@
+"""Whether two logs tell the same calibration."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.parameters import Block, Calibration, difference, prior_sigma
+from magfusion.refinement import DETERMINED_RATIO
+from magfusion.units import Array
+
+OF_THE_LOG = ("phase",)  # kinds that a log has of its own: its phases refer to its own middle
+
+
+class Estimated(NamedTuple):
+    """A calibration with its posterior."""
+
+    declared: Calibration
+    calibration: Calibration
+    blocks: tuple[Block, ...]
+    cov: Array
+
+
+class Agreement(NamedTuple):
+    """The difference of two calibrations in its own sigmas.
+
+    Parameters
+    ----------
+    by_parameter : ndarray, shape (parameters,)
+        Difference over the root of the sum of both posterior variances.
+    by_direction : ndarray, shape (determined,)
+        Along each direction that both logs determined, in the sigmas that the difference has.
+    """
+
+    by_parameter: Array
+    by_direction: Array
+
+
+def agreement(first: Estimated, second: Estimated) -> Agreement:
+    """Compare calibrations that two logs told of one installation.
+
+    Both began at the same survey, and where a log says nothing both stay there: such directions,
+    the gauge among them, agree without proof and are left out.  In the others the pull of the
+    survey is taken off the sigma of the difference: with ``K = I - P P0^-1`` it has the covariance
+    ``(K1 - K2) P0 (K1 - K2)^T + sum(P - P P0^-1 P)``, which is less than the sum of the posteriors.
+
+    Parameters
+    ----------
+    first, second : Estimated
+        With the same parameters and priors.
+    """
+    kept = np.concatenate(
+        [np.full(len(b.sigma), b.kind not in OF_THE_LOG) for b in first.blocks] or [np.zeros(0)]
+    ).astype(bool)
+    prior = prior_sigma(first.blocks)[kept]
+    step = difference(first.calibration, second.calibration, first.blocks)[kept] / prior
+    scaled = [part.cov[np.ix_(kept, kept)] / prior[:, None] / prior for part in (first, second)]
+    both = scaled[0] + scaled[1]
+    pulled = scaled[1] - scaled[0]
+    own = pulled @ pulled + sum(p - p @ p for p in scaled)
+    value, vector = np.linalg.eigh(0.5 * both)
+    told = vector[:, np.sqrt(np.maximum(value, 0.0)) < DETERMINED_RATIO]
+    variance = np.einsum("ik,ij,jk->k", told, own, told)
+    return Agreement(
+        by_parameter=step / np.sqrt(np.diagonal(both)),
+        by_direction=(told.T @ step) / np.sqrt(variance),
+    )
