@@ -146,7 +146,6 @@ def choose_windows(
             f"magnetometer: sampled at {rate:.4g} Hz, too slow for the tone at {highest:g} Hz; "
             f"at least {highest / 0.45:.4g} Hz are needed"
         )
-    imu_time = imu.time + site.platform.imu.time_offset
     time, half = waveform.time, settings.window / 2.0
     # The last sample stands for the interval up to the next one, as every sample does.
     last_start = time[-1] + 1.0 / rate - time[0] - settings.window
@@ -154,29 +153,11 @@ def choose_windows(
     centre = time[0] - 0.5 / rate + half + settings.step * np.arange(max(number, 0))
     first = np.searchsorted(time, centre - half)
     last = np.searchsorted(time, centre + half)
-    reasons = Counter[str]()
-    usable = np.ones(len(centre), dtype=bool)
-
-    def drop(reason: str, spoilt: BoolArray) -> None:
-        reasons[reason] += int(np.sum(usable & spoilt))
-        usable[spoilt] = False
-
-    gap = np.flatnonzero(np.diff(time) > 1.5 / rate)
-    # From just before the first missing sample to just after the last.
-    missing = time[gap] + 0.75 / rate, time[gap + 1] - 0.75 / rate
-    drop("gap in the magnetometer stream", _meets(*missing, centre - half, centre + half))
-    drop("too few samples", last - first < 0.9 * settings.window * rate)
-    clipped = _saturated(waveform)
-    drop("magnetometer saturated", _meets(clipped, clipped, centre - half, centre + half))
-    step = _usual_step(imu_time, "imu")
-    margin = 2.0 * step + 3.0 * site.platform.imu.time_offset_sigma
-    inside = (centre - half >= imu_time[0] - margin) & (centre + half <= imu_time[-1] + margin)
-    drop("no inertial data", ~inside)
-    gap = np.flatnonzero(np.diff(imu_time) > 3.0 * step)
-    silent = _meets(imu_time[gap], imu_time[gap + 1], centre - half, centre + half)
-    drop("gap in the inertial stream", silent)
+    limits = centre - half, centre + half
+    least = 0.9 * settings.window * rate
+    usable, reasons = usable_stretches(waveform, imu, site, limits, last - first, least)
     if not np.any(usable):
-        told = "; ".join(f"{k}: {v}" for k, v in reasons.items() if v) or "the log is too short"
+        told = "; ".join(f"{k}: {v}" for k, v in reasons.items()) or "the log is too short"
         raise InputError(
             f"magnetometer: no window of {settings.window:g} s is usable ({told}); "
             "record longer, or choose a shorter window"
@@ -185,8 +166,68 @@ def choose_windows(
         centre=centre[usable],
         first=first[usable],
         count=(last - first)[usable],
-        dropped={k: v for k, v in reasons.items() if v},
+        dropped=reasons,
     )
+
+
+def usable_stretches(
+    waveform: Waveform,
+    imu: ImuSamples,
+    site: Site,
+    limits: tuple[Array, Array],
+    count: IntArray,
+    least: float,
+    *,
+    clips: bool = True,
+) -> tuple[BoolArray, Mapping[str, int]]:
+    """Tell which stretches of a waveform no gap and no saturation spoils.
+
+    Parameters
+    ----------
+    waveform : Waveform
+    imu : ImuSamples
+    site : Site
+    limits : tuple of ndarray, shape (n,)
+        Begin and end of each stretch (s).
+    count : int ndarray, shape (n,)
+        Samples that it holds.
+    least : float
+        Samples that it must hold.
+    clips : bool
+        Whether a constant extreme is saturation.
+
+    Returns
+    -------
+    usable : bool ndarray, shape (n,)
+    dropped : mapping
+        Reason to number of stretches.
+    """
+    begin, end = limits
+    time, rate = waveform.time, sample_rate_hz(waveform)
+    imu_time = imu.time + site.platform.imu.time_offset
+    reasons = Counter[str]()
+    usable = np.ones(len(begin), dtype=bool)
+
+    def drop(reason: str, spoilt: BoolArray) -> None:
+        reasons[reason] += int(np.sum(usable & spoilt))
+        usable[spoilt] = False
+
+    gap = np.flatnonzero(np.diff(time) > 1.5 / rate)
+    # From just before the first missing sample to just after the last.
+    missing = time[gap] + 0.75 / rate, time[gap + 1] - 0.75 / rate
+    drop("gap in the magnetometer stream", _meets(*missing, begin, end))
+    drop("too few samples", count < least)
+    if clips:
+        clipped = _saturated(waveform)
+        drop("magnetometer saturated", _meets(clipped, clipped, begin, end))
+    step = _usual_step(imu_time, "imu")
+    margin = 2.0 * step + 3.0 * site.platform.imu.time_offset_sigma
+    inside = (begin >= imu_time[0] - margin) & (end <= imu_time[-1] + margin)
+    drop("no inertial data", ~inside)
+    gap = np.flatnonzero(np.diff(imu_time) > 3.0 * step)
+    silent = _meets(imu_time[gap], imu_time[gap + 1], begin, end)
+    drop("gap in the inertial stream", silent)
+    return usable, {k: v for k, v in reasons.items() if v}
 
 
 def _meets(begin: Array, end: Array, window_begin: Array, window_end: Array) -> BoolArray:

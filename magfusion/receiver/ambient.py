@@ -1,0 +1,132 @@
+"""What was measured while all coils were silent, carried over to the slots in which one was driven.
+
+Paper 000, Eq 2-8, subtracts the silent slot of the cycle.  That is exact for a field that does not
+change within the cycle and makes hum worse: of a tone f there remains, in units of its amplitude,
+``|sinc(f tau)| 2 |sin(pi f n tau)|``, n slots before the silent one; with slots of 5 ms 50 Hz are
+5.1 dB larger than had nothing been subtracted.
+"""
+
+from typing import Literal
+
+import numpy as np
+
+from magfusion.units import Array, ComplexArray, IntArray
+
+Removal = Literal["none", "subtract", "interpolate", "state"]
+LEAST_TURNS = 1.2  # of an alias of the mains in the span of the state, which tells it from a ramp
+
+
+def subtraction_gain(frequency_hz: float, duration: float, slots_apart: int) -> float:
+    """Return what subtracting a silent slot leaves of a tone, worst phase, relative to it.
+
+    Parameters
+    ----------
+    frequency_hz : float
+    duration : float
+        Of a slot (s).
+    slots_apart : int
+        How many slots the silent one comes later.
+    """
+    averaged = abs(np.sinc(frequency_hz * duration))
+    return float(averaged * 2.0 * abs(np.sin(np.pi * frequency_hz * slots_apart * duration)))
+
+
+def ambient_weights(
+    driven: IntArray,
+    silent: IntArray,
+    count: int,
+    removal: Removal,
+    *,
+    cycles: int = 8,
+    mains_turns: float = 0.0,
+) -> tuple[IntArray, Array]:
+    """Return from which silent slots, and with which weights, the ambient field is taken.
+
+    Parameters
+    ----------
+    driven, silent : int ndarray, shape (n,) and (m,)
+        Running numbers of the slots, increasing.
+    count : int
+        Slots in a cycle.
+    removal : {"none", "subtract", "interpolate", "state"}
+        Nothing; the mean of the silent slots of the same cycle; straight lines between the nearest
+        silent slots before and after; least squares of a constant, a ramp and, where they can be
+        told apart, the mains over the nearest silent slots.
+    cycles : int
+        Length of the state (cycles).
+    mains_turns : float
+        Turns of the mains in a slot; zero for none.
+
+    Returns
+    -------
+    index : int ndarray, shape (n, k)
+        Into ``silent``.
+    weight : ndarray, shape (n, k)
+        NaN where there is no silent slot to take the field from.
+    """
+    if removal == "none" or len(silent) == 0:
+        nothing = np.zeros((len(driven), 1))
+        return nothing.astype(np.int64), nothing + (np.nan if removal != "none" else 0.0)
+    after = np.searchsorted(silent, driven)
+    if removal == "subtract":
+        return _same_cycle(driven, silent, count)
+    if removal == "interpolate":
+        return _interpolated(driven, silent, after, count)
+    per_cycle = len(np.unique(silent % count))
+    number = min(cycles * per_cycle, len(silent))
+    first = np.clip(after - number // 2, 0, len(silent) - number)
+    index = first[:, None] + np.arange(number)
+    elapsed = (silent[index] - driven[:, None]).astype(np.float64)
+    # What is far off says nothing of the field now: the log has a gap.
+    near = np.abs(elapsed) <= cycles * count
+    design = _state_design(elapsed, near, count, mains_turns)
+    weight = np.linalg.pinv(design, rcond=1e-6)[:, 0]  # the constant, at the driven slot itself
+    return index, np.where(near.any(axis=1)[:, None], weight, np.nan)
+
+
+def _state_design(elapsed: Array, near: Array, count: int, mains_turns: float) -> Array:
+    span = np.ptp(elapsed, axis=1).max() / count  # cycles
+    columns = [np.ones_like(elapsed), elapsed / (span * count + 1.0)]
+    alias = abs(mains_turns * count - round(mains_turns * count))
+    told_apart = span * min(alias, 0.5 - alias) >= LEAST_TURNS
+    if told_apart and abs(np.sinc(mains_turns)) > 1e-3:
+        angle = 2.0 * np.pi * mains_turns * elapsed
+        # At the driven slot the mains are wanted too: cos(0) = 1 there, so that the constant,
+        # less the cosine's own column, holds both.
+        columns += [np.cos(angle) - 1.0, np.sin(angle)]
+    return np.stack(columns, axis=-1) * near[..., None]
+
+
+def _same_cycle(driven: IntArray, silent: IntArray, count: int) -> tuple[IntArray, Array]:
+    lo = np.searchsorted(silent // count, driven // count)
+    hi = np.searchsorted(silent // count, driven // count, side="right")
+    most = max(int(np.max(hi - lo)), 1)
+    index = lo[:, None] + np.arange(most)
+    there = index < hi[:, None]
+    weight = np.where(there, 1.0 / np.maximum(hi - lo, 1)[:, None], 0.0)
+    weight[hi == lo] = np.nan
+    return np.minimum(index, len(silent) - 1), weight
+
+
+def _interpolated(
+    driven: IntArray, silent: IntArray, after: IntArray, count: int
+) -> tuple[IntArray, Array]:
+    right = np.minimum(after, len(silent) - 1)
+    left = np.maximum(after - 1, 0)
+    span = np.maximum(silent[right] - silent[left], 1)
+    share = np.clip((driven - silent[left]) / span, 0.0, 1.0)
+    weight = np.stack([1.0 - share, share], axis=1)
+    weight[span > 2 * count] = np.nan  # a gap
+    outside = (driven < silent[left]) | (driven > silent[right])
+    reach = np.minimum(np.abs(driven - silent[left]), np.abs(driven - silent[right]))
+    weight[outside & (reach > count)] = np.nan
+    return np.stack([left, right], axis=1), weight
+
+
+def removed(
+    driven: ComplexArray, silent: ComplexArray, index: IntArray, weight: Array
+) -> ComplexArray:
+    """Return the driven slots (n, 3) freed of the ambient field that silent ones (m, 3) tell."""
+    if len(silent) == 0:
+        return driven + weight
+    return np.asarray(driven - np.einsum("nk,nkx->nx", weight, silent[index]))

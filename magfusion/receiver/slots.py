@@ -1,0 +1,433 @@
+"""Time division: from the raw waveform of coils driven in turn to one phasor a slot.
+
+Every slot is stamped with its own time, a row of its own with one channel: what is measured one
+after the other is not simultaneous, and at 100 deg/s slots of 5 ms make 0.7 deg of that.  All
+samples are turned by the gyro into axes that do not turn with the body, in which the Earth's field
+of a silent slot is the one of its neighbours, and back into those of the slot's own time.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.receiver.ambient import Removal, ambient_weights, removed
+from magfusion.receiver.noise import smoothed_over_windows
+from magfusion.receiver.windows import sample_rate_hz, usable_stretches
+from magfusion.records.samples import FieldSamples, ImuSamples, Waveform
+from magfusion.site import Site, Slots
+from magfusion.strapdown import attitude_at, attitude_from_gyro
+from magfusion.units import Array, ComplexArray, IntArray
+
+LEAST_SAMPLES = 8  # in a slot; its noise is measured three cycles a slot beside the carrier
+LEAST_CYCLES = 4.0  # of a carrier in a slot
+NOISE_CYCLES = 16  # over which the noise is averaged
+
+
+@dataclass(frozen=True)
+class SlotSettings:
+    """How the slots of a waveform are demodulated.
+
+    Parameters
+    ----------
+    removal : {"none", "subtract", "interpolate", "state"}
+        How the silent slots free the others of the ambient field, see
+        `magfusion.receiver.ambient.ambient_weights`.
+    taper : {"rectangular", "hann"}
+        Weight of the samples within a slot.
+    cycles : int
+        Over which the ambient state reaches.
+    mains_hz : float
+        Fitted in the ambient state of pulsed direct current; 0 for none.
+    """
+
+    removal: Removal
+    taper: Literal["rectangular", "hann"]
+    cycles: int = 8
+    mains_hz: float = 50.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Stretches:
+    """The slots of a waveform that are usable; ``number`` counts on from the schedule's start."""
+
+    number: IntArray
+    first: IntArray
+    count: IntArray
+    begin: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """What least squares makes of each slot."""
+
+    time: Array  # (n,) weighted mean of the sample times
+    value: ComplexArray  # (n, 3) non-turning axes
+    variance: Array  # (n,) of a component, for samples of unit variance
+
+
+def has_schedule(site: Site) -> bool:
+    """Tell whether a beacon of the site declares time slots."""
+    return any(beacon.slots is not None for beacon in site.beacons)
+
+
+def schedule(site: Site) -> Slots:
+    """Return the schedule that all beacons of the site keep.
+
+    Raises
+    ------
+    InputError
+        Where a beacon keeps none or another one, or two coils that do not belong together are
+        driven in one slot.
+    """
+    first = next(beacon for beacon in site.beacons if beacon.slots is not None)
+    assert first.slots is not None
+    for beacon in site.beacons:
+        if beacon.slots != first.slots:
+            kept = "none" if beacon.slots is None else "another one"
+            raise InputError(
+                f"beacon {first.name} keeps a schedule of time slots and beacon {beacon.name}"
+                f" {kept}; give both the same slots, in which each coil has its own"
+            )
+    taken: dict[int, str] = {}
+    for beacon in site.beacons:
+        for _, slot in beacon.tones:
+            if slot is None:
+                raise InputError(
+                    f"beacon {beacon.name} keeps a schedule of time slots and has a coil without"
+                    " one; give every coil its slot"
+                )
+            if slot in taken:
+                raise InputError(
+                    f"beacons {taken[slot]} and {beacon.name} are both driven in slot {slot};"
+                    " give every coil a slot of its own"
+                )
+            taken[slot] = beacon.name
+    return first.slots
+
+
+def default_slot_settings(site: Site, mains_hz: float = 50.0) -> SlotSettings:
+    """Choose how to demodulate: the ambient state for pulses, tapered carriers without it.
+
+    Beside a carrier the silent slots tell nothing and cost noise.
+    """
+    pulsed = any(np.any(beacon.tone_frequencies_hz == 0.0) for beacon in site.beacons)
+    if pulsed:
+        return SlotSettings("state", "rectangular", mains_hz=mains_hz)
+    return SlotSettings("none", "hann", mains_hz=mains_hz)
+
+
+def demodulate_slots(
+    waveform: Waveform,
+    imu: ImuSamples,
+    site: Site,
+    settings: SlotSettings,
+    *,
+    gyro_bias_body: Array | None = None,
+    time_offset: float | None = None,
+) -> tuple[FieldSamples, Mapping[str, int]]:
+    """Turn the raw samples of a slotted tracker into one phasor for each slot.
+
+    Pulses of direct current give a real phasor, the field itself.
+
+    Parameters
+    ----------
+    waveform : Waveform
+    imu : ImuSamples
+    site : Site
+        Whose beacons share one schedule.
+    settings : SlotSettings
+    gyro_bias_body : ndarray, shape (3,) or (len(imu), 3), optional
+        (rad/s)
+    time_offset : float, optional
+        IMU time offset (s); the site's where it is not given.
+
+    Returns
+    -------
+    samples : FieldSamples
+        A row for each driven slot, at the mean time of its samples, with one channel.  The
+        covariance holds the noise of the slot and of what was taken off, not what hum leaves.
+    dropped : mapping
+        Reason to number of slots.
+
+    Raises
+    ------
+    InputError
+        Where the schedule does not fit the sampling rate or the settings, or no slot is usable.
+    """
+    slots = schedule(site)
+    carrier = _carriers_hz(site, slots, sample_rate_hz(waveform), settings)
+    pulsed = not np.any(carrier)
+    stretches, dropped = _stretches(waveform, imu, site, slots, pulsed=pulsed)
+    offset = site.platform.imu.time_offset if time_offset is None else time_offset
+    gyro = imu.gyro_body - (0.0 if gyro_bias_body is None else gyro_bias_body)
+    imu_time = imu.time + offset
+    attitude = attitude_from_gyro(imu_time, gyro)
+    magnetometer = site.platform.magnetometer
+    measured_from_body = magnetometer.matrix @ magnetometer.body_from_sensor.T
+    field_body = (waveform.measured_sensor - magnetometer.offset) @ np.linalg.inv(
+        measured_from_body
+    ).T
+    still = attitude_at(attitude, imu_time, gyro, waveform.time).apply(field_body)
+
+    place = stretches.number % slots.count
+    sums = _slot_sums(waveform.time, still, stretches, slots, carrier[place], settings)
+    noise = _noise(waveform, stretches, slots, carrier[place])
+    owner = _owners(site, slots)
+    driven, silent = np.flatnonzero(owner[place] >= 0), np.flatnonzero(owner[place] < 0)
+    index, weight = ambient_weights(
+        stretches.number[driven],
+        stretches.number[silent],
+        slots.count,
+        settings.removal,
+        cycles=settings.cycles,
+        mains_turns=settings.mains_hz * slots.duration if pulsed else 0.0,
+    )
+    value = removed(sums.value[driven], sums.value[silent], index, weight)
+    usable = np.isfinite(value).all(axis=1)
+    if not np.any(usable):
+        raise InputError(
+            f"magnetometer: no slot of {slots.duration:g} s has silent ones beside it; record"
+            " longer, or mend the schedule"
+        )
+    kept, weight = driven[usable], weight[usable]
+    variance = sums.variance[kept] * (1.0 + np.sum(weight**2, axis=1))
+    body_from_still = attitude_at(attitude, imu_time, gyro, sums.time[kept]).inv()
+    phasor = body_from_still.apply(value[usable].real) @ measured_from_body.T + 1j * (
+        body_from_still.apply(value[usable].imag) @ measured_from_body.T
+    )
+    found = _rows(site, slots, sums.time[kept], owner[place[kept]], phasor)
+    rows = np.arange(len(kept))
+    found.phasor_cov[rows, owner[place[kept]]] = variance[:, None, None] * noise[kept]
+    lost = int(np.sum(~usable))
+    return found, dict(dropped) | ({"no silent slot beside it": lost} if lost else {})
+
+
+def _carriers_hz(site: Site, slots: Slots, rate_hz: float, settings: SlotSettings) -> Array:
+    """Return the carrier of each slot of a cycle (Hz); that of the first coil in silent ones."""
+    tones = [(slot, f) for beacon in site.beacons for f, slot in beacon.tones]
+    carrier = np.full(slots.count, tones[0][1])
+    for slot, frequency in tones:
+        assert slot is not None
+        carrier[slot] = frequency
+    if slots.duration * rate_hz < LEAST_SAMPLES:
+        raise InputError(
+            f"magnetometer: sampled at {rate_hz:.4g} Hz, too slow for slots of"
+            f" {slots.duration:g} s; at least {LEAST_SAMPLES / slots.duration:.4g} Hz are needed"
+        )
+    highest, lowest = float(np.max(carrier)), float(np.min(carrier))
+    if highest > 0.45 * rate_hz:
+        raise InputError(
+            f"magnetometer: sampled at {rate_hz:.4g} Hz, too slow for the carrier at {highest:g}"
+            f" Hz; at least {highest / 0.45:.4g} Hz are needed"
+        )
+    if highest > 0.0 and lowest * slots.duration < LEAST_CYCLES:
+        raise InputError(
+            f"a carrier of {lowest:g} Hz has less than {LEAST_CYCLES:g} cycles in a slot of"
+            f" {slots.duration:g} s; give longer slots, a faster carrier, or frequency_hz: 0"
+            " in all coils for pulses of direct current"
+        )
+    apart = settings.removal != "none"
+    if apart and highest > lowest:
+        raise InputError(
+            "silent slots cannot tell the ambient field at several carriers; demodulate without"
+            " them, or drive all coils at one frequency"
+        )
+    if (apart or highest == 0.0) and len(tones) == slots.count:
+        raise InputError(
+            f"all {slots.count} time slots are driven and none tells the ambient field; leave one"
+            " silent, or drive the coils with a carrier"
+        )
+    return carrier
+
+
+def _stretches(
+    waveform: Waveform, imu: ImuSamples, site: Site, slots: Slots, *, pulsed: bool
+) -> tuple[_Stretches, Mapping[str, int]]:
+    rate = sample_rate_hz(waveform)
+    running = slots.running(waveform.time)
+    first = np.flatnonzero(np.diff(running, prepend=running[0] - 1))
+    count = np.diff(first, append=len(running))
+    number = running[first]
+    begin = slots.start + number * slots.duration
+    # The plateau of a pulse is no saturation.
+    usable, dropped = usable_stretches(
+        waveform,
+        imu,
+        site,
+        (begin - 0.5 / rate, begin + slots.duration - 0.5 / rate),
+        count,
+        0.9 * slots.duration * rate,
+        clips=not pulsed,
+    )
+    if not np.any(usable):
+        told = "; ".join(f"{k}: {v}" for k, v in dropped.items()) or "the log is too short"
+        raise InputError(
+            f"magnetometer: no slot of {slots.duration:g} s is usable ({told}); record longer"
+        )
+    found = _Stretches(number[usable], first[usable], count[usable], begin[usable])
+    return found, dropped
+
+
+def _samples_of(stretches: _Stretches) -> tuple[IntArray, IntArray, IntArray]:
+    """Return all samples in slots, the slot of each, and where each slot begins among them."""
+    owner = np.repeat(np.arange(len(stretches.count)), stretches.count)
+    begins = np.concatenate([[0], np.cumsum(stretches.count)[:-1]])
+    sample = np.arange(len(owner)) - begins[owner] + stretches.first[owner]
+    return sample, owner, begins
+
+
+def _hann(time: Array, begin: Array, slots: Slots, rate_hz: float) -> Array:
+    return np.asarray(1.0 - np.cos(2.0 * np.pi * (time - begin + 0.5 / rate_hz) / slots.duration))
+
+
+def _slot_sums(
+    time: Array,
+    still: Array,
+    stretches: _Stretches,
+    slots: Slots,
+    carrier_hz: Array,
+    settings: SlotSettings,
+) -> _Sums:
+    """Fit a constant, and beside a carrier its two quadratures, to each slot."""
+    sample, owner, begins = _samples_of(stretches)
+    rate = 1.0 / float(np.median(np.diff(time)))
+    begin, at = stretches.begin[owner], time[sample]
+    weight = np.ones(len(at))
+    if settings.taper == "hann":
+        weight = _hann(at, begin, slots, rate)
+    columns = [np.ones(len(at))]
+    if np.any(carrier_hz):
+        angle = 2.0 * np.pi * carrier_hz[owner] * (at - begin)
+        columns += [np.cos(angle), np.sin(angle)]
+
+    def total(values: Array) -> Array:
+        return np.asarray(np.add.reduceat(values, begins, axis=0))
+
+    size = len(columns)
+    normal, spread = np.empty((2, len(begins), size, size))
+    right = np.empty((len(begins), size, 3))
+    for i, a in enumerate(columns):
+        right[:, i] = total((weight * a)[:, None] * still[sample])
+        for j, b in enumerate(columns):
+            normal[:, i, j] = total(weight * a * b)
+            spread[:, i, j] = total(weight**2 * a * b)
+    inverse = np.linalg.inv(normal)
+    fitted = inverse @ right
+    cov = inverse @ spread @ inverse
+    centre = total(weight * at) / total(weight)
+    if size == 1:
+        return _Sums(centre, fitted[:, 0].astype(np.complex128), cov[:, 0, 0])
+    reference = np.exp(-2j * np.pi * carrier_hz * stretches.begin)
+    value = (fitted[:, 1] - 1j * fitted[:, 2]) * reference[:, None]
+    return _Sums(centre, value, 0.5 * (cov[:, 1, 1] + cov[:, 2, 2]))
+
+
+def _noise(waveform: Waveform, stretches: _Stretches, slots: Slots, carrier_hz: Array) -> Array:
+    """Return the covariance per sample of the noise beside the carrier, (n, 3, 3), measured axes.
+
+    It is the power three cycles a slot away, tapered so that neither carrier nor hum leaks there.
+    """
+    sample, owner, begins = _samples_of(stretches)
+    rate = sample_rate_hz(waveform)
+    at = waveform.time[sample] - stretches.begin[owner]
+    weight = _hann(waveform.time[sample], stretches.begin[owner], slots, rate)
+    away = 3.0 / slots.duration
+    above = carrier_hz + away < 0.5 * rate
+    probe = np.where(above, carrier_hz + away, carrier_hz - away)
+    turned = weight * np.exp(-2j * np.pi * probe[owner] * at)
+    seen = np.add.reduceat(turned[:, None] * waveform.measured_sensor[sample], begins, axis=0)
+    power = np.add.reduceat(weight**2, begins)
+    cov = np.einsum("nx,ny->nxy", seen, np.conj(seen)).real / power[:, None, None]
+    centre = stretches.begin + 0.5 * slots.duration
+    number = NOISE_CYCLES * slots.count
+    smooth = smoothed_over_windows(cov[:, None], centre, slots.cycle, number)[:, 0]
+    least = 1e-12 * np.max(np.abs(waveform.measured_sensor))
+    return np.asarray(smooth + least**2 * np.eye(3))
+
+
+def _owners(site: Site, slots: Slots) -> IntArray:
+    """Return the channel that each slot of a cycle drives; -1 where it is silent."""
+    owner = np.full(slots.count, -1)
+    tones = [slot for beacon in site.beacons for _, slot in beacon.tones]
+    owner[np.array(tones)] = np.arange(len(tones))
+    return owner
+
+
+def _rows(
+    site: Site, slots: Slots, time: Array, channel: IntArray, phasor: ComplexArray
+) -> FieldSamples:
+    shape = (len(time), len(site.channels), 3)
+    every = np.full(shape, np.nan, dtype=np.complex128)
+    every[np.arange(len(time)), channel] = phasor
+    return FieldSamples(
+        time=time,
+        window=np.full(len(time), slots.duration),
+        channels=site.channels,
+        phasor_sensor=every,
+        phasor_cov=np.full((*shape, 3), np.nan),
+    )
+
+
+def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSamples:
+    """Join the slots of each cycle to one row, as if they were simultaneous.
+
+    The fields are turned by the gyro to the mean time of the slots; where the body moves, what it
+    moves by within the cycle remains.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        Channels in the site's order.
+    imu : ImuSamples
+    site : Site
+        With a schedule.
+
+    Returns
+    -------
+    FieldSamples
+        The cycles that hold every channel.
+
+    Raises
+    ------
+    InputError
+        Where there is none.
+    """
+    slots = schedule(site)
+    _, cycle = np.unique(slots.running(samples.time) // slots.count, return_inverse=True)
+    row, channel = np.nonzero(samples.valid)
+    number = int(cycle[-1]) + 1
+    held = np.zeros((number, len(samples.channels)), dtype=bool)
+    held[cycle[row], channel] = True
+    whole = held.all(axis=1)
+    if not np.any(whole):
+        raise InputError(
+            f"no cycle of {slots.count} slots holds all of {len(samples.channels)} coils; record"
+            " longer, or give the site in which the log was recorded"
+        )
+    time = np.bincount(cycle, samples.time) / np.bincount(cycle)
+    turn = _measured_at(imu, site, samples.time[row], time[cycle[row]])
+    phasor = np.full((number, *samples.phasor_sensor.shape[1:]), np.nan, dtype=np.complex128)
+    phasor[cycle[row], channel] = (turn @ samples.phasor_sensor[row, channel][..., None])[..., 0]
+    cov = np.full((number, *samples.phasor_cov.shape[1:]), np.nan)
+    cov[cycle[row], channel] = turn @ samples.phasor_cov[row, channel] @ np.swapaxes(turn, 1, 2)
+    return FieldSamples(
+        time=time[whole],
+        window=np.full(int(np.sum(whole)), slots.cycle),
+        channels=samples.channels,
+        phasor_sensor=phasor[whole],
+        phasor_cov=cov[whole],
+    )
+
+
+def _measured_at(imu: ImuSamples, site: Site, time: Array, wanted: Array) -> Array:
+    """Return what turns a field as measured at each time into one as measured at another."""
+    stamps = imu.time + site.platform.imu.time_offset
+    attitude = attitude_from_gyro(stamps, imu.gyro_body)
+    there, here = (attitude_at(attitude, stamps, imu.gyro_body, t) for t in (wanted, time))
+    sensor = site.platform.magnetometer
+    measured_from_body = sensor.matrix @ sensor.body_from_sensor.T
+    turn = (there.inv() * here).as_matrix()
+    return np.asarray(measured_from_body @ turn @ np.linalg.inv(measured_from_body))
