@@ -125,7 +125,7 @@ def navigate(
         replace(chosen, lockin=job.lockin), realtime, live, resume, checkpoint, every
     )
     with progress() as report:
-        figures = run_navigate(job, settings, report=report)
+        figures = run_navigate(job, settings, report)
     show_result(figures, job.output, as_json)
 
 

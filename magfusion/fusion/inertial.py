@@ -44,7 +44,9 @@ class Increments:
     bridged: BoolArray
 
 
-def cut_at_epochs(imu: ImuSamples, time_offset: float, epochs: Array) -> Increments:
+def cut_at_epochs(
+    imu: ImuSamples, time_offset: float, epochs: Array, usual: float | None = None
+) -> Increments:
     """Cut the inertial stream into steps that never straddle an epoch.
 
     Parameters
@@ -54,32 +56,48 @@ def cut_at_epochs(imu: ImuSamples, time_offset: float, epochs: Array) -> Increme
         Added to its stamps to bring them to the log's clock (s).
     epochs : ndarray, shape (n,)
         (s); where they lie outside the stream its end values are held.
+    usual : float, optional
+        Sampling interval (s); the median where it is not given: of a stretch inside a gap there
+        is none.
 
     Returns
     -------
     Increments
     """
     time = imu.time + time_offset
-    inside = (time > epochs[0]) & (time < epochs[-1])
-    grid = np.union1d(time[inside], epochs)
+    known = float(np.median(np.diff(time))) if usual is None else usual
+    # One long step would tie the position to the velocity: its noise would be singular.
+    stamps = np.concatenate([time, _between_samples(time, epochs, known)])
+    inside = (stamps > epochs[0]) & (stamps < epochs[-1])
+    grid = np.union1d(stamps[inside], epochs)
     samples = [
         np.stack([np.interp(grid, time, axis) for axis in stream.T], axis=1)
         for stream in (imu.gyro_body, imu.accel_body)
     ]
     gyro, accel = (0.5 * (s[:-1] + s[1:]) for s in samples)
     first = np.searchsorted(grid, epochs)
-    silent = np.flatnonzero(_in_gap(time, grid))
+    silent = np.flatnonzero(_in_gap(time, grid, known))
     bridged = np.zeros(len(epochs) - 1, dtype=bool)
     bridged[np.searchsorted(first, silent, side="right") - 1] = True
     return Increments(gyro, accel, np.diff(grid), first, bridged)
 
 
-def _in_gap(time: Array, grid: Array) -> BoolArray:
+def _between_samples(time: Array, epochs: Array, usual: float) -> Array:
+    """Return stamps that fill the gaps of a stream, as far as the epochs reach."""
+    edges = np.concatenate([[min(time[0], epochs[0])], time, [max(time[-1], epochs[-1])]])
+    filled = [np.empty(0)]
+    for k in np.flatnonzero(np.diff(edges) > GAP_SAMPLES * usual):
+        begin, end = max(edges[k], epochs[0]), min(edges[k + 1], epochs[-1])
+        if end > begin:
+            filled.append(np.linspace(begin, end, int((end - begin) / usual) + 2)[1:-1])
+    return np.concatenate(filled)
+
+
+def _in_gap(time: Array, grid: Array, usual: float) -> BoolArray:
     """Tell which steps of the grid lie in a gap of the stream, however short the step itself is."""
     edges = np.concatenate([[min(time[0], grid[0])], time, [max(time[-1], grid[-1])]])
     spacing = np.diff(edges)
     holding = np.clip(np.searchsorted(edges, grid[:-1], side="right") - 1, 0, len(spacing) - 1)
-    usual = float(np.median(np.diff(time)))
     return np.asarray(spacing[holding] > GAP_SAMPLES * usual)
 
 

@@ -37,6 +37,7 @@ LOST_EPOCHS = 5  # in a row, most of whose channels were refused: the state is w
 REST_SIGMA = 0.01  # m/s
 REST_SPAN = 1.0  # s
 RATE_SPAN = 0.08  # s; motion is slower, noise is not
+LONGEST_WAIT = 5.0  # s; the fields go on without an IMU that is silent for longer
 SPEED_SIGMA = 1.0  # m/s; of a state that was found again
 
 
@@ -98,6 +99,7 @@ class Navigator:
         self._estimator: SlidingWindow | ErrorStateFilter | None = None
         self._receiver: OnlineReceiver | None = None
         self._applied_offset = site.platform.imu.time_offset
+        self._usual: float | None = None  # sampling interval of the IMU (s)
         self._next_start = self.settings.start_duration
         self._refused_in_a_row = 0
         self._last_epoch_time = -np.inf
@@ -269,6 +271,7 @@ class Navigator:
     def _start_at(self, outset: Outset) -> None:
         state = outset.state
         self._applied_offset = state.calibration.time_offset
+        self._usual = float(np.median(np.diff(self._imu.rows()[0])))
         self.rival_chi_square = outset.rival_chi_square
         if self.settings.estimator == "ekf":
             self._estimator = ErrorStateFilter(state, self.blocks)
@@ -289,7 +292,9 @@ class Navigator:
         """Process the next epoch, if all that it needs has come."""
         assert self._estimator is not None
         now = self._estimator.state.time
-        inertial = self._imu.newest + self._applied_offset - self.settings.delay
+        heard = self._fields[-1].time[0] if self._fields else self._waveform.newest
+        inertial = max(self._imu.newest + self._applied_offset, heard - LONGEST_WAIT)
+        inertial = float(inertial) - self.settings.delay
         if self._receiver is not None and self._waveform.newest >= self._receiver.next_end:
             return self._step_window(self._receiver, inertial)
         if self._fields and self._fields[0].time[0] <= inertial:
@@ -361,7 +366,7 @@ class Navigator:
         state = self._estimator.state
         begin, end = state.time - self._applied_offset, time - self._applied_offset
         imu = self._imu_samples(begin, end)
-        return propagate(state, imu, time, self.site, self._applied_offset, self._walk)
+        return propagate(state, imu, time, self.site, self._applied_offset, self._walk, self._usual)
 
     def _imu_samples(self, begin: float = -np.inf, end: float = np.inf) -> ImuSamples:
         time, rows = self._imu.between(begin, end)
@@ -391,6 +396,8 @@ class Navigator:
             )
             wave = receiver.demodulate(self._waveform, imu, before, state, self._applied_offset)
             samples = wave.fields
+        if not np.any(samples.valid):
+            return None, None
         pose = Trajectory(samples.time, state.world_from_body[None], state.position_world[None])
         calibrated = state.calibration.site
         cov = measurement_cov(calibrated, samples, sensor_world=sensor_positions(calibrated, pose))
@@ -446,7 +453,7 @@ class Navigator:
         """Tell whether the platform stands: the IMU is quiet and nothing says that it moves."""
         stamp = state.time - self._applied_offset
         time, rows = self._imu.between(stamp - REST_SPAN - 0.1, stamp + 0.1)
-        if len(time) < 10 or time[0] > stamp - REST_SPAN:
+        if len(time) < 10 or time[0] > stamp - REST_SPAN or time[-1] < stamp - 0.1:
             return False
         still = resting(time, rows[:, :3], rows[:, 3:], REST_SPAN - 0.1)
         if not still[np.searchsorted(time, stamp - REST_SPAN / 2)]:

@@ -43,6 +43,7 @@ def propagate(
     site: Site,
     time_offset: float,
     calibration_noise: Array | None = None,
+    usual: float | None = None,
 ) -> Propagated:
     """Carry a state on to a later time.
 
@@ -62,13 +63,15 @@ def propagate(
         Added to the IMU's stamps (s).
     calibration_noise : ndarray, shape (calibration,), optional
         Variance that the calibration gains in a second.
+    usual : float, optional
+        Sampling interval of the IMU (s), as in `cut_at_epochs`.
 
     Returns
     -------
     Propagated
     """
     epochs = np.array([state.time, time])
-    increments = cut_at_epochs(imu, time_offset, epochs)
+    increments = cut_at_epochs(imu, time_offset, epochs, usual)
     accel, gyro = state.accel_bias_body, state.gyro_bias_body
     measurement = preintegrate(
         increments, site.platform.imu, site.gravity, accel[None], gyro[None]

@@ -10,6 +10,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.evaluation.errors import TrajectoryErrors
+from magfusion.fusion.batch import Report
 from magfusion.fusion.online import Navigator, NavigatorSettings, restored
 from magfusion.fusion.state import MOTION, State
 from magfusion.job import Job, claim, named, read_job
@@ -23,7 +24,6 @@ from magfusion.jobs.checkpoint import (
 )
 from magfusion.jobs.replay import PIECE, Replay, feed, paced
 from magfusion.parameters import initial_calibration
-from magfusion.pipeline import Report, quiet
 from magfusion.records.samples import Log
 from magfusion.records.trajectory_table import write_trajectory
 from magfusion.records.tum import write_tum
@@ -70,8 +70,15 @@ class NavigateSettings:
     every: float = 30.0
 
 
-def run_navigate(job: Job, settings: NavigateSettings, *, report: Report = quiet) -> Figures:
+def run_navigate(job: Job, settings: NavigateSettings, report: Report) -> Figures:
     """Navigate along a log: trajectories, refined site, report and recording.
+
+    Parameters
+    ----------
+    job : Job
+    settings : NavigateSettings
+    report : callable
+        Told stage, steps done and steps in all.
 
     Returns
     -------
