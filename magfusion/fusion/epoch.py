@@ -1,6 +1,6 @@
 """One field epoch as an online estimator takes it: whitened rows in the state's tangent."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -75,14 +75,7 @@ def channel_distances(rows: Rows, cov: Array, channels: int) -> Array:
 def without(measurements: FieldMeasurements, rejected: BoolArray) -> FieldMeasurements:
     """Return an epoch's measurements with some channels taken out."""
     root = np.where(rejected[None, :, None, None], 0.0, measurements.root)
-    return FieldMeasurements(
-        time=measurements.time,
-        measured=measurements.measured,
-        root=root,
-        rate_body=measurements.rate_body,
-        applied_offset=measurements.applied_offset,
-        by_time_offset=measurements.by_time_offset,
-    )
+    return replace(measurements, root=root)
 
 
 def single(measurements: FieldMeasurements, blocks: tuple[Block, ...]) -> FieldFactors:

@@ -11,6 +11,7 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 from scipy.spatial.transform import Rotation
 
+from magfusion.fusion.earth_rows import linearize_earth, predict_earth
 from magfusion.parameters import (
     Block,
     Calibration,
@@ -42,6 +43,8 @@ class FieldMeasurements:
         IMU time offset with which the inertial data were cut (s).
     by_time_offset : ndarray, shape (n, channels, 6)
         What a change of it does to the lock-in, the states held (T/s).
+    earth : bool
+        Whether the Earth field stands behind the last channel, as one more.
     """
 
     time: Array
@@ -50,6 +53,7 @@ class FieldMeasurements:
     rate_body: Array
     applied_offset: float
     by_time_offset: Array
+    earth: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +75,15 @@ def read_poses(values: gtsam.Values) -> Poses:
     )
 
 
-def robust_weight(square: Array, loss: str | None) -> tuple[Array, Array]:
-    """Return weight and loss of squared whitened residual norms of six components.
+def robust_weight(square: Array, loss: str | None, components: int = 6) -> tuple[Array, Array]:
+    """Return weight and loss of squared whitened residual norms.
 
     Parameters
     ----------
     square : ndarray
     loss : {None, 'huber', 'cauchy'}
+    components : int
+        Of each residual.
 
     Returns
     -------
@@ -86,7 +92,7 @@ def robust_weight(square: Array, loss: str | None) -> tuple[Array, Array]:
     """
     if loss is None:
         return np.ones_like(square), square
-    width = ROBUST_WIDTH[loss] ** 2 * 6.0
+    width = ROBUST_WIDTH[loss] ** 2 * components
     if loss == "cauchy":
         return 1.0 / (1.0 + square / width), width * np.log1p(square / width)
     beyond = square > width
@@ -105,12 +111,19 @@ class FieldFactors:
         Calibration parameters that are estimated.
     loss : str, optional
         Robust loss for each channel.
+    earth_loss : str, optional
+        Robust loss of the Earth field.
     """
 
     def __init__(
-        self, measurements: FieldMeasurements, blocks: tuple[Block, ...], loss: str | None
+        self,
+        measurements: FieldMeasurements,
+        blocks: tuple[Block, ...],
+        loss: str | None,
+        earth_loss: str | None = None,
     ) -> None:
-        self.measurements, self.blocks, self.loss = measurements, blocks, loss
+        self.measurements, self.blocks = measurements, blocks
+        self.loss, self.earth_loss = loss, earth_loss
         n, channels = measurements.measured.shape[:2]
         rows, self.columns = 6 * channels, dimension(blocks)
         self.graph = gtsam.GaussianFactorGraph()
@@ -135,9 +148,12 @@ class FieldFactors:
         data = self.measurements
         lag, world_from_body, position_world = self._at_field(poses, calibration)
         phasor = predict_channels(calibration, data.time, world_from_body, position_world)
-        value = np.concatenate([phasor.real, phasor.imag], axis=-1) + lag * data.by_time_offset
+        value = np.concatenate([phasor.real, phasor.imag], axis=-1)
+        if data.earth:
+            value = np.concatenate([value, predict_earth(calibration, world_from_body)], axis=1)
+        value = value + lag * data.by_time_offset
         error = data.root @ (value - data.measured)[..., None]
-        _, rho = robust_weight(np.sum(error[..., 0] ** 2, axis=2), self.loss)
+        _, rho = self._robust(np.sum(error[..., 0] ** 2, axis=2))
         return 0.5 * float(np.sum(rho))
 
     def residual(self, poses: Poses, calibration: Calibration) -> tuple[Array, Array, Array]:
@@ -158,7 +174,7 @@ class FieldFactors:
         data = self.measurements
         value, _, by_other = self._predicted(poses, calibration, blocks)
         error = (data.root @ (value - data.measured)[..., None])[..., 0]
-        weight, _ = robust_weight(np.sum(error**2, axis=2), self.loss)
+        weight, _ = self._robust(np.sum(error**2, axis=2))
         return np.asarray(np.sqrt(weight)[..., None, None] * (data.root @ by_other))
 
     def with_others(self, key: int, columns: Array) -> gtsam.GaussianFactorGraph:
@@ -186,6 +202,15 @@ class FieldFactors:
             graph.push_back(factor)
         return graph
 
+    def _robust(self, square: Array) -> tuple[Array, Array]:
+        """Return weight and loss of every channel, the Earth field by its own loss."""
+        weight, rho = robust_weight(square, self.loss)
+        if self.measurements.earth:
+            last = robust_weight(square[:, -1:], self.earth_loss, components=3)
+            weight = np.concatenate([weight[:, :-1], last[0]], axis=1)
+            rho = np.concatenate([rho[:, :-1], last[1]], axis=1)
+        return weight, rho
+
     def _at_field(self, poses: Poses, calibration: Calibration) -> tuple[float, Array, Array]:
         """Return lag, attitude and position where the field was taken.
 
@@ -211,6 +236,12 @@ class FieldFactors:
             position_world,
             np.concatenate([data.rate_body, velocity_body], axis=1),
         )
+        if data.earth:
+            last = linearize_earth(calibration, blocks, world_from_body, data.rate_body)
+            value, by_pose, by_calibration = (
+                np.concatenate(pair, axis=1)
+                for pair in zip((value, by_pose, by_calibration), last, strict=True)
+            )
         value += lag * data.by_time_offset
         for block in blocks:
             if block.kind == "time_offset":
@@ -220,7 +251,7 @@ class FieldFactors:
     def linearize(self, values: gtsam.Values, calibration: Calibration) -> float:
         """Rewrite the factors at a new estimate; return the cost (half the squared residual)."""
         error, by_pose, by_calibration = self.residual(read_poses(values), calibration)
-        weight, rho = robust_weight(np.sum(error**2, axis=2), self.loss)
+        weight, rho = self._robust(np.sum(error**2, axis=2))
         share = np.sqrt(weight)[..., None]
         n = len(error)
         block = np.concatenate([by_pose, by_calibration], axis=-1) * share[..., None]

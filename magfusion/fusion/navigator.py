@@ -67,6 +67,8 @@ class SlidingWindow:
         Variance that the calibration gains in a second.
     applied_offset : float
         IMU time offset with which the inertial data are cut (s).
+    earth : bool
+        Whether epochs hold the Earth field.
     """
 
     def __init__(
@@ -76,8 +78,10 @@ class SlidingWindow:
         lag: float,
         calibration_noise: Array,
         applied_offset: float,
+        *,
+        earth: bool = False,
     ) -> None:
-        self.applied_offset = applied_offset
+        self.applied_offset, self.earth = applied_offset, earth
         self.blocks, self.lag, self.calibration_noise = blocks, lag, calibration_noise
         self.state = self.lagged = state
         self.left: list[State] = []  # the window, in order of time
@@ -111,10 +115,10 @@ class SlidingWindow:
         """
         kept = (self.nodes, self.prior, self.state, self.lagged, self.left)
         if not self.nodes:
-            nothing = _nothing(self.state, self.applied_offset)
+            nothing = self._nothing(self.state)
             self.nodes = [Node(self.state, nothing, None, None)]
         new = predicted.state if about is None else about
-        measured = _nothing(new, self.applied_offset) if fields is None else fields.measurements
+        measured = self._nothing(new) if fields is None else fields.measurements
         self.nodes = [*self.nodes, Node(new, measured, rest_sigma, predicted.measurement)]
         try:
             for _ in range(1 if about is None else ITERATIONS_FAR):
@@ -195,6 +199,18 @@ class SlidingWindow:
         factor.getA()[...] = prior.root
         factor.getb()[...] = right
         return factor
+
+    def _nothing(self, state: State) -> FieldMeasurements:
+        rows = len(state.calibration.site.channels) + self.earth
+        return FieldMeasurements(
+            time=np.array([state.time]),
+            measured=np.zeros((1, rows, 6)),
+            root=np.zeros((1, rows, 6, 6)),
+            rate_body=np.zeros((1, 3)),
+            applied_offset=self.applied_offset,
+            by_time_offset=np.zeros((1, rows, 6)),
+            earth=self.earth,
+        )
 
     def _cov_of_first(self) -> Array:
         """Return the covariance of the first state, the whole window and its past considered."""
@@ -287,18 +303,6 @@ def _rest_factor(node: int, velocity_world: Array, sigma: float) -> gtsam.Jacobi
     return gtsam.JacobianFactor(V(node), np.eye(3) / sigma, -velocity_world / sigma, unit)
 
 
-def _nothing(state: State, applied_offset: float) -> FieldMeasurements:
-    channels = len(state.calibration.site.channels)
-    return FieldMeasurements(
-        time=np.array([state.time]),
-        measured=np.zeros((1, channels, 6)),
-        root=np.zeros((1, channels, 6, 6)),
-        rate_body=np.zeros((1, 3)),
-        applied_offset=applied_offset,
-        by_time_offset=np.zeros((1, channels, 6)),
-    )
-
-
 def _blank(node: Node) -> FieldMeasurements:
     return replace(node.fields, root=np.zeros_like(node.fields.root))
 
@@ -312,4 +316,5 @@ def _stacked(parts: list[FieldMeasurements]) -> FieldMeasurements:
         rate_body=np.concatenate([p.rate_body for p in parts]),
         applied_offset=parts[-1].applied_offset,
         by_time_offset=np.concatenate([p.by_time_offset for p in parts]),
+        earth=parts[-1].earth,
     )

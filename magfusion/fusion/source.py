@@ -1,23 +1,28 @@
 """Where a smoother's phasors and first fixes come from: a waveform, or a table of phasors."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.errors import EstimationError
+from magfusion.errors import EstimationError, InputError
 from magfusion.fixes.fix import Fixes, Gravity
 from magfusion.fixes.likelihood import fix_epochs
 from magfusion.fusion.wave import WaveFields, demodulate_about
 from magfusion.parameters import Calibration, initial_calibration
-from magfusion.receiver.lockin import WindowOperator, demodulate, window_operator
+from magfusion.receiver.lockin import (
+    WindowOperator,
+    demodulate,
+    demodulate_with_steady,
+    window_operator,
+)
 from magfusion.receiver.windows import (
     LockinSettings,
     Windows,
     choose_windows,
     default_settings,
 )
-from magfusion.records.samples import FieldSamples, ImuSamples, Log
+from magfusion.records.samples import FieldSamples, ImuSamples, Log, SteadyFields
 from magfusion.site import Site
 from magfusion.strapdown import resting
 from magfusion.trajectory import Trajectory
@@ -57,6 +62,27 @@ class Source:
         if self.log.fields is None:
             raise EstimationError(f"log {self.log.name} has neither waveform nor phasors")
         return self.log.fields
+
+    def steady(self, calibration: Calibration) -> SteadyFields:
+        """Return the Earth field and the offset before anything is known of the motion.
+
+        Raises
+        ------
+        InputError
+            Where the log holds only phasors.
+        """
+        if self.log.waveform is not None:
+            offset = calibration.site.platform.magnetometer.offset
+            operator = self.operator(calibration, None)
+            centred = self.log.waveform.measured_sensor - offset
+            _, steady = demodulate_with_steady(operator, centred)
+            return replace(steady, measured_sensor=steady.measured_sensor + offset)
+        if self.log.steady is None:
+            raise InputError(
+                "the log holds only phasors, which know nothing of the Earth field; give the log"
+                " with magnetometer.parquet, or leave --earth out"
+            )
+        return self.log.steady
 
     def about(self, calibration: Calibration, states: Trajectory) -> WaveFields:
         """Return the phasors with the motion inside the windows taken off."""

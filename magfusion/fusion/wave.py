@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magfusion.fusion.inertial import low_passed, motion_at
+from magfusion.observation import observe_earth
 from magfusion.parameters import Calibration, predict_channels
-from magfusion.receiver.lockin import WindowOperator, demodulate
-from magfusion.records.samples import FieldSamples, ImuSamples
+from magfusion.receiver.lockin import WindowOperator, demodulate_with_steady
+from magfusion.records.samples import FieldSamples, ImuSamples, SteadyFields
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array, ComplexArray
 
@@ -39,10 +40,8 @@ def predicted_waveform(
     frequencies = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
     carrier = np.exp(2j * np.pi * frequencies * motion.time[:, None])
     beacons = np.einsum("ncx,nc->nx", phasor, carrier).real
-    sensor = site.platform.magnetometer
-    measured_from_body = sensor.matrix @ sensor.body_from_sensor.T
-    earth_body = np.einsum("nji,j->ni", motion.world_from_body, earth_field_world)
-    return np.asarray(beacons + earth_body @ measured_from_body.T + sensor.offset)
+    earth = observe_earth(site.platform.magnetometer, motion.world_from_body, earth_field_world)
+    return np.asarray(beacons + earth.measured_sensor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +53,13 @@ class WaveFields:
     fields : FieldSamples
     by_time_offset : complex ndarray, shape (n, channels, 3)
         Derivative of what was taken off by the IMU's time offset, the states held (T/s).
+    steady : SteadyFields
+        The Earth field and the offset.
     """
 
     fields: FieldSamples
     by_time_offset: ComplexArray
+    steady: SteadyFields
 
 
 def demodulate_about(
@@ -97,12 +99,14 @@ def demodulate_about(
         return predicted_waveform(motion, calibration, earth)
 
     offset, slow = calibration.time_offset, low_passed(imu)
-    rest = demodulate(operator, measured_sensor - predicted(imu, offset))
+    rest, left = demodulate_with_steady(operator, measured_sensor - predicted(imu, offset))
     change = predicted(slow, offset + OFFSET_STEP) - predicted(slow, offset - OFFSET_STEP)
     at_centre = predict_channels(
         calibration, states.time, states.world_from_body, states.position_world
     )
+    steady = observe_earth(site.platform.magnetometer, states.world_from_body, earth)
     return WaveFields(
         fields=replace(rest, phasor_sensor=rest.phasor_sensor + at_centre),
         by_time_offset=operator.apply(change / (2.0 * OFFSET_STEP)),
+        steady=replace(left, measured_sensor=left.measured_sensor + steady.measured_sensor),
     )

@@ -1,0 +1,124 @@
+"""How much the Earth field counts as a measurement, and which beacons are heard beside it.
+
+Indoors the field's direction is disturbed, by iron that no model knows.  Three things keep that
+from the attitude.  The disturbance lasts as long as the platform is near the iron, so that all of
+`AMBIENT_TIME` counts as one measurement of `AMBIENT_SHARE`.  Where the field's size is not what is
+declared, its direction is not either: what it deviates by is added to the covariance.  And what the
+motion contradicts has little say: a Cauchy loss in the graph, in the online estimators the same
+weight at the prediction.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.fusion.factors import FieldMeasurements
+from magfusion.records.samples import FieldSamples, SteadyFields
+from magfusion.site import Site
+from magfusion.units import Array, BoolArray
+from magfusion.weights import paired_whitening, whitening
+
+AMBIENT_SHARE = 0.005  # of the field's size: usual disturbance of each component, one sigma
+AMBIENT_TIME = 2.0  # s; over which it stays the same
+DEVIATION_SPAN = 5.0  # s; over which the deviation of the field's size is averaged
+LEAST_HORIZONTAL = 1e-6  # T; less tells no heading
+HEARD = 100.0  # chi square of a phasor of six components against nothing
+SPEED_SIGMA, SPEED_TIME = 1.0, 2.0  # m/s, s; a platform that no beacon holds stays where it is
+
+
+def check_earth(site: Site) -> None:
+    """Refuse a site that has no use of the Earth field.
+
+    Raises
+    ------
+    InputError
+    """
+    field, gravity = site.earth_field_world, site.gravity
+    if field is None:
+        raise InputError(
+            "the site has no Earth field to measure against; give earth_field_t or a location in"
+            " its world, or leave --earth out"
+        )
+    if np.hypot(field[0], field[1]) < LEAST_HORIZONTAL or not gravity > 0.0:
+        raise InputError(
+            f"the site's Earth field has only {1e6 * np.hypot(field[0], field[1]):.2g} uT across"
+            " the vertical, too little to tell a heading; leave --earth out"
+        )
+
+
+def earth_cov(site: Site, steady: SteadyFields, step: float) -> Array:
+    """Return the covariance of each steady field, shape (n, 3, 3), measured axes (T^2).
+
+    Parameters
+    ----------
+    site : Site
+    steady : SteadyFields
+    step : float
+        Between epochs (s).
+    """
+    assert site.earth_field_world is not None
+    sensor = site.platform.magnetometer
+    size = float(np.linalg.norm(site.earth_field_world))
+    field = (steady.measured_sensor - sensor.offset) @ np.linalg.inv(sensor.matrix).T
+    deviation = (np.linalg.norm(field, axis=1) - size) ** 2
+    ambient = (AMBIENT_SHARE * size) ** 2 + _moving_mean(steady.time, deviation)
+    repeated = max(1.0, AMBIENT_TIME / step)
+    return np.asarray(steady.cov + (repeated * ambient)[:, None, None] * np.eye(3))
+
+
+def _moving_mean(time: Array, value: Array) -> Array:
+    lo = np.searchsorted(time, time - DEVIATION_SPAN / 2)
+    hi = np.searchsorted(time, time + DEVIATION_SPAN / 2, side="right")
+    total = np.concatenate([[0.0], np.cumsum(value)])
+    return np.asarray((total[hi] - total[lo]) / (hi - lo))
+
+
+def with_earth(
+    measurements: FieldMeasurements, steady: SteadyFields, cov: Array
+) -> FieldMeasurements:
+    """Return measurements with the Earth field as their last row.
+
+    Parameters
+    ----------
+    measurements : FieldMeasurements
+        Of the same epochs.
+    steady : SteadyFields
+        A row that is NaN is missing.
+    cov : ndarray, shape (n, 3, 3)
+        (T^2)
+    """
+    valid = np.isfinite(steady.measured_sensor).all(axis=1)
+    root = paired_whitening(cov[:, None], valid[:, None])
+    root[..., 3:, :] = 0.0
+    field = np.nan_to_num(steady.measured_sensor)
+    row = np.concatenate([field, np.zeros_like(field)], axis=1)[:, None]
+    # Windows are symmetric, and a ramp is fitted beside the constant: it knows no time offset.
+    still = np.zeros_like(row)
+    return replace(
+        measurements,
+        measured=np.concatenate([measurements.measured, row], axis=1),
+        root=np.concatenate([measurements.root, root], axis=1),
+        by_time_offset=np.concatenate([measurements.by_time_offset, still], axis=1),
+        earth=True,
+    )
+
+
+def heard(samples: FieldSamples) -> BoolArray:
+    """Tell which phasors are more than noise, shape (n, channels): the others are of no beacon."""
+    root = whitening(samples.phasor_cov, samples.valid)
+    phasor = np.nan_to_num(samples.phasor_sensor)[..., None]
+    square = np.abs(root @ phasor.real) ** 2 + np.abs(root @ phasor.imag) ** 2
+    return np.asarray(samples.valid & (np.sum(square, axis=(-1, -2)) > HEARD))
+
+
+def only(samples: FieldSamples, channels: BoolArray) -> FieldSamples:
+    """Return samples with the other channels missing."""
+    return replace(
+        samples, phasor_sensor=np.where(channels[..., None], samples.phasor_sensor, np.nan)
+    )
+
+
+def speed_sigma(step: float) -> float:
+    """Return the sigma of no velocity at an epoch that no beacon holds (m/s)."""
+    return SPEED_SIGMA * float(np.sqrt(max(1.0, SPEED_TIME / step)))

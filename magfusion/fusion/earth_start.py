@@ -1,0 +1,107 @@
+"""A start for the smoother at epochs that no beacon tells of: gyro, gravity and the Earth field."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.fusion.start import Start
+from magfusion.records.samples import FieldSamples, ImuSamples, SteadyFields
+from magfusion.site import Site
+from magfusion.strapdown import attitude_at, attitude_from_gyro
+from magfusion.trajectory import Trajectory
+from magfusion.units import Array
+
+AVERAGING = 2.0  # s; over which the specific force is taken for gravity
+
+
+def earth_start(samples: FieldSamples, steady: SteadyFields, imu: ImuSamples, site: Site) -> Start:
+    """Return attitudes by gravity and the Earth field, at rest amid the beacons.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        None of which is used but its times.
+    steady : SteadyFields
+        At the same times.
+    imu : ImuSamples
+    site : Site
+    """
+    assert site.earth_field_world is not None
+    time, n = samples.time, len(samples)
+    stamps = imu.time + site.platform.imu.time_offset
+    attitude = attitude_from_gyro(stamps, imu.gyro_body)
+    at_epochs = attitude_at(attitude, stamps, imu.gyro_body, time)
+    up_body = at_epochs.inv().apply(_mean_about(stamps, attitude.apply(imu.accel_body), time))
+    sensor = site.platform.magnetometer
+    field = (steady.measured_sensor - sensor.offset) @ np.linalg.inv(sensor.matrix).T
+    field_body = field @ sensor.body_from_sensor.T
+    world = _axes(np.array([0.0, 0.0, 1.0]), site.earth_field_world)
+    middle = np.mean([b.position_world for b in site.beacons], axis=0)
+    return Start(
+        states=Trajectory(
+            time=time,
+            world_from_body=world @ np.swapaxes(_axes(up_body, field_body), -1, -2),
+            position_world=np.broadcast_to(middle, (n, 3)).copy(),
+            velocity_world=np.zeros((n, 3)),
+        ),
+        phase=np.zeros((n, len(site.channels))),
+        chosen=np.zeros(n, dtype=np.int64),
+        cost=0.0,
+        determined=np.zeros(n, dtype=bool),
+    )
+
+
+def _mean_about(time: Array, vector: Array, wanted: Array) -> Array:
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(vector, axis=0)])
+    lo = np.searchsorted(time, wanted - AVERAGING / 2)
+    hi = np.maximum(np.searchsorted(time, wanted + AVERAGING / 2), lo + 1)
+    hi = np.minimum(hi, len(time))
+    lo = np.minimum(lo, hi - 1)
+    return np.asarray((total[hi] - total[lo]) / (hi - lo)[:, None])
+
+
+def _axes(up: Array, field: Array) -> Array:
+    """Return the axes east of the field, along it, and up, as columns (..., 3, 3)."""
+    z = up / np.linalg.norm(up, axis=-1, keepdims=True)
+    east = np.cross(field, z)
+    x = east / np.linalg.norm(east, axis=-1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def carried(start: Start, imu: ImuSamples, time_offset: float, time: Array) -> Start:
+    """Return a start at more epochs: from the nearest that it has, turned by the gyro.
+
+    Parameters
+    ----------
+    start : Start
+    imu : ImuSamples
+    time_offset : float
+        (s)
+    time : ndarray, shape (n,)
+        Those of the start among them (s).
+    """
+    known = start.states
+    after = np.clip(np.searchsorted(known.time, time), 1, len(known) - 1)
+    later = known.time[after] - time < time - known.time[after - 1]
+    nearest = np.where(later, after, after - 1)
+    stamps = imu.time + time_offset
+    attitude = attitude_from_gyro(stamps, imu.gyro_body)
+    there, here = (
+        attitude_at(attitude, stamps, imu.gyro_body, at) for at in (known.time[nearest], time)
+    )
+    turned = Rotation.from_matrix(known.world_from_body[nearest]) * there.inv() * here
+    position = np.stack([np.interp(time, known.time, p) for p in known.position_world.T], axis=1)
+    states = Trajectory(
+        time=time,
+        world_from_body=turned.as_matrix(),
+        position_world=position,
+        velocity_world=np.asarray(np.gradient(position, time, axis=0)),
+    )
+    return replace(
+        start,
+        states=states,
+        phase=start.phase[nearest],
+        chosen=start.chosen[nearest],
+        determined=start.determined[nearest],
+    )
