@@ -14,6 +14,7 @@ from magfusion.units import Array, ComplexArray, IntArray
 
 Removal = Literal["none", "subtract", "interpolate", "state"]
 LEAST_TURNS = 1.2  # of an alias of the mains in the span of the state, which tells it from a ramp
+STRETCH = 4  # at most so many times longer a state, where that tells them apart
 
 
 def subtraction_gain(frequency_hz: float, duration: float, slots_apart: int) -> float:
@@ -53,7 +54,8 @@ def ambient_weights(
         silent slots before and after; least squares of a constant, a ramp and, where they can be
         told apart, the mains over the nearest silent slots.
     cycles : int
-        Length of the state (cycles).
+        Length of the state (cycles); up to four times longer where that tells the mains from a
+        drift.
     mains_turns : float
         Turns of the mains in a slot; zero for none.
 
@@ -72,6 +74,9 @@ def ambient_weights(
         return _same_cycle(driven, silent, count)
     if removal == "interpolate":
         return _interpolated(driven, silent, after, count)
+    alias = _alias(mains_turns, count)
+    if alias * (STRETCH * cycles - 1) >= LEAST_TURNS:
+        cycles = max(cycles, int(np.ceil(LEAST_TURNS / alias)) + 1)
     per_cycle = len(np.unique(silent % count))
     number = min(cycles * per_cycle, len(silent))
     first = np.clip(after - number // 2, 0, len(silent) - number)
@@ -84,12 +89,21 @@ def ambient_weights(
     return index, np.where(near.any(axis=1)[:, None], weight, np.nan)
 
 
+def _alias(mains_turns: float, count: int) -> float:
+    """Return how far (turns a cycle) the mains are from what silent slots take for a drift.
+
+    Zero where a slot averages them out.
+    """
+    if abs(np.sinc(mains_turns)) < 1e-3:
+        return 0.0
+    alias = abs(mains_turns * count - round(mains_turns * count))
+    return float(min(alias, 0.5 - alias))
+
+
 def _state_design(elapsed: Array, near: Array, count: int, mains_turns: float) -> Array:
     span = np.ptp(elapsed, axis=1).max() / count  # cycles
     columns = [np.ones_like(elapsed), elapsed / (span * count + 1.0)]
-    alias = abs(mains_turns * count - round(mains_turns * count))
-    told_apart = span * min(alias, 0.5 - alias) >= LEAST_TURNS
-    if told_apart and abs(np.sinc(mains_turns)) > 1e-3:
+    if span * _alias(mains_turns, count) >= LEAST_TURNS:
         angle = 2.0 * np.pi * mains_turns * elapsed
         # At the driven slot the mains are wanted too: cos(0) = 1 there, so that the constant,
         # less the cosine's own column, holds both.

@@ -22,7 +22,7 @@ from magfusion.strapdown import attitude_at, attitude_from_gyro
 from magfusion.units import Array, ComplexArray, IntArray
 
 LEAST_SAMPLES = 8  # in a slot; its noise is measured three cycles a slot beside the carrier
-LEAST_CYCLES = 4.0  # of a carrier in a slot
+LEAST_CYCLES = 1.0  # of a carrier in a slot
 NOISE_CYCLES = 16  # over which the noise is averaged
 
 
