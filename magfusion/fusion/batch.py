@@ -8,10 +8,11 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.fixes.fix import Fixes
-from magfusion.fixes.problem import nuisance_blocks
-from magfusion.fixes.survey import survey_jacobians
+from magfusion.fusion.beginning import begin, with_rest_bias
+from magfusion.fusion.earth import check_earth, earth_cov, heard, hold, only, with_earth
 from magfusion.fusion.factors import FieldFactors, FieldMeasurements, read_poses
 from magfusion.fusion.inertial import cut_at_epochs, low_passed, preintegrate
+from magfusion.fusion.loose import survey_cov
 from magfusion.fusion.smoother import (
     Optimised,
     Problem,
@@ -22,8 +23,8 @@ from magfusion.fusion.smoother import (
     optimise,
     read_states,
 )
-from magfusion.fusion.source import Source, first_fixes, open_source
-from magfusion.fusion.start import Start, choose_chains, start_phases
+from magfusion.fusion.source import Source, open_source
+from magfusion.fusion.start import Start
 from magfusion.fusion.wave import WaveFields
 from magfusion.parameters import (
     Block,
@@ -33,9 +34,8 @@ from magfusion.parameters import (
     initial_calibration,
 )
 from magfusion.receiver.windows import LockinSettings
-from magfusion.records.samples import FieldSamples, ImuSamples, Log
+from magfusion.records.samples import FieldSamples, Log, SteadyFields
 from magfusion.site import Site
-from magfusion.strapdown import resting
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array
 from magfusion.weights import (
@@ -43,7 +43,6 @@ from magfusion.weights import (
     paired_whitening,
     sensor_positions,
     stacked,
-    whitening,
 )
 
 OFFSET_CONVERGED = 2e-5  # s; change of the time offset at which the passes end
@@ -72,6 +71,9 @@ class SmootherSettings:
         At most so many predictions of the waveform.
     lockin : LockinSettings, optional
         None chooses window and step from the tones' spacing.
+    earth : bool
+        Measure the Earth field too; where no beacon is heard, it and gravity alone hold the
+        attitude.  With tight coupling only.
     """
 
     coupling: str = "tight"
@@ -79,8 +81,11 @@ class SmootherSettings:
     estimate: tuple[str, ...] | None = None
     passes: int = 8
     lockin: LockinSettings | None = None
+    earth: bool = False
 
     def __post_init__(self) -> None:
+        if self.earth and self.coupling == "loose":
+            raise ValueError("the Earth field is measured with tight coupling only")
         if self.passes < 1:
             raise ValueError(f"passes must be at least 1; got {self.passes}")
 
@@ -118,6 +123,8 @@ class Smoothed:
     cost : float
     passes, iterations : int
     converged : bool
+    earth_residual : ndarray, shape (n, 3), optional
+        Whitened; None where the Earth field was not measured.
     """
 
     states: Trajectory
@@ -137,6 +144,7 @@ class Smoothed:
     passes: int
     iterations: int
     converged: bool
+    earth_residual: Array | None = None
 
 
 def smooth(
@@ -171,6 +179,8 @@ def smooth(
                 f"the {beacon.unknown} of beacon {beacon.name} is unknown; place it by"
                 " magfusion.fusion.self_survey.smooth_and_place"
             )
+    if settings.earth:
+        check_earth(site)
     job = _prepared(log, site, settings, report)
     return _loose(job) if settings.coupling == "loose" else _tight(job)
 
@@ -183,7 +193,8 @@ class _Job:
     settings: SmootherSettings
     source: Source
     samples: FieldSamples
-    fixes: Fixes
+    steady: SteadyFields | None
+    fixes: Fixes | None
     start: Start
     states: Trajectory
     declared: Calibration
@@ -204,21 +215,23 @@ def _prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) 
         )
     report("finding a start", 1, settings.passes + 3)
     calibration = initial_calibration(site, float(np.mean(samples.time)))
-    fixes = first_fixes(samples, log, calibration)
+    steady = source.steady(calibration) if settings.earth else None
+    if settings.earth:
+        samples = only(samples, heard(samples))
     jobs = [
         _Job(
             log=log,
             settings=settings,
             source=source,
             samples=samples,
-            fixes=fixes,
-            start=start,
-            states=_with_rest_bias(start.states, log.imu, calibration.time_offset),
-            # Unsynchronised drives have no declared phase: their prior is centred on the start.
-            declared=start_phases(calibration, samples.time, start.phase),
+            steady=steady,
+            fixes=beginning.fixes,
+            start=beginning.start,
+            states=with_rest_bias(beginning.start.states, log.imu, calibration.time_offset),
+            declared=beginning.declared,
             report=report,
         )
-        for start in choose_chains(fixes, log.imu, calibration.time_offset, site.gravity)
+        for beginning in begin(samples, steady, log, calibration)
     ]
     return jobs[0] if len(jobs) == 1 else _likeliest(jobs)
 
@@ -235,16 +248,6 @@ def _likeliest(jobs: list[_Job]) -> _Job:
     return replace(likeliest, rival_chi_square=float(margin))
 
 
-def _with_rest_bias(states: Trajectory, imu: ImuSamples, time_offset: float) -> Trajectory:
-    """Gyro bias from the rests, where there are any."""
-    still = resting(imu.time + time_offset, imu.gyro_body, imu.accel_body)
-    bias = np.mean(imu.gyro_body[still], axis=0) if np.any(still) else np.zeros(3)
-    shape = (len(states), 3)
-    return replace(
-        states, gyro_bias_body=np.broadcast_to(bias, shape).copy(), accel_bias_body=np.zeros(shape)
-    )
-
-
 def _tight(job: _Job) -> Smoothed:
     states, calibration, wave = job.states, job.declared, None
     iterations, done, settled = 0, 0, False
@@ -253,6 +256,8 @@ def _tight(job: _Job) -> Smoothed:
         if done > 0 and job.log.waveform is not None:
             wave = job.source.about(calibration, states)
         samples = job.samples if wave is None else wave.fields
+        if job.steady is not None:
+            samples = only(samples, job.samples.valid)
         problem, bridged = _problem(job, samples, states, calibration, wave)
         found = optimise(problem, initial_estimate(states, calibration))
         moved = read_states(found.estimate.values, samples.time)
@@ -314,26 +319,38 @@ def _problem(
         applied_offset=calibration.time_offset,
         by_time_offset=np.zeros(shape) if wave is None else stacked(wave.by_time_offset),
     )
-    blocks = choose_blocks(job.declared.site, job.settings.estimate)
-    fields = FieldFactors(measurements, blocks, job.settings.loss)
+    if job.steady is not None:
+        steady, step = job.steady if wave is None else wave.steady, _step(samples)
+        cov = earth_cov(calibration.site, steady, step)
+        measurements = with_earth(measurements, steady, cov)
+        hold(graph, states, np.asarray(samples.valid.any(axis=1)), step)
+    blocks = choose_blocks(job.declared.site, job.settings.estimate, earth=job.settings.earth)
+    fields = FieldFactors(measurements, blocks, job.settings.loss, "cauchy")
     return Problem(graph, fields, job.declared, len(samples)), bridged
 
 
 def overlap(samples: FieldSamples) -> float:
     """Return how many windows hold each sample: their information must not be counted twice."""
-    step = float(np.median(np.diff(samples.time)))
-    return max(1.0, float(np.median(samples.window)) / step)
+    return max(1.0, float(np.median(samples.window)) / _step(samples))
+
+
+def _step(samples: FieldSamples) -> float:
+    return float(np.median(np.diff(samples.time)))
 
 
 def _posterior(
     job: _Job, problem: Problem, found: Optimised, samples: FieldSamples, bridged: int
 ) -> Smoothed:
-    held = held_blocks(problem.declared.site, problem.blocks)
+    earth = job.settings.earth
+    held = held_blocks(problem.declared.site, problem.blocks, earth=earth)
     pose_cov, calibration_cov = marginals(problem, found.estimate, held)
+    earth_residual = None
     residual = np.full((*samples.phasor_sensor.shape[:2], 6), np.nan)
     if problem.fields is not None:
         poses = read_poses(found.estimate.values)
         error, _, _ = problem.fields.residual(poses, found.estimate.calibration)
+        earth_residual = error[:, -1, :3] if earth else None
+        error = error[:, : len(samples.channels)]
         residual = np.where(samples.valid[..., None], error, np.nan)
     job.told("done", job.settings.passes + 3)
     return Smoothed(
@@ -354,12 +371,14 @@ def _posterior(
         passes=1,
         iterations=found.iterations,
         converged=found.converged,
+        earth_residual=earth_residual,
     )
 
 
 def _loose(job: _Job) -> Smoothed:
     job.told("fusing fixes", 2)
     offset = job.declared.time_offset
+    assert job.fixes is not None
     graph, bridged = _inertial(job, job.samples.time, job.states, offset)
     rows = np.arange(len(job.fixes))
     cov = job.fixes.pose_cov[rows, job.start.chosen] * overlap(job.samples)
@@ -370,29 +389,5 @@ def _loose(job: _Job) -> Smoothed:
     result = _posterior(job, problem, found, job.samples, bridged)
     states = result.states
     assert states.pose_cov is not None
-    shared = _survey_cov(job, states)
+    shared = survey_cov(job.declared, job.samples, states)
     return replace(result, states=replace(states, pose_cov=states.pose_cov + shared))
-
-
-def _survey_cov(job: _Job, states: Trajectory) -> Array:
-    """Return what the survey's error does to every fix alike, shape (n, 6, 6).
-
-    The graph takes the fixes' errors for independent, but no number of fixes averages it out.
-    """
-    samples = job.samples
-    cov = measurement_cov(
-        job.declared.site,
-        samples,
-        survey_error=True,
-        sensor_world=sensor_positions(job.declared.site, states),
-    )
-    by_found, by_survey = survey_jacobians(
-        job.declared,
-        nuisance_blocks(job.declared.site),
-        samples.time,
-        states.world_from_body,
-        states.position_world,
-        whitening(cov, samples.valid),
-    )
-    moved = (np.linalg.pinv(by_found) @ by_survey)[:, :6]
-    return np.asarray(moved @ np.swapaxes(moved, 1, 2))

@@ -10,12 +10,15 @@ weight at the prediction.
 
 from dataclasses import replace
 
+import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import V, X
 
 from magfusion.errors import InputError
 from magfusion.fusion.factors import FieldMeasurements
 from magfusion.records.samples import FieldSamples, SteadyFields
 from magfusion.site import Site
+from magfusion.trajectory import Trajectory
 from magfusion.units import Array, BoolArray
 from magfusion.weights import paired_whitening, whitening
 
@@ -24,6 +27,7 @@ AMBIENT_TIME = 2.0  # s; over which it stays the same
 DEVIATION_SPAN = 5.0  # s; over which the deviation of the field's size is averaged
 LEAST_HORIZONTAL = 1e-6  # T; less tells no heading
 HEARD = 100.0  # chi square of a phasor of six components against nothing
+ANYWHERE, ANY_ROTATION = 100.0, 1e3  # m, rad; of a platform that no beacon ever held
 SPEED_SIGMA, SPEED_TIME = 1.0, 2.0  # m/s, s; a platform that no beacon holds stays where it is
 
 
@@ -88,7 +92,7 @@ def with_earth(
     cov : ndarray, shape (n, 3, 3)
         (T^2)
     """
-    valid = np.isfinite(steady.measured_sensor).all(axis=1)
+    valid = np.asarray(np.isfinite(steady.measured_sensor).all(axis=1))
     root = paired_whitening(cov[:, None], valid[:, None])
     root[..., 3:, :] = 0.0
     field = np.nan_to_num(steady.measured_sensor)
@@ -117,6 +121,31 @@ def only(samples: FieldSamples, channels: BoolArray) -> FieldSamples:
     return replace(
         samples, phasor_sensor=np.where(channels[..., None], samples.phasor_sensor, np.nan)
     )
+
+
+def hold(
+    graph: gtsam.NonlinearFactorGraph, states: Trajectory, held: BoolArray, step: float
+) -> None:
+    """Keep what no beacon holds from floating off: the speed, and if need be one position.
+
+    Parameters
+    ----------
+    graph : gtsam.NonlinearFactorGraph
+        Takes the factors.
+    states : Trajectory
+        Where the platform is thought to be.
+    held : bool ndarray, shape (n,)
+        Whether a beacon is heard.
+    step : float
+        Between epochs (s).
+    """
+    slow = gtsam.noiseModel.Isotropic.Sigma(3, speed_sigma(step))
+    for i in np.flatnonzero(~held):
+        graph.addPriorVector(V(int(i)), np.zeros(3), slow)
+    if not np.any(held):
+        wide = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([ANY_ROTATION, ANYWHERE], 3))
+        pose = gtsam.Pose3(gtsam.Rot3(states.world_from_body[0]), states.position_world[0])
+        graph.add(gtsam.PriorFactorPose3(X(0), pose, wide))
 
 
 def speed_sigma(step: float) -> float:

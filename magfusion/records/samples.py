@@ -119,8 +119,8 @@ class SteadyFields:
 class Log:
     """One recording; streams that it does not hold are None.
 
-    ``epoch_ns`` is the log clock's zero, to which drive phases and every ``time`` refer.  ``steady``
-    stands beside ``fields``, at the same times; no file holds it.
+    ``epoch_ns`` is the log clock's zero, to which drive phases and every ``time`` refer.
+    ``steady`` stands beside ``fields``, at the same times; no file holds it.
     """
 
     name: str

@@ -1,21 +1,93 @@
-"""A start for the smoother at epochs that no beacon tells of: gyro, gravity and the Earth field."""
+"""Where the smoother of a log begins: chains of fixes, or gravity and the Earth field.
 
-from dataclasses import replace
+At epochs that no beacon tells of the gyro carries the attitude on from those that one does.
+"""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.fusion.start import Start
-from magfusion.records.samples import FieldSamples, ImuSamples, SteadyFields
+from magfusion.fixes.fix import Fixes
+from magfusion.fusion.source import first_fixes
+from magfusion.fusion.start import Start, choose_chains, start_phases
+from magfusion.parameters import Calibration
+from magfusion.records.samples import FieldSamples, ImuSamples, Log, SteadyFields
 from magfusion.site import Site
-from magfusion.strapdown import attitude_at, attitude_from_gyro
+from magfusion.strapdown import attitude_at, attitude_from_gyro, resting
 from magfusion.trajectory import Trajectory
-from magfusion.units import Array
+from magfusion.units import Array, BoolArray
 
+LEAST_HELD = 10  # epochs at which a beacon is heard; fewer are no beginning
 AVERAGING = 2.0  # s; over which the specific force is taken for gravity
 
 
-def earth_start(samples: FieldSamples, steady: SteadyFields, imu: ImuSamples, site: Site) -> Start:
+@dataclass(frozen=True, eq=False)
+class Beginning:
+    """A start with the calibration that its drive phases suggest.
+
+    Parameters
+    ----------
+    start : Start
+    declared : Calibration
+        Unsynchronised drives have no declared phase: their prior is centred on the start.
+    fixes : Fixes, optional
+        Of the epochs at which a beacon is heard; None where there are too few.
+    """
+
+    start: Start
+    declared: Calibration
+    fixes: Fixes | None
+
+
+def begin(
+    samples: FieldSamples, steady: SteadyFields | None, log: Log, calibration: Calibration
+) -> list[Beginning]:
+    """Return the starts from which the motion chooses.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+    steady : SteadyFields, optional
+        At the same times; where there is none, every epoch needs a beacon.
+    log : Log
+    calibration : Calibration
+    """
+    held = np.asarray(samples.valid.any(axis=1))
+    if steady is not None and np.sum(held) < LEAST_HELD:
+        return [Beginning(_by_earth(samples, steady, log.imu, calibration.site), calibration, None)]
+    heard = samples if steady is None else _rows(samples, held)
+    fixes = first_fixes(heard, log, calibration)
+    offset = calibration.time_offset
+    out = []
+    for start in choose_chains(fixes, log.imu, offset, calibration.site.gravity):
+        declared = start_phases(calibration, heard.time, start.phase)
+        whole = start if np.all(held) else _carried(start, log.imu, offset, samples.time)
+        out.append(Beginning(whole, declared, fixes))
+    return out
+
+
+def with_rest_bias(states: Trajectory, imu: ImuSamples, time_offset: float) -> Trajectory:
+    """Return states with the gyro bias of the rests, where there are any."""
+    still = resting(imu.time + time_offset, imu.gyro_body, imu.accel_body)
+    bias = np.mean(imu.gyro_body[still], axis=0) if np.any(still) else np.zeros(3)
+    shape = (len(states), 3)
+    return replace(
+        states, gyro_bias_body=np.broadcast_to(bias, shape).copy(), accel_bias_body=np.zeros(shape)
+    )
+
+
+def _rows(samples: FieldSamples, kept: BoolArray) -> FieldSamples:
+    return FieldSamples(
+        samples.time[kept],
+        samples.window[kept],
+        samples.channels,
+        samples.phasor_sensor[kept],
+        samples.phasor_cov[kept],
+    )
+
+
+def _by_earth(samples: FieldSamples, steady: SteadyFields, imu: ImuSamples, site: Site) -> Start:
     """Return attitudes by gravity and the Earth field, at rest amid the beacons.
 
     Parameters
@@ -69,7 +141,7 @@ def _axes(up: Array, field: Array) -> Array:
     return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
-def carried(start: Start, imu: ImuSamples, time_offset: float, time: Array) -> Start:
+def _carried(start: Start, imu: ImuSamples, time_offset: float, time: Array) -> Start:
     """Return a start at more epochs: from the nearest that it has, turned by the gyro.
 
     Parameters
