@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from magfusion.errors import InputError
+from magfusion.receiver.slots import has_schedule, schedule
 from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz
 from magfusion.records.atomic import refuse_in_the_way, whole_directory
 from magfusion.records.fields import order_channels
@@ -142,7 +143,10 @@ def read_job(job: Job, *, unknown: bool = False) -> tuple[Log, Site]:
     log = _open(job)
     if log.waveform is not None:
         with named(site_path):
-            channel_frequencies_hz(site)
+            if has_schedule(site):
+                schedule(site)
+            else:
+                channel_frequencies_hz(site)
     if log.fields is not None:
         with named(job.log_path):
             log = replace(log, fields=order_channels(log.fields, site))

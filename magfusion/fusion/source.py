@@ -16,6 +16,13 @@ from magfusion.receiver.lockin import (
     demodulate_with_steady,
     window_operator,
 )
+from magfusion.receiver.slots import (
+    SlotSettings,
+    demodulate_slots,
+    has_schedule,
+    slot_settings_of,
+    whole_cycles,
+)
 from magfusion.receiver.windows import (
     LockinSettings,
     Windows,
@@ -101,6 +108,54 @@ class Source:
         return {} if self.windows is None else self.windows.dropped
 
 
+@dataclass(frozen=True, eq=False)
+class SlotSource(Source):
+    """A waveform of coils driven in turn, each slot a row at its own time."""
+
+    slots: SlotSettings
+    opened: FieldSamples
+    lost: Mapping[str, int]
+
+    def first(self, calibration: Calibration) -> FieldSamples:  # noqa: ARG002 - as its base
+        """Return the phasors before anything is known of the motion."""
+        return self.opened
+
+    def steady(self, calibration: Calibration) -> SteadyFields:  # noqa: ARG002 - as its base
+        """Refuse: between slots there is no steady field.
+
+        Raises
+        ------
+        InputError
+        """
+        raise InputError(
+            "of coils in time slots the Earth field is taken off with the silent slots; leave"
+            " --earth out"
+        )
+
+    def about(self, calibration: Calibration, states: Trajectory) -> WaveFields:
+        """Return the phasors as turned by the gyro without its bias."""
+        assert self.log.waveform is not None
+        fields, _ = demodulate_slots(
+            self.log.waveform,
+            self.log.imu,
+            calibration.site,
+            self.slots,
+            gyro_bias_body=_bias_at(self.log.imu, calibration.time_offset, states),
+            time_offset=calibration.time_offset,
+        )
+        n = len(fields)
+        return WaveFields(
+            fields=fields,
+            by_time_offset=np.zeros_like(fields.phasor_sensor),
+            steady=SteadyFields(fields.time, np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)),
+        )
+
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """Reason to number of slots."""
+        return self.lost
+
+
 def _bias_at(imu: ImuSamples, time_offset: float, states: Trajectory) -> Array:
     assert states.gyro_bias_body is not None
     time = imu.time + time_offset
@@ -113,10 +168,14 @@ def open_source(log: Log, site: Site, settings: LockinSettings | None) -> Source
     Raises
     ------
     InputError
-        Where no window is usable.
+        Where no window, or no slot, is usable.
     """
     if log.waveform is None:
         return Source(log, None, None)
+    if has_schedule(site):
+        slots = slot_settings_of(site, settings)
+        opened, lost = demodulate_slots(log.waveform, log.imu, site, slots)
+        return SlotSource(log, settings, None, slots, opened, lost)
     chosen = default_settings(site) if settings is None else settings
     return Source(log, chosen, choose_windows(log.waveform, log.imu, site, chosen))
 
@@ -166,6 +225,11 @@ def gravity_at_rest(imu: ImuSamples, site: Site, time: Array) -> Gravity | None:
 def first_fixes(
     samples: FieldSamples, log: Log, calibration: Calibration, free: tuple[str, ...] = ()
 ) -> Fixes:
-    """Return the fix of every epoch, with gravity where the platform rests."""
+    """Return the fix of every epoch, with gravity where the platform rests.
+
+    Of coils driven in turn a whole cycle is one epoch.
+    """
+    if has_schedule(calibration.site):
+        samples = whole_cycles(samples, log.imu, calibration.site)
     gravity = gravity_at_rest(log.imu, calibration.site, samples.time)
     return fix_epochs(samples, calibration, gravity=gravity, free=free)

@@ -15,7 +15,7 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.receiver.ambient import Removal, ambient_weights, removed
 from magfusion.receiver.noise import smoothed_over_windows
-from magfusion.receiver.windows import sample_rate_hz, usable_stretches
+from magfusion.receiver.windows import LockinSettings, sample_rate_hz, usable_stretches
 from magfusion.records.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.site import Site, Slots
 from magfusion.strapdown import attitude_at, attitude_from_gyro
@@ -117,6 +117,37 @@ def default_slot_settings(site: Site, mains_hz: float = 50.0) -> SlotSettings:
     if pulsed:
         return SlotSettings("state", "rectangular", mains_hz=mains_hz)
     return SlotSettings("none", "hann", mains_hz=mains_hz)
+
+
+def slot_lockin(site: Site, mains_hz: float = 50.0) -> LockinSettings:
+    """Return what stands for window and step of a site with a schedule: its slots.
+
+    Raises
+    ------
+    InputError
+        As `schedule`.
+    """
+    duration = schedule(site).duration
+    return LockinSettings(duration, duration, mains_hz)
+
+
+def slot_settings_of(site: Site, lockin: LockinSettings | None) -> SlotSettings:
+    """Return the settings for what the options of a lock-in ask.
+
+    Raises
+    ------
+    InputError
+        Where they ask for a window that is no slot.
+    """
+    if lockin is None:
+        return default_slot_settings(site)
+    duration = schedule(site).duration
+    if abs(lockin.window - duration) > 1e-9 * duration:
+        raise InputError(
+            f"--window {lockin.window:g} s: the time slots of {duration:g} s are the windows;"
+            " leave the option out"
+        )
+    return default_slot_settings(site, lockin.mains_hz)
 
 
 def demodulate_slots(

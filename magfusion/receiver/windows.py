@@ -85,9 +85,10 @@ def channel_frequencies_hz(site: Site) -> Array:
     """Return the frequency of each channel (Hz), refusing tones that cannot be told apart."""
     for beacon in site.beacons:
         if any(slot is not None for _, slot in beacon.tones):
+            remedy = "" if beacon.slots else "declare its slots: {duration_s, count}, or "
             raise InputError(
                 f"beacon {beacon.name} is driven in time slots, which the lock-in cannot separate; "
-                "give its demodulated fields.parquet instead of the waveform"
+                f"{remedy}give its demodulated fields.parquet instead of the waveform"
             )
     frequencies = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
     order = np.argsort(frequencies)
