@@ -53,11 +53,14 @@ _RESULT = {"trajectory.tum", "trajectory.parquet", *_SITE, "run.rrd", "report.js
 _TABLES = {"imu.parquet", "magnetometer.parquet", "fields.parquet", "truth.parquet"}
 _TRUE_SITE = {"true_site.yaml", "true_site_field_map.parquet"}
 _LOG = {"log.yaml", *_SITE, *_TRUE_SITE, "report.json", *_TABLES}
-_UNFINISHED = {"checkpoint.bin", "checkpoint.rows"}  # of magfusion navigate while it runs
+UNFINISHED_DRIFT = "unfinished"
+# What stands in the directory while these jobs run.
+_UNFINISHED = {"navigate": {"checkpoint.bin", "checkpoint.rows"}, "drift": {UNFINISHED_DRIFT}}
 _WRITTEN = {
     "smooth": _RESULT | {"fixes.parquet"},
     "fix": _RESULT | {"fixes.parquet"},
-    "navigate": _RESULT | {"lagged.parquet"} | _UNFINISHED,
+    "navigate": _RESULT | {"lagged.parquet"} | _UNFINISHED["navigate"],
+    "drift": {"drift.png", "run.rrd", "report.json"} | _UNFINISHED["drift"],
     "simulate": _LOG,
     "demodulate": _LOG,
     "survey": {"survey.parquet", "survey.png", "report.json"},
@@ -79,14 +82,15 @@ _WRITTEN = {
 
 def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
     """Tell whether a directory holds nothing but an earlier result of these jobs."""
-    if "navigate" in kinds and {entry.name for entry in path.iterdir()} <= _UNFINISHED:
+    found = {entry.name for entry in path.iterdir()}
+    if any(found <= _UNFINISHED.get(kind, set()) for kind in kinds):
         return True
     try:
         report = json.loads((path / "report.json").read_text(encoding="utf-8"))
         job = report["job"]
     except (OSError, ValueError, KeyError, TypeError):
         return False
-    return job in kinds and {entry.name for entry in path.iterdir()} <= _WRITTEN[job]
+    return job in kinds and found <= _WRITTEN[job]
 
 
 def claim(output: Path, *kinds: str) -> AbstractContextManager[Path]:

@@ -25,12 +25,14 @@ FLOORS = (
         "beacon_plot",
         "antenna_plot",
         "coverage_plot",
+        "drift_plot",
         "fieldmap_plot",
         "log_calibration_plot",
         "magnetometer_plot",
         "match_plot",
         "survey_plot",
         "view_coverage",
+        "view_drift",
         "view_live",
     },
     {"pipeline", "jobs", "screen", "options"},
@@ -100,7 +102,7 @@ def test_the_drawn_imports_leave_no_circle() -> None:
 
 
 def test_only_the_view_imports_rerun() -> None:
-    views = {"view", "view_coverage", "view_live"}
+    views = {"view", "view_coverage", "view_drift", "view_live"}
     assert _importers("rerun") <= {f"magfusion/{name}.py" for name in views}
 
 
@@ -109,6 +111,7 @@ def test_only_the_plot_imports_matplotlib() -> None:
         "magfusion/beacon_plot.py",
         "magfusion/antenna_plot.py",
         "magfusion/coverage_plot.py",
+        "magfusion/drift_plot.py",
         "magfusion/fieldmap_plot.py",
         "magfusion/log_calibration_plot.py",
         "magfusion/magnetometer_plot.py",

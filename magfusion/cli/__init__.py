@@ -8,6 +8,7 @@ import typer
 
 from magfusion.cli import (
     calibrate_commands,
+    drift_commands,
     log_commands,
     match_commands,
     online_commands,
@@ -19,6 +20,7 @@ from magfusion.errors import EstimationError, InputError
 
 COMMANDS = (
     calibrate_commands,
+    drift_commands,
     log_commands,
     match_commands,
     online_commands,

@@ -197,3 +197,62 @@ def in_windows(time: Array, value: Array, edges: Array) -> Array:
     for k in np.unique(own[(own >= 0) & (own < len(out))]):
         out[k] = np.mean(value[own == k])
     return out
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A part of the error that is judged.
+
+    Parameters
+    ----------
+    name, unit : str
+        As in the report.
+    part : slice
+        Of an error's columns.
+    scale : float
+        From SI to the unit.
+    limit : float
+        Slope that is still none, by design (unit per day): about what the error itself is of a good
+        installation would take days to gather.
+    """
+
+    name: str
+    unit: str
+    part: slice
+    scale: float
+    limit: float
+
+
+DEG_PER_H = float(np.rad2deg(3600.0))
+QUANTITIES = (
+    Quantity("position", "m", POSITION, 1.0, 2e-3),
+    Quantity("attitude", "deg", ATTITUDE, float(np.rad2deg(1.0)), 0.05),
+    Quantity("gyro_bias", "deg_h", GYRO_BIAS, DEG_PER_H, 5.0),
+    Quantity("accel_bias", "m_s2", ACCEL_BIAS, 1.0, 5e-3),
+)
+
+
+def settled_after(hours: float) -> float:
+    """Return when slopes begin to count (s): after twelve hours, or a quarter of a shorter run."""
+    return 3600.0 * min(12.0, 0.25 * hours)
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """What is drawn of an estimator.
+
+    Parameters
+    ----------
+    name : str
+    errors : ErrorSeries
+        At equal distances.
+    interval : float
+        These distances (s).
+    pace : ndarray, shape (pieces, 5)
+        Begin (s), processor time (s), updates, memory (MiB), squared innovation.
+    """
+
+    name: str
+    errors: ErrorSeries
+    interval: float
+    pace: Array

@@ -1,0 +1,245 @@
+"""What the runs of an estimator come to: figures, and a verdict in words for each."""
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.evaluation.drift import (
+    DAY,
+    QUANTITIES,
+    ErrorSeries,
+    Quantity,
+    Slope,
+    Verdict,
+    evenly,
+    in_windows,
+    settled_after,
+    slope_over_worlds,
+    within,
+)
+from magfusion.jobs.drift_world import PACE, PIECE, WorldRun
+from magfusion.report import Figures
+from magfusion.units import Array
+
+MINUTE = 60.0  # s; errors count at the phasors of whole minutes, which rests and walks have alike
+NEES_LIMITS = (0.5, 2.0)  # of a degree of freedom; sigmas honest to within a factor of 1.4
+MEMORY_LIMIT = 20.0  # MiB, from the second quarter to the last
+LATENCY_LIMIT = 1.25  # last quarter to second, at rest
+TIME, SECONDS, UPDATES, MEMORY, DISTORTION = range(len(PACE))
+# The first walk begins the run; the start is found in it.
+_STARTED = 60.0  # s
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One judged figure.
+
+    Parameters
+    ----------
+    name : str
+        Of its verdict in the report.
+    verdict : {'pass', 'fail', 'undecided'}
+    sentence : str
+    """
+
+    name: str
+    verdict: Verdict
+    sentence: str
+
+
+def judged(name: str, runs: list[WorldRun]) -> tuple[Figures, list[Finding]]:
+    """Return figures of one estimator's runs, each key beginning with its name, and the findings.
+
+    Parameters
+    ----------
+    name : str
+        Of the estimator.
+    runs : list of WorldRun
+        One of each world.
+    """
+    figures: Figures = {}
+    findings: list[Finding] = []
+    for part in (_drifts, _consistency, _memory, _latency, _losses):
+        found, told = part(runs)
+        figures |= {f"{name}_{key}": value for key, value in found.items()}
+        findings += [Finding(f"{name}_{f.name}", f.verdict, f"{name}: {f.sentence}") for f in told]
+    figures |= {f"{finding.name}_verdict": finding.verdict for finding in findings}
+    return figures, findings
+
+
+def minutes(run: WorldRun) -> ErrorSeries:
+    """Return the states at the phasors of whole minutes."""
+    return evenly(run.errors, MINUTE)
+
+
+def settled(run: WorldRun) -> ErrorSeries:
+    """Return the same after the time from which slopes count."""
+    series = minutes(run)
+    return series.rows(series.time >= settled_after(run.task.hours))
+
+
+def drift_of(quantity: Quantity, runs: list[WorldRun]) -> Slope:
+    """Return the slope of the length of an error (unit per day)."""
+    every = [settled(run) for run in runs]
+    return slope_over_worlds(
+        [s.time for s in every], [quantity.scale * s.size(quantity.part) for s in every]
+    )
+
+
+def _drifts(runs: list[WorldRun]) -> tuple[Figures, list[Finding]]:
+    figures: Figures = {}
+    findings = []
+    for quantity in QUANTITIES:
+        name, unit = quantity.name, quantity.unit
+        slope = drift_of(quantity, runs)
+        every = [quantity.scale * settled(run).size(quantity.part) for run in runs]
+        figures |= {
+            f"{name}_rms_{unit}": _rms(np.concatenate(every)),
+            f"{name}_slope_{unit}_per_day": slope.per_day,
+            f"{name}_slope_standard_error": slope.standard_error,
+        }
+        verdict = slope.verdict(quantity.limit)
+        findings.append(
+            Finding(
+                f"{name}_drift",
+                verdict,
+                f"{name} {_WORDS[verdict]}: {slope.per_day:+.3g} +- {slope.margin:.2g} {unit} a day"
+                f" (95 %), limit {quantity.limit:g}",
+            )
+        )
+    between = [quantity_between(run) for run in runs]
+    walking = [run.errors.rows(run.errors.measured & ~_at_minutes(run.errors)) for run in runs]
+    position = QUANTITIES[0].part
+    figures["position_rms_between_fields_m"] = _rms(np.concatenate(between))
+    figures["position_rms_walking_m"] = _rms(
+        np.concatenate([w.rows(w.time > _STARTED).size(position) for w in walking])
+    )
+    return figures, findings
+
+
+_WORDS = {
+    "pass": "does not drift",
+    "fail": "drifts",
+    "undecided": "is not told to drift nor to stand (run longer, or more worlds)",
+}
+
+
+def quantity_between(run: WorldRun) -> Array:
+    """Return the position error of the states that the IMU carried on (m)."""
+    errors = run.errors
+    return errors.rows(~errors.measured & (errors.time > _STARTED)).size(QUANTITIES[0].part)
+
+
+def _at_minutes(series: ErrorSeries) -> Array:
+    return np.asarray(np.abs(series.time / MINUTE - np.round(series.time / MINUTE)) < 1e-7)
+
+
+def _consistency(runs: list[WorldRun]) -> tuple[Figures, list[Finding]]:
+    figures: Figures = {}
+    findings = []
+    low, high = NEES_LIMITS
+    for name in ("pose", "bias"):
+        every = [settled(run) for run in runs]
+        level = [getattr(s, f"{name}_nees") / 6.0 for s in every]
+        time = [s.time for s in every]
+        mean = float(np.mean(np.concatenate(level)))
+        begin, end = settled_after(runs[0].task.hours), 3600.0 * runs[0].task.hours
+        halves = in_windows(
+            np.concatenate(time),
+            np.concatenate(level),
+            np.array([begin, 0.5 * (begin + end), end]),
+        ).tolist()
+        figures |= {
+            f"{name}_nees_per_dof": mean,
+            f"{name}_nees_first_half": halves[0],
+            f"{name}_nees_last_half": halves[1],
+        }
+        verdict: Verdict = "pass" if low < mean < high else "fail"
+        word = "honest" if verdict == "pass" else "too small" if mean >= high else "too large"
+        findings.append(
+            Finding(
+                f"{name}_consistency",
+                verdict,
+                f"the sigmas of the {name} are {word}: squared error {mean:.3g} of what they say"
+                f" ({halves[0]:.3g} in the first half, {halves[1]:.3g} in the last), limits {low:g}"
+                f" and {high:g}",
+            )
+        )
+    innovation = np.concatenate([run.pace[:, DISTORTION] for run in runs])
+    figures["innovation_level"] = float(np.nanmean(innovation))
+    return figures, findings
+
+
+def _memory(runs: list[WorldRun]) -> tuple[Figures, list[Finding]]:
+    growth = []
+    for run in runs:
+        second, last = _quarters(run)
+        growth.append(float(np.median(last[:, MEMORY]) - np.median(second[:, MEMORY])))
+    most = max(growth)
+    elapsed = 0.5 * 3600.0 * runs[0].task.hours
+    figures: Figures = {
+        "memory_growth_mib": most,
+        "memory_growth_mib_per_day": most * DAY / elapsed,
+        "memory_mib": float(max(np.max(run.pace[:, MEMORY]) for run in runs)),
+    }
+    verdict = within(most, most, MEMORY_LIMIT)
+    word = "stays" if verdict == "pass" else "grows"
+    told = f"memory {word}: {most:+.2f} MiB from the second quarter to the last"
+    return figures, [Finding("memory", verdict, f"{told}, limit {MEMORY_LIMIT:g}")]
+
+
+def _latency(runs: list[WorldRun]) -> tuple[Figures, list[Finding]]:
+    every = np.concatenate([run.pace[run.pace[:, UPDATES] > 0.0] for run in runs])
+    each = 1e3 * every[:, SECONDS] / every[:, UPDATES]
+    ratio = []
+    for run in runs:
+        second, last = (_resting(part)[:, SECONDS] for part in _quarters(run))
+        if len(second) and len(last):
+            ratio.append(float(np.median(last) / np.median(second)))
+    spent = sum(float(np.sum(run.pace[:, SECONDS])) for run in runs)
+    bare = sum(run.bare_seconds for run in runs)
+    hours = sum(run.task.hours for run in runs)
+    figures: Figures = {
+        "update_ms_median": float(np.median(each)),
+        "update_ms_p99": float(np.percentile(each, 99)),
+        "update_ms_max": float(np.max(each)),
+        "navigated_s_per_48_h": spent * 48.0 / hours,
+        "bare_loop_s_per_48_h": bare * 48.0 / hours,
+        "bare_loops": spent / bare,
+    }
+    if not ratio:
+        return figures, []
+    worst = float(np.median(ratio))
+    figures["update_last_to_second_quarter"] = worst
+    verdict = within(worst, worst, LATENCY_LIMIT)
+    word = "as fast at the end as before" if verdict == "pass" else "slower and slower"
+    told = f"updates are {word}: {worst:.2f} times, limit {LATENCY_LIMIT:g}"
+    return figures, [Finding("latency", verdict, told)]
+
+
+def _losses(runs: list[WorldRun]) -> tuple[Figures, list[Finding]]:
+    total: Counter[str] = Counter()
+    for run in runs:
+        total.update(run.losses)
+    figures: Figures = {"losses": [f"{what}: {count}" for what, count in sorted(total.items())]}
+    lost = total["lost and found again"]
+    verdict: Verdict = "fail" if lost else "pass"
+    told = f"it was lost {lost} times" if lost else "it was never lost"
+    return figures, [Finding("lost", verdict, told)]
+
+
+def _quarters(run: WorldRun) -> tuple[Array, Array]:
+    """Return the pace of the second and of the last quarter of a run."""
+    share = run.pace[:, TIME] / (3600.0 * run.task.hours)
+    return run.pace[(share >= 0.25) & (share < 0.5)], run.pace[share >= 0.75]
+
+
+def _resting(pace: Array) -> Array:
+    """Return the pieces of full length: those between the phasors of a walk are shorter."""
+    length = np.diff(pace[:, TIME], append=np.inf)
+    return pace[(np.abs(length - PIECE) < 1e-6) & (pace[:, UPDATES] == 1.0)]
+
+
+def _rms(value: Array) -> float:
+    return float(np.sqrt(np.mean(value**2))) if len(value) else 0.0
