@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
+from magfusion.errors import EstimationError
 from magfusion.fusion.epoch import Rows, field_rows, joined, rest_rows
 from magfusion.fusion.factors import FieldFactors
 from magfusion.fusion.propagation import Propagated
-from magfusion.fusion.state import State, between, moved
+from magfusion.fusion.state import State, between, considered, moved
 from magfusion.parameters import Block
 from magfusion.units import Array
 
@@ -27,6 +28,15 @@ def _step(cov: Array, rows: Rows) -> tuple[Array, Array]:
     return np.asarray(kalman.x), np.asarray(0.5 * (kalman.P + kalman.P.T))
 
 
+def _step_from_far(cov: Array, rows: Rows) -> tuple[Array, Array]:
+    """Return step and covariance by QR: the innovation's covariance spans too many digits."""
+    prior = np.linalg.inv(np.linalg.cholesky(cov))
+    right = np.concatenate([np.zeros(len(cov)), -rows.error])
+    orthogonal, root = np.linalg.qr(np.vstack([prior, rows.jacobian]))
+    inverse = np.linalg.inv(root)
+    return np.asarray(inverse @ (orthogonal.T @ right)), np.asarray(inverse @ inverse.T)
+
+
 class ErrorStateFilter:
     """State of now, updated epoch by epoch.
 
@@ -36,10 +46,12 @@ class ErrorStateFilter:
         The start.
     blocks : tuple of Block
         Calibration parameters in its tangent.
+    held : int
+        Parameters at the tangent's end that are considered, not estimated.
     """
 
-    def __init__(self, state: State, blocks: tuple[Block, ...]) -> None:
-        self.blocks, self.state = blocks, state
+    def __init__(self, state: State, blocks: tuple[Block, ...], held: int = 0) -> None:
+        self.blocks, self.state, self.held = blocks, state, held
         self.lagged = state
 
     def absorb(
@@ -61,6 +73,11 @@ class ErrorStateFilter:
             Standard deviation of the velocity, where the platform stands (m/s).
         about : State, optional
             Where to linearise, if the prediction is too wide for it; then three times.
+
+        Raises
+        ------
+        EstimationError
+            Where the arithmetic fails; the state is then as it was.
         """
         prior = predicted.state
         state = prior if about is None else replace(about, cov=prior.cov)
@@ -73,7 +90,12 @@ class ErrorStateFilter:
             # Told about the prediction, which holds the prior.
             back = between(prior, state, self.blocks)
             told = Rows(rows.error - rows.jacobian @ back, rows.jacobian)
-            step, cov = _step(prior.cov, told)
+            try:
+                step, cov = (_step if about is None else _step_from_far)(prior.cov, told)
+            except np.linalg.LinAlgError as error:
+                raise EstimationError(f"the filter's update failed ({error})") from error
+            if not np.all(np.isfinite(step)):
+                raise EstimationError("the filter's step is not finite")
             state = moved(replace(prior, cov=cov), self.blocks, step)
         self.state = self.lagged = state
 

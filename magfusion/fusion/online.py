@@ -12,7 +12,6 @@ from typing import Literal
 import numpy as np
 
 from magfusion.errors import EstimationError
-from magfusion.fixes.likelihood import fix_epochs
 from magfusion.fusion.buffers import Buffer, check_clock
 from magfusion.fusion.ekf import ErrorStateFilter
 from magfusion.fusion.epoch import channel_distances, field_rows, single, without
@@ -21,8 +20,9 @@ from magfusion.fusion.navigator import SlidingWindow
 from magfusion.fusion.outset import Outset, find_outset
 from magfusion.fusion.propagation import Propagated, calibration_walk, propagate
 from magfusion.fusion.receive import OnlineReceiver
+from magfusion.fusion.recovery import AgreedFix, agreed_fix, prior_of
 from magfusion.fusion.state import State
-from magfusion.parameters import choose_blocks
+from magfusion.parameters import Block, choose_blocks, dimension, held_blocks
 from magfusion.receiver.windows import LockinSettings
 from magfusion.records.samples import FieldSamples, ImuSamples
 from magfusion.site import Site
@@ -38,6 +38,7 @@ REST_SIGMA = 0.01  # m/s
 REST_SPAN = 1.0  # s
 RATE_SPAN = 0.08  # s; motion is slower, noise is not
 LONGEST_WAIT = 5.0  # s; the fields go on without an IMU that is silent for longer
+LOST_POSITION = 10.0  # m; a prediction wider than this is worth nothing
 SPEED_SIGMA = 1.0  # m/s; of a state that was found again
 
 
@@ -89,10 +90,14 @@ class Navigator:
     def __init__(self, site: Site, settings: NavigatorSettings | None = None) -> None:
         self.site = site
         self.settings = NavigatorSettings() if settings is None else settings
-        self.blocks = choose_blocks(site, self.settings.estimate)
+        estimated = choose_blocks(site, self.settings.estimate)
+        held = held_blocks(site, estimated)
+        self._held = dimension(held)
+        self.blocks = (*estimated, *(_behind(b, dimension(estimated)) for b in held))
         self.counts: Counter[str] = Counter()
         self.distortion: dict[str, float] = {}
         self._walk = calibration_walk(self.blocks)
+        self._walk[len(self._walk) - self._held :] = 0.0
         self._imu = Buffer("imu", 6)
         self._waveform = Buffer("magnetometer", 3)
         self._fields: list[FieldSamples] = []
@@ -274,10 +279,15 @@ class Navigator:
         self._usual = float(np.median(np.diff(self._imu.rows()[0])))
         self.rival_chi_square = outset.rival_chi_square
         if self.settings.estimator == "ekf":
-            self._estimator = ErrorStateFilter(state, self.blocks)
+            self._estimator = ErrorStateFilter(state, self.blocks, self._held)
         else:
             self._estimator = SlidingWindow(
-                state, self.blocks, self.settings.lag, self._walk, self._applied_offset
+                state,
+                self.blocks,
+                self.settings.lag,
+                self._walk,
+                self._applied_offset,
+                self._held,
             )
         if outset.lockin is not None:
             self._receiver = OnlineReceiver(
@@ -337,8 +347,17 @@ class Navigator:
         measurements, samples = self._measured(predicted, samples)
         about = None
         if measurements is not None and samples is not None:
-            about = self._found(samples, predicted) if _wide(predicted.state) else None
-            measurements = self._gated(measurements, samples, predicted, about)
+            if predicted.state.position_sigma > LOST_POSITION and self._found_again(
+                samples, predicted
+            ):
+                return
+            about, refused = None, np.zeros(len(samples.channels), dtype=bool)
+            if _wide(predicted.state):
+                state = predicted.state
+                fix = agreed_fix(samples, state.calibration, prior_of(state))
+                about = self._found(fix, predicted)
+                refused = refused if fix is None else fix.refused
+            measurements = self._gated(measurements, samples, predicted, about, refused)
             if self._refused_in_a_row >= LOST_EPOCHS and self._found_again(samples, predicted):
                 return
         self._take_in(predicted, measurements, about)
@@ -353,6 +372,7 @@ class Navigator:
             self._estimator.absorb(predicted, factors, rest, about)
         except EstimationError:
             self.counts["update failed"] += 1
+            self._refused_in_a_row += 1
             self._estimator.replace_state(predicted.state)
         self._finish()
 
@@ -427,6 +447,7 @@ class Navigator:
         samples: FieldSamples,
         predicted: Propagated,
         about: State | None,
+        refused: BoolArray,
     ) -> FieldMeasurements:
         """Refuse the channels that the prediction does not explain."""
         state = predicted.state if about is None else about
@@ -434,7 +455,7 @@ class Navigator:
         channels = len(self.site.channels)
         distance = channel_distances(rows, state.cov, channels)
         valid = samples.valid[0]
-        rejected: BoolArray = np.asarray(distance > GATE) & valid
+        rejected: BoolArray = np.asarray((distance > GATE) | refused) & valid
         self._note_distortion(distance, valid)
         for name, _ in np.array(self.site.channels, dtype=object)[rejected]:
             self.counts[f"outlier of {name}"] += 1
@@ -464,23 +485,14 @@ class Navigator:
 
     # Being lost, and found again
 
-    def _found(self, samples: FieldSamples, predicted: Propagated) -> State | None:
+    def _found(self, fix: AgreedFix | None, predicted: Propagated) -> State | None:
         """Return where a fix finds the platform, if the prediction is too wide to tell."""
-        state = predicted.state
-        prior = Trajectory(
-            samples.time,
-            state.world_from_body[None],
-            state.position_world[None],
-            pose_cov=state.cov[None, :6, :6],
-        )
-        try:
-            fixes = fix_epochs(samples, state.calibration, prior=prior)
-        except EstimationError:
+        if fix is None:
             return None
-        best = fixes.best()
+        best = fix.fixes.best()
         self.counts["found by a fix"] += 1
         return replace(
-            state,
+            predicted.state,
             world_from_body=best.world_from_body[0],
             position_world=best.position_world[0],
         )
@@ -488,13 +500,10 @@ class Navigator:
     def _found_again(self, samples: FieldSamples, predicted: Propagated) -> bool:
         """Give the pose up that explains nothing any more, and start from a fix."""
         assert self._estimator is not None
-        try:
-            fixes = fix_epochs(samples, predicted.state.calibration)
-        except EstimationError:
+        fix = agreed_fix(samples, predicted.state.calibration)
+        if fix is None or not fix.fixes.determined[0, 0]:
             return False
-        if not fixes.determined[0, 0]:
-            return False
-        best = fixes.best()
+        best = fix.fixes.best()
         assert best.pose_cov is not None
         cov = predicted.state.cov.copy()
         cov[:9] = cov[:, :9] = 0.0
@@ -530,6 +539,12 @@ def _row(samples: FieldSamples, i: int) -> FieldSamples:
         samples.phasor_sensor[rows],
         samples.phasor_cov[rows],
     )
+
+
+def _behind(block: Block, columns: int) -> Block:
+    """Return a block moved to the right in the tangent."""
+    own = slice(block.columns.start + columns, block.columns.stop + columns)
+    return block._replace(columns=own)
 
 
 def _wide(state: State) -> bool:
