@@ -286,7 +286,7 @@ def run_demodulate(job: Job, *, report: Report = quiet) -> Figures:
         "window_s": float(np.median(samples.window)),
     }
     for c, (beacon, tone) in enumerate(samples.channels):
-        figures[f"sigma_{beacon}_{tone}_t"] = float(np.median(sigma[:, c]))
+        figures[f"sigma_{beacon}_{tone}_t"] = float(np.median(sigma[samples.valid[:, c], c]))
     figures |= dropped_figures(dropped)
     with claimed as directory:
         write_log(replace(log, waveform=None, fields=samples), directory)

@@ -17,6 +17,7 @@ from magfusion.errors import InputError
 from magfusion.job import Job, read_job
 from magfusion.options import lockin_option, topics_option
 from magfusion.pipeline import Report
+from magfusion.receiver.slots import has_schedule, slot_lockin
 from magfusion.receiver.windows import default_settings
 from magfusion.report import Figures
 from magfusion.screen import show as show_figures
@@ -104,8 +105,11 @@ def log_job(
     job = Job(log, site, place, None, start, end, topics_option(topics))
     if window is None and step is None and mains_hz == 50.0:
         return job
-    usual = default_settings(read_job(job, unknown=True)[1], mains_hz).window
-    return replace(job, lockin=lockin_option(usual, window, step, mains_hz))
+    declared = read_job(job, unknown=True)[1]
+    usual = slot_lockin if has_schedule(declared) else default_settings
+    return replace(
+        job, lockin=lockin_option(usual(declared, mains_hz).window, window, step, mains_hz)
+    )
 
 
 def show_result(figures: Figures, output: Path | None, as_json: bool) -> None:

@@ -33,6 +33,7 @@ from magfusion.parameters import (
     held_blocks,
     initial_calibration,
 )
+from magfusion.receiver.slots import has_schedule, whole_cycles
 from magfusion.receiver.windows import LockinSettings
 from magfusion.records.samples import FieldSamples, Log, SteadyFields
 from magfusion.site import Site
@@ -209,6 +210,8 @@ def _prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) 
     report("demodulating", 0, settings.passes + 3)
     source = open_source(log, site, settings.lockin)
     samples = source.first(initial_calibration(site, 0.0))
+    if settings.coupling == "loose" and has_schedule(site):
+        samples = whole_cycles(samples, log.imu, site)
     if len(samples) < 2:
         raise EstimationError(
             f"log {log.name} has {len(samples)} field epoch; at least 2 are needed"

@@ -1,6 +1,7 @@
 """Where the smoother of a log begins: chains of fixes, or gravity and the Earth field.
 
-At epochs that no beacon tells of the gyro carries the attitude on from those that one does.
+At epochs that no beacon tells of the gyro carries the attitude on from those that one does, as it
+does from the fix of a cycle to the slots in it.
 """
 
 from dataclasses import dataclass, replace
@@ -61,8 +62,9 @@ def begin(
     offset = calibration.time_offset
     out = []
     for start in choose_chains(fixes, log.imu, offset, calibration.site.gravity):
-        declared = start_phases(calibration, heard.time, start.phase)
-        whole = start if np.all(held) else _carried(start, log.imu, offset, samples.time)
+        declared = start_phases(calibration, fixes.time, start.phase)
+        everywhere = len(fixes) == len(samples)
+        whole = start if everywhere else _carried(start, log.imu, offset, samples.time)
         out.append(Beginning(whole, declared, fixes))
     return out
 
@@ -151,7 +153,7 @@ def _carried(start: Start, imu: ImuSamples, time_offset: float, time: Array) -> 
     time_offset : float
         (s)
     time : ndarray, shape (n,)
-        Those of the start among them (s).
+        (s)
     """
     known = start.states
     after = np.clip(np.searchsorted(known.time, time), 1, len(known) - 1)

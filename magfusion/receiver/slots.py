@@ -224,7 +224,9 @@ def demodulate_slots(
             " longer, or mend the schedule"
         )
     kept, weight = driven[usable], weight[usable]
-    variance = sums.variance[kept] * (1.0 + np.sum(weight**2, axis=1))
+    # Slots share what was taken off them, and no number of slots averages that out.
+    shared = 0.0 if settings.removal == "none" else 1.0 / len(np.unique(place[silent]))
+    variance = sums.variance[kept] * (1.0 + np.maximum(np.sum(weight**2, axis=1), shared))
     body_from_still = attitude_at(attitude, imu_time, gyro, sums.time[kept]).inv()
     phasor = body_from_still.apply(value[usable].real) @ measured_from_body.T + 1j * (
         body_from_still.apply(value[usable].imag) @ measured_from_body.T
