@@ -13,6 +13,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import V, X
+from scipy.ndimage import binary_erosion
 
 from magfusion.errors import InputError
 from magfusion.fusion.factors import FieldMeasurements
@@ -109,11 +110,21 @@ def with_earth(
 
 
 def heard(samples: FieldSamples) -> BoolArray:
-    """Tell which phasors are more than noise, shape (n, channels): the others are of no beacon."""
+    """Tell which phasors are of a beacon, shape (n, channels): more than noise, and for longer.
+
+    A window in which a beacon falls silent, or begins, holds a part of its tone that nothing tells;
+    those that overlap a window without the beacon are therefore not of it.
+    """
     root = whitening(samples.phasor_cov, samples.valid)
     phasor = np.nan_to_num(samples.phasor_sensor)[..., None]
     square = np.abs(root @ phasor.real) ** 2 + np.abs(root @ phasor.imag) ** 2
-    return np.asarray(samples.valid & (np.sum(square, axis=(-1, -2)) > HEARD))
+    loud = samples.valid & (np.sum(square, axis=(-1, -2)) > HEARD)
+    if len(samples) < 2:
+        return np.asarray(loud)
+    step = float(np.median(np.diff(samples.time)))
+    reach = int(np.ceil(np.median(samples.window) / step - 1e-6))
+    whole = np.ones((2 * reach + 1, 1), dtype=bool)
+    return np.asarray(binary_erosion(loud, whole, border_value=1))
 
 
 def only(samples: FieldSamples, channels: BoolArray) -> FieldSamples:
