@@ -25,7 +25,7 @@ def write_plot(path: Path, fit: MapFit) -> None:
     beacons = fit.site.beacons
     figure = Figure(figsize=(1.5 + 4.2 * len(beacons), 8.5), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(2, len(beacons), squeeze=False)
+    panels = figure.subplots(2, len(beacons), squeeze=False, sharex=True, sharey=True)
     sheets = [_sheet(beacon) for beacon in beacons]
     most = max(float(np.max(np.abs(s.gain))) for s in sheets) or 1.0
     largest = max(float(np.max(s.turn_deg)) for s in sheets) or 1.0
@@ -43,14 +43,21 @@ def write_plot(path: Path, fit: MapFit) -> None:
             )
             axes.plot(*sheet.points.T, ".", color="black", markersize=2.0)
             axes.plot(*beacon.position_world[:2], "^", color="black", markersize=9)
-            axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+            axes.set(aspect="equal")
             if column == len(beacons) - 1:
-                label = "gain (%)" if axes is upper else "turn (deg)"
+                label = "stronger than modelled by (%)" if axes is upper else "turned by (deg)"
                 figure.colorbar(mesh, ax=axes, label=label)
+        lower.set_xlabel("x (m)")
         without, left = (100.0 * e[beacon.name] for e in (fit.error_without, fit.error_with))
-        upper.set_title(f"beacon {beacon.name}\nerror {without:.2g} %, with the map {left:.2g} %")
+        upper.set_title(
+            f"beacon {beacon.name}\nmodel wrong by {without:.2g} %, with the map {left:.2g} %"
+        )
+    for axes in panels[:, 0]:
+        axes.set_ylabel("y (m)")
     figure.suptitle(
-        "Field measured against field modelled; dots: survey, triangle: beacon; hatched: not known"
+        f"What the field is, relative to its model, at a height of {sheets[0].height:.2f} m\n"
+        "dots: where it was learnt (any height); triangle: the beacon; hatched: too far from the"
+        " dots to be known; errors: rms at points left out"
     )
     figure.savefig(path, dpi=100, metadata={"Software": None})
 
@@ -64,6 +71,7 @@ class _Sheet(NamedTuple):
     gain: Array  # percent
     turn_deg: Array
     unknown: Array  # sigma left of that before the survey
+    height: float  # m
 
 
 def _sheet(beacon: Beacon) -> _Sheet:
@@ -73,7 +81,8 @@ def _sheet(beacon: Beacon) -> _Sheet:
     low, high = points.min(axis=0), points.max(axis=0)
     margin = 0.5 * found.length_scale
     x, y = (np.linspace(low[i] - margin, high[i] + margin, _GRID) for i in (0, 1))
-    mesh = np.meshgrid(x, y, [float(np.median(points[:, 2]))], indexing="xy")
+    height = float(np.median(points[:, 2]))
+    mesh = np.meshgrid(x, y, [height], indexing="xy")
     spots = np.stack(mesh, axis=-1).reshape(-1, 3)
     value, _ = found.mean(spots)
     left = np.sqrt(found.variance(spots)[:, 0]) / found.gain_sigma
@@ -85,4 +94,5 @@ def _sheet(beacon: Beacon) -> _Sheet:
         gain=100.0 * np.expm1(value[:, 0]).reshape(square),
         turn_deg=np.rad2deg(np.linalg.norm(value[:, 1:], axis=1)).reshape(square),
         unknown=left.reshape(square),
+        height=height,
     )

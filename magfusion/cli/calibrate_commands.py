@@ -62,7 +62,7 @@ def fieldmap(
     ] = None,
     trajectory: Annotated[
         Path | None,
-        typer.Option(help="Of a log: result of smooth, or a table; default: the log's truth."),
+        typer.Option(help="Of a log: poses, best not from this field; default: the log's truth."),
     ] = None,
     spacing: Annotated[
         float, typer.Option(help="Of a log: one point in each cube of this edge, m.")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from magfusion.calibration.fieldmap import MapFit, MapPoints, learn_field_map, thinned
-from magfusion.errors import InputError
+from magfusion.errors import EstimationError, InputError
 from magfusion.fieldmap_plot import write_plot
 from magfusion.fusion.source import open_source
 from magfusion.job import Job, claim, named, read_estimate, read_job
@@ -36,7 +36,8 @@ class MapSource:
     site_path : Path, optional
         None takes ``site.yaml`` of the trajectory's directory, then that of ``path``.
     trajectory_path : Path, optional
-        Of a log: the result of a job, or a table; None takes the log's truth.
+        Of a log: the result of a job, or a table; None takes the log's truth.  Poses that were
+        found by the same field have taken up its error, and teach little of it.
     spacing : float
         One epoch of a log for each cube of this edge (m).
     """
@@ -57,7 +58,7 @@ def run_calibrate_fieldmap(source: MapSource, output: Path, *, report: Report) -
 
     Raises
     ------
-    InputError, EstimationError
+    InputError
     """
     claimed = claim(output, "calibrate fieldmap")
     if not 0.0 < source.spacing < np.inf:
@@ -74,7 +75,10 @@ def run_calibrate_fieldmap(source: MapSource, output: Path, *, report: Report) -
             " choose a larger --spacing"
         )
     report("learning", 1, 2)
-    fit = learn_field_map(site, points)
+    try:
+        fit = learn_field_map(site, points)
+    except EstimationError as error:
+        raise InputError(f"{source.path}: {error}") from error
     report("done", 2, 2)
     figures: Figures = {"job": "calibrate fieldmap", "log": source.path.stem, "points": len(points)}
     figures |= _figures(fit) | extra
