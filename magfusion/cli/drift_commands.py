@@ -8,6 +8,7 @@ import typer
 
 from magfusion.cli.app import AsJson, Output, app, progress, show_result
 from magfusion.jobs.drift import ESTIMATORS, DriftSettings, run_drift
+from magfusion.jobs.drift_world import Estimator
 
 
 class Tried(StrEnum):
@@ -16,6 +17,11 @@ class Tried(StrEnum):
     BOTH = "both"
     EKF = "ekf"
     SMOOTHER = "smoother"
+
+    @property
+    def estimators(self) -> tuple[Estimator, ...]:
+        """Names of the estimators."""
+        return tuple(e for e in ESTIMATORS if self in (Tried.BOTH, e))
 
 
 class Drive(StrEnum):
@@ -63,7 +69,7 @@ def drift(
     """Prove that the online estimators do not drift: days of simulated data, judged."""
     settings = DriftSettings(
         hours=hours,
-        estimators=ESTIMATORS if estimator is Tried.BOTH else (estimator.value,),
+        estimators=estimator.estimators,
         worlds=worlds,
         seed=seed,
         drive=drive.value,

@@ -14,6 +14,7 @@ from magfusion.files import whole_file
 from magfusion.job import UNFINISHED_DRIFT, claim
 from magfusion.jobs.drift_figures import MINUTE, Finding, judged, minutes, settled
 from magfusion.jobs.drift_world import (
+    Estimator,
     WorldRun,
     WorldTask,
     forget,
@@ -24,7 +25,7 @@ from magfusion.monte_carlo import run_many
 from magfusion.report import Figures, write_report
 from magfusion.view_drift import write_drift_recording
 
-ESTIMATORS = ("ekf", "smoother")
+ESTIMATORS: tuple[Estimator, ...] = ("ekf", "smoother")
 SHORTEST, LONGEST = 0.1, 1000.0  # h
 LOOK = 1.0  # s between two looks at how far the runs are
 Report = Callable[[str, int, int], None]
@@ -55,7 +56,7 @@ class DriftSettings:
     """
 
     hours: float = 48.0
-    estimators: tuple[str, ...] = ESTIMATORS
+    estimators: tuple[Estimator, ...] = ESTIMATORS
     worlds: int = 1
     seed: int = 0
     drive: str = "current"

@@ -20,7 +20,7 @@ from magfusion.evaluation.drift import (
 )
 from magfusion.jobs.drift_world import PACE, PIECE, WorldRun
 from magfusion.report import Figures
-from magfusion.units import Array
+from magfusion.units import Array, BoolArray
 
 MINUTE = 60.0  # s; errors count at the phasors of whole minutes, which rests and walks have alike
 NEES_LIMITS = (0.5, 2.0)  # of a degree of freedom; sigmas honest to within a factor of 1.4
@@ -131,7 +131,7 @@ def quantity_between(run: WorldRun) -> Array:
     return errors.rows(~errors.measured & (errors.time > _STARTED)).size(QUANTITIES[0].part)
 
 
-def _at_minutes(series: ErrorSeries) -> Array:
+def _at_minutes(series: ErrorSeries) -> BoolArray:
     return np.asarray(np.abs(series.time / MINUTE - np.round(series.time / MINUTE)) < 1e-7)
 
 
@@ -238,7 +238,7 @@ def _quarters(run: WorldRun) -> tuple[Array, Array]:
 def _resting(pace: Array) -> Array:
     """Return the pieces of full length: those between the phasors of a walk are shorter."""
     length = np.diff(pace[:, TIME], append=np.inf)
-    return pace[(np.abs(length - PIECE) < 1e-6) & (pace[:, UPDATES] == 1.0)]
+    return np.asarray(pace[(np.abs(length - PIECE) < 1e-6) & (pace[:, UPDATES] == 1.0)])
 
 
 def _rms(value: Array) -> float:

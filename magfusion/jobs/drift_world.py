@@ -7,6 +7,7 @@ import shutil
 import time
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Literal
 
 import gtsam
 import numpy as np
@@ -30,7 +31,7 @@ from magfusion.simulation.endurance import (
 from magfusion.simulation.inertial import BiasInstability
 from magfusion.site import ImuModel, Site
 from magfusion.trajectory import Trajectory
-from magfusion.units import Array
+from magfusion.units import Array, BoolArray
 
 STRETCH = 10  # blocks that are made, navigated and written at once
 PIECE = 10.0  # s that are fed at once
@@ -39,6 +40,7 @@ BARE = 6000  # samples of each stretch on which the bare loop is timed
 INSTABILITY = BiasInstability(gyro=1e-5, accel=1e-4, time=300.0)
 # What the user of such a drive declares of a moment (log): heat and wander.
 MOMENT_SIGMA = {"current": 0.005, "voltage": 0.08}
+Estimator = Literal["ekf", "smoother"]
 PACE = ("time", "seconds", "updates", "memory_mib", "distortion")
 
 
@@ -62,7 +64,7 @@ class WorldTask:
     """
 
     world: int
-    estimator: str
+    estimator: Estimator
     hours: float
     seed: int
     drive: str = "current"
@@ -202,10 +204,12 @@ def navigate(navigator: Navigator, world: World, made: Stretch) -> tuple[ErrorSe
         states += new
     stamps = np.array([s.time for s in states])
     truth = world.truth(made, stamps)
-    return state_errors(states, truth, np.isin(stamps, made.fields.time)), np.array(pace)
+    return state_errors(states, truth, np.asarray(np.isin(stamps, made.fields.time))), np.array(
+        pace
+    )
 
 
-def state_errors(states: list[State], truth: Trajectory, measured: Array) -> ErrorSeries:
+def state_errors(states: list[State], truth: Trajectory, measured: BoolArray) -> ErrorSeries:
     """Return what states err, in their own tangent space.
 
     Parameters
@@ -230,7 +234,7 @@ def state_errors(states: list[State], truth: Trajectory, measured: Array) -> Err
         for j, part in enumerate((slice(0, 6), slice(9, 15))):
             own = error[i, part]
             nees[i, j] = own @ np.linalg.solve(state.cov[part, part], own)
-    return ErrorSeries(truth.time, measured.astype(bool), error, sigma, nees[:, 0], nees[:, 1])
+    return ErrorSeries(truth.time, measured, error, sigma, nees[:, 0], nees[:, 1])
 
 
 def bare_loop(imu: ImuSamples, model: ImuModel, gravity: float) -> float:
@@ -274,8 +278,7 @@ def _begun(place: Path | None, world: World, task: WorldTask) -> _Progress:
             ) from error
         assert isinstance(found, _Progress)
         return found
-    kind = "ekf" if task.estimator == "ekf" else "smoother"
-    navigator = Navigator(world.site, NavigatorSettings(estimator=kind))
+    navigator = Navigator(world.site, NavigatorSettings(estimator=task.estimator))
     return _Progress(0, world.start(), navigator.checkpoint(), 0.0)
 
 

@@ -36,6 +36,7 @@ SCHEDULE = Rests(start=40.0, move=180.0, pause=3420.0)
 MARGIN = 10.0  # s before and after a walk in which fields come as often as in it
 DAYTIME = 14.0 * HOUR  # loudest and warmest; the run starts at midnight
 HEAT = WarmUp(rise=20.0, time_constant=90.0 * 60.0)
+CLOCK_WALK = 1e-9  # s per root second; a quartz
 CURRENT_PER_KELVIN = 1e-4  # what a current source loses
 _WORLD, _IMU, _FIELDS = range(3)  # first key of each stream of random numbers
 
@@ -54,7 +55,7 @@ def usual_drift(drive: str, clock_rate: float) -> Drift:
         coils=HEAT,
         fading_per_kelvin=COPPER_PER_KELVIN if drive == "voltage" else CURRENT_PER_KELVIN,
         gain=Wander(rms=0.003, time_constant=4.0 * HOUR),
-        clock=Clock(rate=clock_rate, walk=1e-9),
+        clock=Clock(rate=clock_rate, walk=CLOCK_WALK),
         sensor=DailySwing(amplitude=4.0, warmest_time=DAYTIME),
         scale_per_kelvin=5e-5,
     )
@@ -262,10 +263,9 @@ class World:
         config, site = self.config, self.true_site
         time = self._field_times(block)
         rng = _generator(self.seed, _FIELDS, block)
-        place = time / BLOCK
-        edges = np.arange(block, block + 2)
+        share = time / BLOCK - block
         log_gain, phase, scale = (
-            _between(edges, known[block : block + 2], place)
+            _between(known[block : block + 2], share)
             for known in (self.log_gain, self.phase, self.scale[:, None])
         )
         owner = [i for i, b in enumerate(site.beacons) for _ in b.tones]
@@ -301,7 +301,8 @@ class World:
 
     def _field_times(self, block: int) -> Array:
         config = self.config
-        within = np.arange(round(BLOCK / config.walk_interval)) * config.walk_interval
+        count = round(BLOCK / config.walk_interval)
+        within = np.arange(count, dtype=float) * config.walk_interval
         often = block * BLOCK + within
         every = round(config.rest_interval / config.walk_interval)
         seldom = np.arange(len(often)) % every == 0
@@ -332,7 +333,7 @@ def draw_endurance(site: Site, config: EnduranceConfig, seed: tuple[int, ...]) -
         config.speed,
         rests=config.schedule,
     )
-    edges = BLOCK * np.arange(config.blocks + 1)
+    edges = BLOCK * np.arange(config.blocks + 1, dtype=float)
     drawn = draw_drift(config.drift, edges, len(site.beacons), drift_rng)
     tones_hz = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
     drives = draw_drives(site, clock_rng)
@@ -340,7 +341,7 @@ def draw_endurance(site: Site, config: EnduranceConfig, seed: tuple[int, ...]) -
     own = [
         np.zeros(len(edges))
         if beacon.synchronised
-        else Clock(float(rate), 1e-9).lead(edges, clock_rng)
+        else Clock(float(rate), CLOCK_WALK).lead(edges, clock_rng)
         for beacon, rate in zip(site.beacons, drives.drift, strict=True)
     ]
     lead = drawn.lead[:, None] + np.repeat(np.stack(own, axis=1), tones, axis=1)
@@ -389,9 +390,9 @@ def _carried_on(
     return walk + wander, Biases(walk[:, -1], wander[:, -1])
 
 
-def _between(edges: Array, known: Array, place: Array) -> Array:
-    share = (place - edges[0])[:, None]
-    return np.asarray((1.0 - share) * known[0] + share * known[1])
+def _between(known: Array, share: Array) -> Array:
+    after = share[:, None]
+    return np.asarray((1.0 - after) * known[0] + after * known[1])
 
 
 def _joined(parts: list[FieldSamples]) -> FieldSamples:

@@ -1,0 +1,145 @@
+"""Slopes, Allan deviations and verdicts against what is known of synthetic errors."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from magfusion.evaluation.drift import (
+    DAY,
+    ErrorSeries,
+    Slope,
+    allan_deviation,
+    evenly,
+    in_windows,
+    settled_after,
+    slope_of_one,
+    slope_over_worlds,
+    within,
+)
+
+MINUTES = 60.0 * np.arange(2880.0)
+
+
+def correlated(rng, time_constant):
+    """Return a stationary Gauss-Markov series of unit variance, a value a minute."""
+    kept = np.exp(-60.0 / time_constant)
+    drive = np.sqrt(1.0 - kept**2) * rng.standard_normal(len(MINUTES))
+    drive[0] = rng.standard_normal()
+    return lfilter([1.0], [1.0, -kept], drive)
+
+
+def test_a_straight_line_has_its_slope_and_no_error():
+    slope = slope_of_one(MINUTES, 3.0 + 0.7 * MINUTES / DAY)
+    assert slope.per_day == pytest.approx(0.7, rel=1e-9)
+    assert slope.standard_error < 1e-9
+
+
+@pytest.mark.parametrize("time_constant", [60.0, 600.0, 3600.0])
+def test_the_standard_error_of_one_world_is_that_of_many(time_constant):
+    rng = np.random.default_rng(4)
+    told = [slope_of_one(MINUTES, correlated(rng, time_constant)) for _ in range(300)]
+    scatter = np.std([s.per_day for s in told])
+    claimed = np.sqrt(np.mean([s.standard_error**2 for s in told]))
+    assert 0.75 < claimed / scatter < 1.25
+
+
+def test_neighbours_taken_for_independent_would_claim_too_little():
+    """Why blocks: with one for four values each the error of a slow series is far too small."""
+    rng = np.random.default_rng(4)
+    told = [slope_of_one(MINUTES, correlated(rng, 3600.0), len(MINUTES) // 4) for _ in range(40)]
+    scatter = np.std([s.per_day for s in told])
+    assert np.sqrt(np.mean([s.standard_error**2 for s in told])) < 0.3 * scatter
+
+
+def test_the_interval_of_eight_worlds_holds_the_slope_as_often_as_it_says():
+    rng = np.random.default_rng(5)
+    held = []
+    for _ in range(400):
+        values = [0.3 * MINUTES / DAY + correlated(rng, 4.0 * 3600.0) for _ in range(8)]
+        slope = slope_over_worlds([MINUTES] * 8, values)
+        held.append(abs(slope.per_day - 0.3) < slope.margin)
+    assert abs(np.mean(held) - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / 400)
+
+
+@pytest.mark.parametrize(
+    ("per_day", "error", "verdict"),
+    [(0.01, 0.001, "pass"), (0.2, 0.01, "fail"), (-0.2, 0.01, "fail"), (0.01, 1.0, "undecided")],
+)
+def test_a_run_too_short_to_tell_has_not_passed(per_day, error, verdict):
+    assert Slope(per_day, error, 10).verdict(0.1) == verdict
+
+
+def test_a_slope_that_is_there_is_found_and_one_that_is_not_is_not():
+    rng = np.random.default_rng(6)
+    for true, verdict in ((0.0, "pass"), (2.0, "fail")):
+        values = [true * MINUTES / DAY + correlated(rng, 600.0) for _ in range(8)]
+        assert slope_over_worlds([MINUTES] * 8, values).verdict(0.5) == verdict
+
+
+def test_an_interval_on_both_sides_of_a_limit_tells_nothing():
+    assert within(0.0, 1.0, 2.0) == "pass"
+    assert within(1.0, 3.0, 2.0) == "undecided"
+    assert within(2.5, 3.0, 2.0) == "fail"
+
+
+def test_too_few_values_have_no_slope():
+    with pytest.raises(ValueError, match="three blocks"):
+        slope_of_one(MINUTES[:2], np.zeros(2))
+
+
+def test_white_errors_fall_with_the_root_of_the_averaging_time():
+    rng = np.random.default_rng(7)
+    time, deviation = allan_deviation(rng.standard_normal((30_000, 3)), 2.0)
+    count = time / 2.0
+    short = count <= 100
+    assert np.allclose(deviation[short] * np.sqrt(count[short]), 1.0, rtol=0.06, atol=0.0)
+
+
+def test_a_random_walk_rises_as_its_closed_form():
+    """Means of m values of a walk of unit steps: variance (2 m^2 + 1) / (6 m)."""
+    rng = np.random.default_rng(8)
+    walk = np.cumsum(rng.standard_normal((30_000, 3)), axis=0)
+    time, deviation = allan_deviation(walk, 1.0)
+    short = time <= 100
+    expected = np.sqrt((2.0 * time[short] ** 2 + 1.0) / (6.0 * time[short]))
+    assert np.allclose(deviation[short], expected, rtol=0.08, atol=0.0)
+
+
+def test_a_drift_rises_with_the_averaging_time():
+    time, deviation = allan_deviation(0.2 * np.arange(3000.0), 1.0)
+    assert np.allclose(deviation, 0.2 * time / np.sqrt(2.0), rtol=1e-9, atol=0.0)
+
+
+def test_averaging_ends_at_a_third_of_the_series():
+    time, _ = allan_deviation(np.zeros(100), 60.0)
+    assert time[-1] == 33 * 60.0
+    assert len(allan_deviation(np.zeros(2), 1.0)[0]) == 0
+
+
+def a_series(time, measured):
+    n = len(time)
+    error = np.tile(np.arange(15.0), (n, 1))
+    ones = np.ones(n)
+    return ErrorSeries(np.array(time), np.array(measured), error, error + 1.0, ones, 2.0 * ones)
+
+
+def test_walks_do_not_count_more_than_rests():
+    series = a_series([60.0, 61.0, 62.0, 120.0, 180.0], [True, True, True, True, False])
+    assert evenly(series, 60.0).time.tolist() == [60.0, 120.0]
+
+
+def test_the_size_of_an_error_is_that_of_its_own_columns():
+    series = a_series([0.0], [True])
+    assert series.size(slice(3, 6))[0] == pytest.approx(np.sqrt(9.0 + 16.0 + 25.0))
+
+
+def test_windows_have_their_own_means():
+    means = in_windows(np.array([0.5, 0.6, 2.5]), np.array([1.0, 3.0, 7.0]), np.arange(4.0))
+    assert means[0] == 2.0
+    assert np.isnan(means[1])
+    assert means[2] == 7.0
+
+
+def test_slopes_begin_after_twelve_hours_or_a_quarter():
+    assert settled_after(48.0) == 12.0 * 3600.0
+    assert settled_after(2.0) == 0.5 * 3600.0
