@@ -37,9 +37,8 @@ def write_plot(path: Path, fit: MapFit) -> None:
         )
         for axes, values, scale in shown:
             mesh = axes.pcolormesh(sheet.x, sheet.y, values, shading="nearest", **scale)
-            # What is hatched is hardly better known than before the survey.
             axes.contourf(
-                sheet.x, sheet.y, sheet.unknown, [0.5, 2.0], hatches=["//"], colors="none"
+                sheet.x, sheet.y, sheet.unknown, [1.0, np.inf], hatches=["//"], colors="none"
             )
             axes.plot(*sheet.points.T, ".", color="black", markersize=2.0)
             axes.plot(*beacon.position_world[:2], "^", color="black", markersize=9)
@@ -56,8 +55,8 @@ def write_plot(path: Path, fit: MapFit) -> None:
         axes.set_ylabel("y (m)")
     figure.suptitle(
         f"What the field is, relative to its model, at a height of {sheets[0].height:.2f} m\n"
-        "dots: where it was learnt (any height); triangle: the beacon; hatched: too far from the"
-        " dots to be known; errors: rms at points left out"
+        "dots: where it was learnt (any height); triangle: the beacon; hatched: not known, sigma"
+        " above the size it has at the dots; errors: rms at points left out"
     )
     figure.savefig(path, dpi=100, metadata={"Software": None})
 
@@ -70,7 +69,7 @@ class _Sheet(NamedTuple):
     y: Array
     gain: Array  # percent
     turn_deg: Array
-    unknown: Array  # sigma left of that before the survey
+    unknown: Array  # sigma of the gain, relative to what the gain is at the points
     height: float  # m
 
 
@@ -85,7 +84,8 @@ def _sheet(beacon: Beacon) -> _Sheet:
     mesh = np.meshgrid(x, y, [height], indexing="xy")
     spots = np.stack(mesh, axis=-1).reshape(-1, 3)
     value, _ = found.mean(spots)
-    left = np.sqrt(found.variance(spots)[:, 0]) / found.gain_sigma
+    learnt = np.sqrt(np.mean(found.mean(points)[0][:, 0] ** 2))
+    left = np.sqrt(found.variance(spots)[:, 0]) / max(float(learnt), found.residual)
     square = (_GRID, _GRID)
     return _Sheet(
         points=points[:, :2],
