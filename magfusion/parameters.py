@@ -209,6 +209,8 @@ def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) ->
     names = [b.name for b in site.beacons]
     for block in blocks:
         part = np.array(step[block.columns])  # GTSAM's vectors are read-only
+        if not np.any(part):
+            continue
         if block.kind == "time_offset":
             time_offset += float(part[0])
         elif block.group in ("magnetometer", "extrinsics"):

@@ -91,9 +91,10 @@ class ErrorStateFilter:
             back = between(prior, state, self.blocks)
             told = Rows(rows.error - rows.jacobian @ back, rows.jacobian)
             try:
-                step, cov = (_step if about is None else _step_from_far)(prior.cov, told)
+                found = (_step if about is None else _step_from_far)(prior.cov, told)
             except np.linalg.LinAlgError as error:
                 raise EstimationError(f"the filter's update failed ({error})") from error
+            step, cov = considered(*found, prior.cov, self.held)
             if not np.all(np.isfinite(step)):
                 raise EstimationError("the filter's step is not finite")
             state = moved(replace(prior, cov=cov), self.blocks, step)

@@ -6,21 +6,25 @@ from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.fusion.batch import Smoothed
 from magfusion.fusion.factors import CALIBRATION_KEY
-from magfusion.fusion.smoother import Estimate, linearized
+from magfusion.fusion.smoother import Estimate, held_steps, linearized
 from magfusion.fusion.state import State
+from magfusion.parameters import Block, prior_sigma
+from magfusion.units import Array
 
 
-def last_state(result: Smoothed) -> State:
+def last_state(result: Smoothed, held: tuple[Block, ...] = ()) -> State:
     """Return the smoothed state of the last epoch with its covariance, the calibration's included.
 
     Parameters
     ----------
     result : Smoothed
+    held : tuple of Block
+        Uncertain parameters that were not estimated, to be considered from here on.
 
     Returns
     -------
     State
-        In the tangent of ``result.blocks``.
+        In the tangent of ``result.blocks``, then of those held.
     """
     states, last = result.states, len(result.states) - 1
     estimate = Estimate(result.values, result.calibration)
@@ -36,7 +40,7 @@ def last_state(result: Smoothed) -> State:
     except RuntimeError:  # an ill-conditioned stretch: QR needs half the digits
         _, rest = graph.eliminatePartialSequential(earlier, gtsam.EliminateQR)
     information, _ = rest.hessian(kept)
-    cov = np.linalg.inv(information)
+    cov = _with_held(np.linalg.inv(information), result, estimate, held)
     assert states.velocity_world is not None
     assert states.accel_bias_body is not None
     assert states.gyro_bias_body is not None
@@ -50,3 +54,19 @@ def last_state(result: Smoothed) -> State:
         calibration=result.calibration,
         cov=0.5 * (cov + cov.T),
     )
+
+
+def _with_held(cov: Array, result: Smoothed, estimate: Estimate, held: tuple[Block, ...]) -> Array:
+    """Return the joint covariance with parameters that the estimate took for known."""
+    if not held or result.problem.fields is None:
+        return cov
+    last = len(result.states) - 1
+    sigma = prior_sigma(held)
+    columns = []
+    for step in held_steps(result.problem, estimate, held):
+        own = [step.at(X(last)), step.at(V(last)), step.at(B(last))]
+        own += [step.at(CALIBRATION_KEY)] if result.blocks else []
+        columns.append(np.concatenate(own))
+    response = np.stack(columns, axis=1)
+    across = response * sigma
+    return np.block([[cov + response @ response.T, across], [across.T, np.diag(sigma**2)]])

@@ -14,7 +14,7 @@ from gtsam.symbol_shorthand import B, V, X
 from magfusion.errors import EstimationError
 from magfusion.fusion.factors import CALIBRATION_KEY, FieldFactors, FieldMeasurements
 from magfusion.fusion.propagation import Propagated
-from magfusion.fusion.state import MOTION, State, between, moved_to, pose_of
+from magfusion.fusion.state import MOTION, State, between, considered, moved_to, pose_of
 from magfusion.parameters import Block, dimension, retract
 from magfusion.units import Array
 
@@ -69,6 +69,8 @@ class SlidingWindow:
         IMU time offset with which the inertial data are cut (s).
     earth : bool
         Whether epochs hold the Earth field.
+    held : int
+        Parameters at the tangent's end that are considered, not estimated.
     """
 
     def __init__(
@@ -80,7 +82,9 @@ class SlidingWindow:
         applied_offset: float,
         *,
         earth: bool = False,
+        held: int = 0,
     ) -> None:
+        self.held, self._held_cov = held, state.cov
         self.applied_offset, self.earth = applied_offset, earth
         self.blocks, self.lag, self.calibration_noise = blocks, lag, calibration_noise
         self.state = self.lagged = state
@@ -146,7 +150,7 @@ class SlidingWindow:
         solved, rest = _eliminated(graph, _keys(range(last), None))
         information, vector = rest.hessian(_keys([last], self.calibration_key))
         cov = np.linalg.inv(information)
-        step = cov @ vector
+        step, cov = considered(cov @ vector, cov, self._held_cov, self.held)
         if not np.all(np.isfinite(step)):
             raise EstimationError("the window's step is not finite")
         given = gtsam.VectorValues()
@@ -228,11 +232,25 @@ class SlidingWindow:
         _, rest = graph.eliminatePartialSequential(_keys([0], None), gtsam.EliminateQR)
         root, right = rest.jacobian(_keys([1], self.calibration_key))
         noise = self.calibration_noise * (second.state.time - first.state.time)
-        root, right = _widened(root, right, noise)
+        root, right = self._carried(root, right, noise)
         self.prior = Prior(second.state, root, right)
         self.lagged = replace(first.state, cov=cov)
         self.left = [*self.left, self.lagged]
         self.nodes = self.nodes[1:]
+
+    def _carried(self, root: Array, right: Array, noise: Array) -> tuple[Array, Array]:
+        """Return the prior of later: some of the calibration drifts, some is not to be learnt."""
+        triangular = np.asarray(np.linalg.qr(np.column_stack([root, right])).R)
+        size = root.shape[1]
+        root, right = triangular[:size, :size], triangular[:size, size]
+        if not (self.held or np.any(noise > 0.0)):
+            return root, right
+        inverse = np.linalg.inv(root)
+        mean, cov = considered(inverse @ right, inverse @ inverse.T, self._held_cov, self.held)
+        rows = np.arange(MOTION, size)
+        cov[rows, rows] += noise
+        wide = np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
+        return wide, wide @ mean
 
 
 def _empty_factor(rows: int, calibration: int | None, columns: int) -> gtsam.JacobianFactor:
@@ -281,21 +299,6 @@ def _eliminated(
         return graph.eliminatePartialSequential(ordering)
     except RuntimeError:  # an ill-conditioned stretch: QR needs half the digits
         return graph.eliminatePartialSequential(ordering, gtsam.EliminateQR)
-
-
-def _widened(root: Array, right: Array, noise: Array) -> tuple[Array, Array]:
-    """Return a prior whose calibration has gained some variance since; mean and size the same."""
-    triangular = np.asarray(np.linalg.qr(np.column_stack([root, right])).R)
-    size = root.shape[1]
-    root, right = triangular[:size, :size], triangular[:size, size]
-    if not np.any(noise > 0.0):
-        return root, right
-    inverse = np.linalg.inv(root)
-    cov = inverse @ inverse.T
-    rows = np.arange(MOTION, size)
-    cov[rows, rows] += noise
-    wide = np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
-    return wide, wide @ (inverse @ right)
 
 
 def _rest_factor(node: int, velocity_world: Array, sigma: float) -> gtsam.JacobianFactor:

@@ -287,7 +287,7 @@ class Navigator:
                 self.settings.lag,
                 self._walk,
                 self._applied_offset,
-                self._held,
+                held=self._held,
             )
         if outset.lockin is not None:
             self._receiver = OnlineReceiver(

@@ -9,6 +9,7 @@ from magfusion.fusion.batch import SmootherSettings, smooth
 from magfusion.fusion.buffers import Buffer
 from magfusion.fusion.handover import last_state
 from magfusion.fusion.state import State
+from magfusion.parameters import held_blocks
 from magfusion.receiver.windows import LockinSettings, default_settings
 from magfusion.records.samples import FieldSamples, ImuSamples, Log, Waveform
 from magfusion.site import Site
@@ -81,7 +82,7 @@ def find_outset(
     settings = SmootherSettings(estimate=estimate, lockin=used, loss="huber")
     try:
         result = smooth(log, site, settings)
-        state = last_state(result)
+        state = last_state(result, held_blocks(site, result.blocks))
     except (EstimationError, InputError, RuntimeError, np.linalg.LinAlgError):
         return None
     rate_hz = 0.0 if used is None else 1.0 / float(np.median(np.diff(time)))

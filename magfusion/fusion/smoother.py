@@ -312,8 +312,23 @@ def _responses(
 ) -> tuple[Array, Array]:
     """Return the steps that one sigma of each held parameter causes.
 
-    Of the poses, shape (held, n, 6), and of the calibration, shape (held, dimension).  The held
-    parameters are left over when all else is eliminated, so that one elimination serves them all.
+    Of the poses, shape (held, n, 6), and of the calibration, shape (held, dimension).
+    """
+    keys = [X(i) for i in range(problem.epochs)]
+    by_pose, by_calibration = [], []
+    for step in held_steps(problem, estimate, held):
+        by_pose.append(step.vector(keys).reshape(-1, 6))
+        by_calibration.append(step.at(CALIBRATION_KEY) if problem.blocks else np.zeros(0))
+    return np.array(by_pose), np.array(by_calibration)
+
+
+def held_steps(
+    problem: Problem, estimate: Estimate, held: tuple[Block, ...]
+) -> list[gtsam.VectorValues]:
+    """Return the step of every variable that one sigma of each held parameter causes.
+
+    The held parameters are left over when all else is eliminated, so that one elimination serves
+    them all.
     """
     assert problem.fields is not None
     graph = problem.native.linearize(estimate.values)
@@ -332,12 +347,9 @@ def _responses(
         conditional, _ = graph.eliminatePartialSequential(ordering)
     except RuntimeError:  # as in _eliminate
         conditional, _ = graph.eliminatePartialSequential(ordering, gtsam.EliminateQR)
-    keys = [X(i) for i in range(problem.epochs)]
-    by_pose, by_calibration = [], []
+    steps = []
     for one in np.eye(columns.shape[-1]):
         given = gtsam.VectorValues()
         given.insert(HELD_KEY, one)
-        step = conditional.optimize(given)
-        by_pose.append(step.vector(keys).reshape(-1, 6))
-        by_calibration.append(step.at(CALIBRATION_KEY) if calibrated else np.zeros(0))
-    return np.array(by_pose), np.array(by_calibration)
+        steps.append(conditional.optimize(given))
+    return steps
