@@ -245,7 +245,7 @@ def _carriers_hz(site: Site, slots: Slots, rate_hz: float, settings: SlotSetting
     for slot, frequency in tones:
         assert slot is not None
         carrier[slot] = frequency
-    if slots.duration * rate_hz < LEAST_SAMPLES:
+    if slots.duration * rate_hz < LEAST_SAMPLES * (1.0 - 1e-6):
         raise InputError(
             f"magnetometer: sampled at {rate_hz:.4g} Hz, too slow for slots of"
             f" {slots.duration:g} s; at least {LEAST_SAMPLES / slots.duration:.4g} Hz are needed"
