@@ -36,7 +36,9 @@ TRAJECTORY_ERROR = 0.03  # relative; of a field predicted from a trajectory of t
 FEWEST_EPOCHS = 10
 EPOCHS_SEARCHED = 120
 GRID = 24  # points along each axis
-MINIMA = 12  # of the grid that are refined
+MINIMA = 12  # of the grid that are followed
+MOST_REFINED = 4  # of the places to which they lead
+EQUALLY_GOOD = 0.9  # of the best agreement of an attitude with the drive
 RANGE_MARGIN = 1.4  # of a range from the field's strength alone
 SAME_PLACE = 0.05  # m
 NO_PRIOR = (100.0, 10.0)  # m, rad; sigmas that are no information
@@ -167,9 +169,8 @@ def places(heard: Heard) -> list[tuple[float, Beacon]]:
     -------
     list of (float, Beacon)
     """
-    found = []
-    for centre, drift in _centres(heard):
-        found += [_refined(heard, start) for start in _starts(heard, centre, drift)]
+    starts = [start for centre in _centres(heard) for start in _starts(heard, *centre)]
+    found = [_refined(heard, start) for start in starts]
     found.sort(key=lambda one: one[0])
     kept: list[tuple[float, Beacon]] = []
     for chi_square, placed in found:
@@ -179,22 +180,46 @@ def places(heard: Heard) -> list[tuple[float, Beacon]]:
     return kept
 
 
-def _centres(heard: Heard) -> Iterator[tuple[Array, float]]:
-    """Yield centres, with the clock's error, about which the misfit has a minimum."""
-    if heard.beacon.unknown == "attitude":
-        yield heard.beacon.position_world, 0.0
-        return
+def _centres(heard: Heard) -> list[tuple[Array, float]]:
+    """Return centres, with the clock's error, about which the misfit has a minimum."""
+    beacon = heard.beacon
+    drifts = _drifts(heard)
+    if beacon.unknown == "attitude":
+        misfit = _misfit(heard, beacon.position_world[None], drifts)[:, 0]
+        return [(beacon.position_world, float(drifts[int(np.argmin(misfit))]))]
     axes = _search_axes(heard)
     mesh = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    drifts = _drifts(heard)
-    misfit = np.array([_misfit(heard, mesh.reshape(-1, 3), d) for d in drifts])
+    misfit = _misfit(heard, mesh.reshape(-1, 3), drifts)
     least = np.min(misfit, axis=0).reshape(mesh.shape[:3])
     lowest = np.argwhere(minimum_filter(least, 3, mode="nearest") == least)
     lowest = lowest[np.argsort(least[tuple(lowest.T)])][:MINIMA]
-    for index in lowest:
-        row = int(np.ravel_multi_index(tuple(index), mesh.shape[:3]))
-        drift = float(drifts[int(np.argmin(misfit[:, row]))])
-        yield _polished(heard, mesh.reshape(-1, 3)[row], drift)
+    rows = [int(np.ravel_multi_index(tuple(index), mesh.shape[:3])) for index in lowest]
+    polished = [
+        _polished(heard, mesh.reshape(-1, 3)[row], float(drifts[int(np.argmin(misfit[:, row]))]))
+        for row in rows
+    ]
+    polished.sort(key=lambda one: one[0])
+    apart: list[tuple[Array, float]] = []
+    for _, centre, drift in polished:
+        if all(np.linalg.norm(centre - other) > SAME_PLACE for other, _ in apart):
+            apart.append((centre, drift))
+    return apart[:MOST_REFINED] + _mirrors(heard)
+
+
+def _mirrors(heard: Heard) -> list[tuple[Array, float]]:
+    """Return what one epoch allows of a beacon of known attitude: its place and its mirrors.
+
+    A platform that hardly moves leaves them all, where the misfit of a free drive has no minimum.
+    """
+    if heard.beacon.unknown != "position":
+        return []
+    row = len(heard.poses) // 2
+    phasor_beacon = heard.phasor_world[row] @ heard.beacon.world_from_beacon
+    direction, distance = beacon_directions(heard.beacon, phasor_beacon[None])
+    if direction.shape[1] > MOST_REFINED:  # a cone or a sphere of them
+        return []
+    offset_world = (direction[0] * distance[0][:, None]) @ heard.beacon.world_from_beacon.T
+    return [(heard.sensor_world[row] - offset, 0.0) for offset in offset_world]
 
 
 def _search_axes(heard: Heard) -> list[Array]:
@@ -231,26 +256,32 @@ def _tensors(centres: Array, sensor_world: Array) -> Array:
 
 
 def _drive_at(tensor: Array, weight: Array, phasor: ComplexArray) -> tuple[ComplexArray, Array]:
-    """Return the drive in world axes that fits best, (..., 3, tones), and what it explains."""
+    """Return the drive in world axes that fits best, (..., 3, tones), and what each explains."""
     weighed = tensor * weight[:, None, None]
-    normal = np.einsum("...nij,...njk->...ik", weighed, tensor)
-    right = np.einsum("...nij,nkj->...ik", weighed, phasor)
+    rows = (*tensor.shape[:-3], -1, 3)
+    across = np.swapaxes(weighed.reshape(rows), -1, -2)  # the tensors are symmetric
+    normal = across @ tensor.reshape(rows)
+    right = across @ np.swapaxes(phasor, 1, 2).reshape(-1, phasor.shape[1])
     drive = np.linalg.solve(normal, right)
-    return drive, np.asarray(np.sum(np.conj(right) * drive, axis=(-1, -2)).real)
+    return drive, np.asarray(np.sum(np.conj(right) * drive, axis=-2).real)
 
 
-def _misfit(heard: Heard, centres: Array, drift: float) -> Array:
+def _misfit(heard: Heard, centres: Array, drifts: Array) -> Array:
+    """Return what no drive explains, shape (drifts, centres)."""
     elapsed, sensor_world, weight, phasor = heard.thinned()
-    phasor = _undrifted(heard, elapsed, phasor, drift)
+    told = [_undrifted(heard, elapsed, phasor, drift) for drift in drifts]
+    columns = np.concatenate(told, axis=1)  # each clock's phasors side by side
     total = float(np.sum(weight[:, None, None] * np.abs(phasor) ** 2))
     explained = [
-        _drive_at(_tensors(some, sensor_world), weight, phasor)[1]
+        _drive_at(_tensors(some, sensor_world), weight, columns)[1]
         for some in np.array_split(centres, max(1, len(centres) // 500))
     ]
-    return np.asarray(total - np.concatenate(explained))
+    by_drift = np.concatenate(explained).reshape(len(centres), len(drifts), -1)
+    return np.asarray(total - np.sum(by_drift, axis=-1).T)
 
 
-def _polished(heard: Heard, centre: Array, drift: float) -> tuple[Array, float]:
+def _polished(heard: Heard, centre: Array, drift: float) -> tuple[float, Array, float]:
+    """Return the misfit at the minimum near a centre, the centre there, and the clock's error."""
     elapsed, sensor_world, weight, phasor = heard.thinned()
     free = not heard.beacon.synchronised
 
@@ -262,35 +293,51 @@ def _polished(heard: Heard, centre: Array, drift: float) -> tuple[Array, float]:
         return np.concatenate([error.real.ravel(), error.imag.ravel()])
 
     start = np.append(centre, drift / DRIFT_SEARCH) if free else centre
-    solved = least_squares(residual, start, max_nfev=30).x
-    return solved[:3], float(solved[3] * DRIFT_SEARCH) if free else 0.0
+    solved = least_squares(residual, start, max_nfev=30)
+    there = float(solved.x[3] * DRIFT_SEARCH) if free else 0.0
+    return float(solved.cost), solved.x[:3], there
 
 
 def _starts(heard: Heard, centre: Array, drift: float) -> Iterator[Calibration]:
-    """Yield the beacon at a centre in the attitudes that its drive there allows.
-
-    A free drive phase is undone by making each tone's ellipse lie as it does in the beacon, once
-    for each polarity.
-    """
-    beacon, tones = heard.beacon, len(heard.beacon.tones)
+    """Yield the beacon at a centre in the attitudes that its drive there allows."""
+    beacon = heard.beacon
     elapsed, sensor_world, weight, phasor = heard.thinned()
     told = _undrifted(heard, elapsed, phasor, drift)
     world, _ = _drive_at(_tensors(centre[None], sensor_world)[0], weight, told)
     declared = beacon.moments_beacon.T @ beacon.excitation
-    lag = np.zeros(tones)
-    polarities: list[tuple[float, ...]] = [(0.0,) * tones]
-    if not beacon.synchronised:
-        squares = [np.angle(np.sum(drive**2, axis=0)) for drive in (world, declared)]
-        lag = 0.5 * (squares[0] - squares[1])
-        polarities = list(product((0.0, np.pi), repeat=tones))
-    for turned in polarities:
-        phase = lag + np.array(turned)
-        correlation = (world * np.exp(-1j * phase) @ np.conj(declared).T).real
-        known = beacon.unknown == "position"
-        attitude = beacon.world_from_beacon if known else wahba(correlation)
+    if beacon.unknown == "position":
+        lag = np.angle(np.sum(np.conj(beacon.world_from_beacon @ declared) * world, axis=0))
+        phase = np.zeros(len(lag)) if beacon.synchronised else lag
+        pairs = [(beacon.world_from_beacon, phase)]
+    else:
+        pairs = _attitudes(beacon, world, declared)
+    for attitude, phase in pairs:
         placed = replace(beacon, position_world=centre, world_from_beacon=attitude, unknown=None)
         site = replace(heard.alone.site, beacons=(placed,))
         yield replace(heard.alone, site=site, phase=phase, drift=np.array([drift]))
+
+
+def _attitudes(
+    beacon: Beacon, world: ComplexArray, declared: ComplexArray
+) -> list[tuple[Array, Array]]:
+    """Return the attitudes and drive phases that take a declared drive to that in the world.
+
+    A free phase is undone by making the tone's ellipse lie as it does in the beacon, which leaves
+    its polarity: with several tones the coils' own centres may tell.
+    """
+    tones = len(beacon.tones)
+    if beacon.synchronised:
+        lags = [np.zeros(tones)]
+    else:
+        squares = [np.angle(np.sum(drive**2, axis=0)) for drive in (world, declared)]
+        lag = 0.5 * (squares[0] - squares[1])
+        signs = product((0.0, np.pi), repeat=tones) if tones > 1 else [(0.0,)]
+        lags = [lag + np.array(turned) for turned in signs]
+    correlation = np.stack([(world * np.exp(-1j * lag) @ np.conj(declared).T).real for lag in lags])
+    attitude = wahba(correlation)
+    score = np.sum(attitude * correlation, axis=(1, 2))
+    kept = np.flatnonzero(score > EQUALLY_GOOD * np.max(score))
+    return [(attitude[k], lags[k]) for k in kept]
 
 
 def _refined(heard: Heard, start: Calibration) -> tuple[float, Beacon]:
