@@ -12,7 +12,7 @@ from magfusion.records.samples import ImuSamples
 from magfusion.refinement import DETERMINED_RATIO
 from magfusion.strapdown import resting
 from magfusion.trajectory import Trajectory
-from magfusion.units import DEGREE, Array
+from magfusion.units import DEGREE, Array, BoolArray
 from magfusion.weights import sensor_positions
 
 HARDLY_TURNED = 15.0  # deg, root mean square about an axis
@@ -105,9 +105,9 @@ def missing_motion(
     return [sentence for sentence in out if sentence]
 
 
-def _is_open(found: Observability, columns: slice) -> Array:
+def _is_open(found: Observability, columns: slice) -> BoolArray:
     """Tell which parameters of a block the log left open; what is all gauge is not among them."""
-    return np.nan_to_num(found.ratio_but_for_gauge[columns]) > DETERMINED_RATIO
+    return np.asarray(np.nan_to_num(found.ratio_but_for_gauge[columns]) > DETERMINED_RATIO)
 
 
 def _open(

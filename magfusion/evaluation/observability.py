@@ -176,7 +176,7 @@ def _open_gauge(
     nearly: list[Weakness] = []
     columns = []
     for gauge, column, length in _orthonormal(calibration, blocks, prior):
-        ratio = float(np.sqrt(max(column @ scaled @ column, 0.0)))
+        ratio = float(np.sqrt(max(float(column @ scaled @ column), 0.0)))
         if ratio < DETERMINED_RATIO:
             continue
         columns.append(column)

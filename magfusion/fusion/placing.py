@@ -262,7 +262,7 @@ def _drive_at(tensor: Array, weight: Array, phasor: ComplexArray) -> tuple[Compl
     across = np.swapaxes(weighed.reshape(rows), -1, -2)  # the tensors are symmetric
     normal = across @ tensor.reshape(rows)
     right = across @ np.swapaxes(phasor, 1, 2).reshape(-1, phasor.shape[1])
-    drive = np.linalg.solve(normal, right)
+    drive: ComplexArray = np.asarray(np.linalg.solve(normal, right), dtype=np.complex128)
     return drive, np.asarray(np.sum(np.conj(right) * drive, axis=-2).real)
 
 
@@ -359,7 +359,7 @@ def _refined(heard: Heard, start: Calibration) -> tuple[float, Beacon]:
     for _ in range(STEPS):
         normal = columns.T @ columns
         scale = np.diag(damping * np.diagonal(normal))
-        step = np.linalg.solve(normal + scale, columns.T @ error)
+        step: Array = np.asarray(np.linalg.solve(normal + scale, columns.T @ error))
         trial = retract(found, blocks, step)
         new_error, new_columns = whitened(trial)
         gain = float(error @ error - new_error @ new_error)

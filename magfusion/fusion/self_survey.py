@@ -127,8 +127,7 @@ def _by_the_known(
         phasor_sensor=samples.phasor_sensor[:, kept],
         phasor_cov=samples.phasor_cov[:, kept],
     )
-    heard = fields.valid.any(axis=1)
-    fields = _rows(fields, heard)
+    fields = _rows(fields, np.asarray(fields.valid.any(axis=1)))
     partial = replace(log, waveform=None, fields=fields)
     found = smooth(partial, known, settings, report)
     return found.states, found.calibration

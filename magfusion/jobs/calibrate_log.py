@@ -120,7 +120,8 @@ def run_calibrate_log(
     told = findings(result.declared, result.calibration, result.blocks, result.calibration_cov)
     found = observability(result.calibration, result.blocks, result.calibration_cov)
     covered = motion_coverage(result.states, result.calibration, log.imu)
-    figures: Figures = {"job": JOB, "log": log.name} | smoothed_figures(result)
+    figures: Figures = {"job": JOB, "log": log.name}
+    figures |= smoothed_figures(result)
     figures |= compared_with_truth(result.states, log)[1]
     figures |= placement_figures(placed, result.calibration.site)
     figures |= _coverage_figures(covered)
