@@ -117,7 +117,7 @@ def test_rest_is_gravity_and_bias_and_white_noise():
 
 
 def test_biases_walk_as_declared_across_the_blocks():
-    config = EnduranceConfig(2.0, imu_rate_hz=10.0, schedule=Rests(start=3600.0))
+    config = EnduranceConfig(2.0, imu_rate_hz=10.0, schedule=Rests(3600.0, 60.0, 3540.0))
     site = demo_site()
     steps = []
     for seed in range(30):

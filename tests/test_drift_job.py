@@ -1,0 +1,255 @@
+"""The job that tries the online estimators for days: its verdicts, its files, its resumption."""
+
+import json
+import time
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from magfusion.cli import main
+from magfusion.errors import InputError
+from magfusion.evaluation.drift import QUANTITIES, ErrorSeries
+from magfusion.jobs import drift, drift_world
+from magfusion.jobs.drift import DriftSettings, overall, run_drift, summarise
+from magfusion.jobs.drift_figures import drift_of, judged
+from magfusion.jobs.drift_world import WorldRun, WorldTask, run_world
+
+SHORT = 0.2  # h; two stretches
+PIECES = 10.0 * np.arange(8640.0)  # s; a day
+SIGMA = np.repeat([1e-3, 4e-3, 1e-2, 5e-3, 1e-4], 3)
+
+
+def a_run(world=0, *, slope=0.0, growth=0.0, slower=0.0, sigma_error=1.0, losses=None):
+    """Return a day of synthetic white errors, with what is to be found in them."""
+    rng = np.random.default_rng(world)
+    stamps = 60.0 * np.arange(1440.0)
+    error = sigma_error * SIGMA * rng.standard_normal((len(stamps), 15))
+    error[:, 0] += slope * stamps / 86_400.0
+    nees = [
+        np.sum((error[:, part] / SIGMA[part]) ** 2, axis=1) for part in (slice(6), slice(9, 15))
+    ]
+    share = PIECES / PIECES[-1]
+    pace = np.column_stack(
+        [
+            PIECES,
+            2e-3 * (1.0 + slower * share),
+            np.ones_like(PIECES),
+            200.0 + growth * share,
+            np.ones_like(PIECES),
+        ]
+    )
+    series = ErrorSeries(
+        stamps,
+        np.ones(len(stamps), bool),
+        error,
+        np.tile(SIGMA, (len(stamps), 1)),
+        nees[0],
+        nees[1],
+    )
+    task = WorldTask(world, "ekf", 24.0, 0)
+    return WorldRun(task, series, pace, 10.0, losses or {})
+
+
+def verdicts(**changes):
+    _, findings = judged("ekf", [a_run(world, **changes) for world in range(8)])
+    return {f.name.removeprefix("ekf_"): f.verdict for f in findings}
+
+
+def test_an_estimator_that_stands_passes():
+    assert set(verdicts().values()) == {"pass"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "failing"),
+    [
+        ({"slope": np.deg2rad(3.0)}, "attitude_drift"),
+        ({"growth": 100.0}, "memory"),
+        ({"slower": 2.0}, "latency"),
+        ({"sigma_error": 2.0}, "pose_consistency"),
+        ({"sigma_error": 2.0}, "bias_consistency"),
+        ({"losses": {"lost and found again": 1}}, "lost"),
+    ],
+)
+def test_each_fault_fails_its_own_verdict(changes, failing):
+    assert verdicts(**changes)[failing] == "fail"
+
+
+def test_the_figures_tell_the_slope():
+    runs = [a_run(world, slope=np.deg2rad(3.0)) for world in range(8)]
+    slope = drift_of(QUANTITIES[1], runs)
+    assert abs(slope.per_day - 3.0) < 5.0 * slope.standard_error + 0.1
+    figures, findings = judged("ekf", runs)
+    assert figures["ekf_attitude_slope_deg_per_day"] == slope.per_day
+    told = next(f.sentence for f in findings if f.name == "ekf_attitude_drift")
+    assert "drifts" in told
+    assert "limit 0.05" in told
+
+
+def test_the_worst_verdict_is_the_whole():
+    assert overall(["pass", "undecided", "pass"]) == "undecided"
+    assert overall(["undecided", "fail"]) == "fail"
+    assert overall(["pass"]) == "pass"
+
+
+@pytest.fixture(scope="module")
+def short_run():
+    return run_world(WorldTask(0, "ekf", SHORT, 1))
+
+
+def test_a_short_run_navigates_within_its_sigmas(short_run):
+    errors = short_run.errors
+    measured = errors.rows(errors.measured & (errors.time > 60.0))
+    assert len(measured) > 150
+    assert np.median(measured.size(slice(3, 6))) < 0.02
+    assert 0.2 < np.median(measured.pose_nees) / 6.0 < 3.0
+    assert "lost and found again" not in short_run.losses
+
+
+def test_both_estimators_see_the_same_world():
+    light, window = (drift_world.draw_task(WorldTask(0, e, 1.0, 1)) for e in ("ekf", "smoother"))
+    assert np.array_equal(light.phase, window.phase)
+    a, b = (w.stretch(0, 1, w.start()) for w in (light, window))
+    assert np.array_equal(a.imu.accel_body, b.imu.accel_body)
+    assert np.array_equal(a.fields.phasor_sensor, b.fields.phasor_sensor)
+
+
+@pytest.fixture(scope="module", params=["ekf", pytest.param("smoother", marks=pytest.mark.slow)])
+def resumed(request, tmp_path_factory):
+    """Return a run that was never interrupted, and one that was, after its first stretch."""
+    place = tmp_path_factory.mktemp("unfinished")
+    task = WorldTask(0, request.param, SHORT, 1)
+    whole = run_world(task)
+    usual, calls = drift_world.navigate, []
+
+    def interrupted(*given):
+        calls.append(given)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return usual(*given)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drift_world, "navigate", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run_world(replace(task, place=str(place)))
+    assert drift_world.stretches_done(place) == 1
+    again = run_world(replace(task, place=str(place)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drift_world, "navigate", None)
+        once_more = run_world(replace(task, place=str(place)))
+    return whole, again, once_more
+
+
+def test_a_run_that_was_interrupted_ends_with_the_same_figures(resumed):
+    whole, again, _ = resumed
+    for field in fields(ErrorSeries):
+        assert np.array_equal(getattr(whole.errors, field.name), getattr(again.errors, field.name))
+    assert whole.losses == again.losses
+    for column in (0, 2, 4):  # not processor time, not memory
+        assert np.array_equal(whole.pace[:, column], again.pace[:, column], equal_nan=True)
+
+
+def test_a_finished_run_is_not_run_again(resumed):
+    _, again, once_more = resumed
+    assert np.array_equal(again.errors.error, once_more.errors.error)
+    assert again.losses == once_more.losses
+
+
+def unfinished(output, settings):
+    """Leave the directory of a run that was interrupted at once."""
+    place = output / "unfinished"
+    place.mkdir(parents=True)
+    (place / "settings.json").write_text(json.dumps(settings.key))
+    return place
+
+
+def test_the_command_writes_report_picture_and_recording(tmp_path, capsys):
+    output = tmp_path / "drift"
+    unfinished(output, DriftSettings(seed=5))  # of another run: begun anew without --resume
+    arguments = ["drift", "--hours", "0.1", "--estimator", "ekf", "--workers", "1"]
+    with pytest.raises(SystemExit) as stopped:
+        main([*arguments, "--json", "-o", str(output)])
+    assert not stopped.value.code
+    assert {p.name for p in output.iterdir()} == {"report.json", "drift.png", "run.rrd"}
+    report = json.loads((output / "report.json").read_text())
+    assert report == json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert report["job"] == "drift"
+    assert report["verdict"] in ("pass", "fail", "undecided")
+    assert report["ekf_bare_loops"] > 0.5
+    assert any("95 %" in note for note in report["notes"])
+    assert not any(key.startswith("smoother") for key in report)
+
+
+def test_what_is_in_the_way_is_refused(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="holds other files"):
+        run_drift(DriftSettings(hours=0.1), tmp_path)
+
+
+def test_runs_of_other_settings_are_not_gone_on_with(tmp_path):
+    settings = DriftSettings(hours=0.1, seed=1, resume=True)
+    unfinished(tmp_path, replace(settings, seed=2))
+    with pytest.raises(InputError, match="other settings"):
+        run_drift(settings, tmp_path)
+
+
+def test_what_is_no_checkpoint_is_refused(tmp_path):
+    settings = DriftSettings(hours=0.1, estimators=("ekf",), workers=1, resume=True)
+    left = unfinished(tmp_path, settings) / "world_0_ekf"
+    left.mkdir()
+    (left / "progress.pickle").write_bytes(b"not a pickle")
+    with pytest.raises(InputError, match="without --resume"):
+        run_drift(settings, tmp_path)
+
+
+def test_progress_is_told_while_the_runs_write(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(drift, "LOOK", 0.01)
+
+    def run_many(_task, tasks, **_others):
+        for number in range(2):
+            tasks[0].own_place.mkdir(exist_ok=True)
+            (tasks[0].own_place / f"rows_{number:04d}.npz").touch()
+            time.sleep(0.2)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(drift, "run_many", run_many)
+    settings = DriftSettings(hours=1.0, worlds=2)
+    with pytest.raises(KeyboardInterrupt):
+        run_drift(settings, tmp_path / "drift", lambda *given: told.append(given))
+    assert {given[2] for given in told} == {4 * 6}
+    assert {1, 2} <= {given[1] for given in told}
+    assert (tmp_path / "drift" / "unfinished" / "settings.json").is_file()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"hours": 0.01}, {"hours": float("nan")}, {"worlds": 0}, {"seed": -1}, {"clock_ppm": 1e3}],
+)
+def test_settings_that_cannot_be_are_refused(changes, tmp_path):
+    with pytest.raises(InputError, match="--"):
+        run_drift(replace(DriftSettings(), **changes), tmp_path / "drift")
+    assert not (tmp_path / "drift").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("estimator", ["ekf", "smoother"])
+def test_hours_leave_memory_and_time_of_an_update_as_they_were(estimator):
+    run = run_world(WorldTask(0, estimator, 3.0, 1))
+    figures, findings = judged(estimator, [run])
+    told = {f.name.removeprefix(f"{estimator}_"): f.verdict for f in findings}
+    assert told["memory"] == told["latency"] == told["lost"] == "pass"
+    assert figures[f"{estimator}_memory_growth_mib"] < 5.0
+
+
+@pytest.mark.slow
+def test_a_clock_that_is_believed_turns_the_attitude(tmp_path):
+    """The test can fail: a hundredth of a ppm, taken for none, is a drift of degrees a day."""
+    settings = DriftSettings(hours=4.0, estimators=("ekf",), phase_known=True, clock_ppm=0.01)
+    trapped = run_world(settings.tasks(tmp_path)[0])
+    figures = summarise(settings, [trapped])
+    assert figures["ekf_attitude_drift_verdict"] == "fail"
+    assert figures["verdict"] == "fail"
+    slope = figures["ekf_attitude_slope_deg_per_day"]
+    assert isinstance(slope, float)
+    assert 3.0 < slope < 12.0
