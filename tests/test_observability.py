@@ -7,14 +7,9 @@ import pytest
 from example_site import mixed_site
 from scipy.spatial.transform import Rotation
 
+from magfusion.evaluation.gauge import Gauge, gauges
 from magfusion.evaluation.motion_coverage import missing_motion, motion_coverage
-from magfusion.evaluation.observability import (
-    Gauge,
-    Observability,
-    gauge_basis,
-    gauges,
-    observability,
-)
+from magfusion.evaluation.observability import Observability, gauge_basis, observability
 from magfusion.evaluation.transfer import Estimated, agreement
 from magfusion.parameters import (
     Block,
