@@ -238,7 +238,8 @@ def _drifts(heard: Heard) -> Array:
         return np.zeros(1)
     turns = 2.0 * np.pi * float(np.max(heard.beacon.tone_frequencies_hz))
     swept = turns * float(np.ptp(heard.poses.time)) * 2.0 * DRIFT_SEARCH
-    return np.linspace(-DRIFT_SEARCH, DRIFT_SEARCH, int(np.ceil(swept)) | 1)
+    count = int(np.ceil(swept)) | 1
+    return np.linspace(-DRIFT_SEARCH, DRIFT_SEARCH, count) if count > 1 else np.zeros(1)
 
 
 def _undrifted(heard: Heard, elapsed: Array, phasor: ComplexArray, drift: float) -> ComplexArray:
