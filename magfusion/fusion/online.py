@@ -36,6 +36,7 @@ WIDE_POSITION, WIDE_ROTATION = 0.3, 0.2  # m, rad; beyond, the prediction is no 
 LOST_EPOCHS = 5  # in a row, most of whose channels were refused: the state is wrong, not they
 REST_SIGMA = 0.01  # m/s
 REST_SPAN = 1.0  # s
+REST_GATE = 30.7  # chi square of three components, one in a million: days have many rests
 RATE_SPAN = 0.08  # s; motion is slower, noise is not
 LONGEST_WAIT = 5.0  # s; the fields go on without an IMU that is silent for longer
 LOST_POSITION = 10.0  # m; a prediction wider than this is worth nothing
@@ -481,7 +482,7 @@ class Navigator:
             return False
         spread = state.cov[6:9, 6:9] + REST_SIGMA**2 * np.eye(3)
         velocity = state.velocity_world
-        return bool(velocity @ np.linalg.solve(spread, velocity) < 12.0)
+        return bool(velocity @ np.linalg.solve(spread, velocity) < REST_GATE)
 
     # Being lost, and found again
 
