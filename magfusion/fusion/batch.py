@@ -9,7 +9,7 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.fixes.fix import Fixes
 from magfusion.fusion.beginning import begin, with_rest_bias
-from magfusion.fusion.earth import check_earth, earth_cov, heard, hold, only, with_earth
+from magfusion.fusion.earth import EARTH_LOSS, check_earth, earth_cov, heard, hold, only, with_earth
 from magfusion.fusion.factors import FieldFactors, FieldMeasurements, read_poses
 from magfusion.fusion.inertial import cut_at_epochs, low_passed, preintegrate
 from magfusion.fusion.loose import survey_cov
@@ -324,11 +324,11 @@ def _problem(
     )
     if job.steady is not None:
         steady, step = job.steady if wave is None else wave.steady, _step(samples)
-        cov = earth_cov(calibration.site, steady, step)
-        measurements = with_earth(measurements, steady, cov)
+        cov = earth_cov(calibration.site, steady)
+        measurements = with_earth(measurements, steady, cov, step)
         hold(graph, states, np.asarray(samples.valid.any(axis=1)), step)
     blocks = choose_blocks(job.declared.site, job.settings.estimate, earth=job.settings.earth)
-    fields = FieldFactors(measurements, blocks, job.settings.loss, "cauchy")
+    fields = FieldFactors(measurements, blocks, job.settings.loss, EARTH_LOSS)
     return Problem(graph, fields, job.declared, len(samples)), bridged
 
 

@@ -4,8 +4,9 @@ Indoors the field's direction is disturbed, by iron that no model knows.  Three 
 from the attitude.  The disturbance lasts as long as the platform is near the iron, so that all of
 `AMBIENT_TIME` counts as one measurement of `AMBIENT_SHARE`.  Where the field's size is not what is
 declared, its direction is not either: what it deviates by is added to the covariance.  And what the
-motion contradicts has little say: a Cauchy loss in the graph, in the online estimators the same
-weight at the prediction.
+motion contradicts has no say: a loss that lets go (Geman and McClure), since a pull that falls only
+with the distance (Cauchy) bends the heading by a degree where the field is turned by fifteen; in
+the online estimators the same weight at the prediction.
 """
 
 from dataclasses import replace
@@ -23,6 +24,7 @@ from magfusion.trajectory import Trajectory
 from magfusion.units import Array, BoolArray
 from magfusion.weights import paired_whitening, whitening
 
+EARTH_LOSS = "geman-mcclure"
 AMBIENT_SHARE = 0.005  # of the field's size: usual disturbance of each component, one sigma
 AMBIENT_TIME = 2.0  # s; over which it stays the same
 DEVIATION_SPAN = 5.0  # s; over which the deviation of the field's size is averaged
@@ -52,24 +54,15 @@ def check_earth(site: Site) -> None:
         )
 
 
-def earth_cov(site: Site, steady: SteadyFields, step: float) -> Array:
-    """Return the covariance of each steady field, shape (n, 3, 3), measured axes (T^2).
-
-    Parameters
-    ----------
-    site : Site
-    steady : SteadyFields
-    step : float
-        Between epochs (s).
-    """
+def earth_cov(site: Site, steady: SteadyFields) -> Array:
+    """Return the covariance of each steady field, shape (n, 3, 3), measured axes (T^2)."""
     assert site.earth_field_world is not None
     sensor = site.platform.magnetometer
     size = float(np.linalg.norm(site.earth_field_world))
     field = (steady.measured_sensor - sensor.offset) @ np.linalg.inv(sensor.matrix).T
     deviation = (np.linalg.norm(field, axis=1) - size) ** 2
     ambient = (AMBIENT_SHARE * size) ** 2 + _moving_mean(steady.time, deviation)
-    repeated = max(1.0, AMBIENT_TIME / step)
-    return np.asarray(steady.cov + (repeated * ambient)[:, None, None] * np.eye(3))
+    return np.asarray(steady.cov + ambient[:, None, None] * np.eye(3))
 
 
 def _moving_mean(time: Array, value: Array) -> Array:
@@ -80,7 +73,7 @@ def _moving_mean(time: Array, value: Array) -> Array:
 
 
 def with_earth(
-    measurements: FieldMeasurements, steady: SteadyFields, cov: Array
+    measurements: FieldMeasurements, steady: SteadyFields, cov: Array, step: float
 ) -> FieldMeasurements:
     """Return measurements with the Earth field as their last row.
 
@@ -92,9 +85,12 @@ def with_earth(
         A row that is NaN is missing.
     cov : ndarray, shape (n, 3, 3)
         (T^2)
+    step : float
+        Between epochs (s).
     """
+    repeats = max(1.0, AMBIENT_TIME / step)
     valid = np.asarray(np.isfinite(steady.measured_sensor).all(axis=1))
-    root = paired_whitening(cov[:, None], valid[:, None])
+    root = paired_whitening(repeats * cov[:, None], valid[:, None])
     root[..., 3:, :] = 0.0
     field = np.nan_to_num(steady.measured_sensor)
     row = np.concatenate([field, np.zeros_like(field)], axis=1)[:, None]
@@ -105,7 +101,7 @@ def with_earth(
         measured=np.concatenate([measurements.measured, row], axis=1),
         root=np.concatenate([measurements.root, root], axis=1),
         by_time_offset=np.concatenate([measurements.by_time_offset, still], axis=1),
-        earth=True,
+        earth_repeats=repeats,
     )
 
 

@@ -22,7 +22,8 @@ from magfusion.parameters import (
 from magfusion.units import Array
 
 CALIBRATION_KEY = gtsam.symbol("c", 0)
-ROBUST_WIDTH = {"huber": 1.345, "cauchy": 2.385}  # 95 % efficient on white noise of one dimension
+# 95 % efficient on white noise of one dimension; the last is for what is no noise at all.
+ROBUST_WIDTH = {"huber": 1.345, "cauchy": 2.385, "geman-mcclure": 2.385}
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +44,9 @@ class FieldMeasurements:
         IMU time offset with which the inertial data were cut (s).
     by_time_offset : ndarray, shape (n, channels, 6)
         What a change of it does to the lock-in, the states held (T/s).
-    earth : bool
-        Whether the Earth field stands behind the last channel, as one more.
+    earth_repeats : float, optional
+        How many epochs in a row count as one measurement of the Earth field, which then stands
+        behind the last channel as one more; None where it is not measured.
     """
 
     time: Array
@@ -53,7 +55,7 @@ class FieldMeasurements:
     rate_body: Array
     applied_offset: float
     by_time_offset: Array
-    earth: bool = False
+    earth_repeats: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,7 @@ def robust_weight(square: Array, loss: str | None, components: int = 6) -> tuple
     Parameters
     ----------
     square : ndarray
-    loss : {None, 'huber', 'cauchy'}
+    loss : {None, 'huber', 'cauchy', 'geman-mcclure'}
     components : int
         Of each residual.
 
@@ -93,6 +95,9 @@ def robust_weight(square: Array, loss: str | None, components: int = 6) -> tuple
     if loss is None:
         return np.ones_like(square), square
     width = ROBUST_WIDTH[loss] ** 2 * components
+    if loss == "geman-mcclure":
+        share = 1.0 / (1.0 + square / width)
+        return share**2, share * square
     if loss == "cauchy":
         return 1.0 / (1.0 + square / width), width * np.log1p(square / width)
     beyond = square > width
@@ -149,7 +154,7 @@ class FieldFactors:
         lag, world_from_body, position_world = self._at_field(poses, calibration)
         phasor = predict_channels(calibration, data.time, world_from_body, position_world)
         value = np.concatenate([phasor.real, phasor.imag], axis=-1)
-        if data.earth:
+        if data.earth_repeats is not None:
             value = np.concatenate([value, predict_earth(calibration, world_from_body)], axis=1)
         value = value + lag * data.by_time_offset
         error = data.root @ (value - data.measured)[..., None]
@@ -203,12 +208,16 @@ class FieldFactors:
         return graph
 
     def _robust(self, square: Array) -> tuple[Array, Array]:
-        """Return weight and loss of every channel, the Earth field by its own loss."""
+        """Return weight and loss of every channel, the Earth field by its own loss.
+
+        An epoch that counts only in part is an outlier no less.
+        """
         weight, rho = robust_weight(square, self.loss)
-        if self.measurements.earth:
-            last = robust_weight(square[:, -1:], self.earth_loss, components=3)
+        repeats = self.measurements.earth_repeats
+        if repeats is not None:
+            last = robust_weight(repeats * square[:, -1:], self.earth_loss, components=3)
             weight = np.concatenate([weight[:, :-1], last[0]], axis=1)
-            rho = np.concatenate([rho[:, :-1], last[1]], axis=1)
+            rho = np.concatenate([rho[:, :-1], last[1] / repeats], axis=1)
         return weight, rho
 
     def _at_field(self, poses: Poses, calibration: Calibration) -> tuple[float, Array, Array]:
@@ -236,7 +245,7 @@ class FieldFactors:
             position_world,
             np.concatenate([data.rate_body, velocity_body], axis=1),
         )
-        if data.earth:
+        if data.earth_repeats is not None:
             last = linearize_earth(calibration, blocks, world_from_body, data.rate_body)
             value, by_pose, by_calibration = (
                 np.concatenate(pair, axis=1)

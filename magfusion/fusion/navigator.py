@@ -213,7 +213,7 @@ class SlidingWindow:
             rate_body=np.zeros((1, 3)),
             applied_offset=self.applied_offset,
             by_time_offset=np.zeros((1, rows, 6)),
-            earth=self.earth,
+            earth_repeats=1.0 if self.earth else None,
         )
 
     def _cov_of_first(self) -> Array:
@@ -319,5 +319,5 @@ def _stacked(parts: list[FieldMeasurements]) -> FieldMeasurements:
         rate_body=np.concatenate([p.rate_body for p in parts]),
         applied_offset=parts[-1].applied_offset,
         by_time_offset=np.concatenate([p.by_time_offset for p in parts]),
-        earth=parts[-1].earth,
+        earth_repeats=parts[-1].earth_repeats,
     )
