@@ -40,9 +40,9 @@ def write_log_calibration_plot(
     labels = [f"{f.name}   {f.prior_sigma:.2g} → {f.sigma:.2g}" for f in told]
     left.set_yticks(rows, labels, fontsize=7)
     left.set(xscale="log", xlabel="sigma over the survey's", ylim=(len(told) - 0.5, -0.5))
-    left.legend(loc="lower left", fontsize=8)
     right.plot(direction_ratio, np.arange(len(direction_ratio)) + 1, ".-", c=_POSTERIOR)
     right.axvline(0.5, c="0.5", lw=0.8)
     right.set(xscale="log", xlabel="sigma over the survey's", ylabel="direction, best first")
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8)
     figure.suptitle("What the log told of the calibration")
     figure.savefig(path, dpi=110, metadata={"Software": None})
