@@ -13,6 +13,8 @@ import numpy as np
 
 from magfusion.errors import EstimationError
 from magfusion.fusion.buffers import Buffer, check_clock
+from magfusion.fusion.earth import check_earth
+from magfusion.fusion.earth_online import EarthWatch
 from magfusion.fusion.ekf import ErrorStateFilter
 from magfusion.fusion.epoch import channel_distances, field_rows, single, without
 from magfusion.fusion.factors import FieldMeasurements
@@ -21,10 +23,10 @@ from magfusion.fusion.outset import Outset, find_outset
 from magfusion.fusion.propagation import Propagated, calibration_walk, propagate
 from magfusion.fusion.receive import OnlineReceiver
 from magfusion.fusion.recovery import AgreedFix, agreed_fix, prior_of
-from magfusion.fusion.state import State
+from magfusion.fusion.state import MOTION, State
 from magfusion.parameters import Block, choose_blocks, dimension, held_blocks
 from magfusion.receiver.windows import LockinSettings
-from magfusion.records.samples import FieldSamples, ImuSamples
+from magfusion.records.samples import FieldSamples, ImuSamples, SteadyFields
 from magfusion.site import Site
 from magfusion.strapdown import resting
 from magfusion.trajectory import Trajectory
@@ -40,6 +42,7 @@ REST_GATE = 30.7  # chi square of three components, one in a million: days have 
 RATE_SPAN = 0.08  # s; motion is slower, noise is not
 LONGEST_WAIT = 5.0  # s; the fields go on without an IMU that is silent for longer
 LOST_POSITION = 10.0  # m; a prediction wider than this is worth nothing
+OFFSET_STALE = 1e-4  # s; at a radian a second, six thousandths of a degree
 SPEED_SIGMA = 1.0  # m/s; of a state that was found again
 
 
@@ -61,6 +64,8 @@ class NavigatorSettings:
     estimate : tuple of str, optional
         Groups of calibration parameters; None takes those that the site leaves open.
     lockin : LockinSettings, optional
+    earth : bool
+        Measure the Earth field too.
     """
 
     estimator: Literal["smoother", "ekf"] = "smoother"
@@ -70,6 +75,7 @@ class NavigatorSettings:
     longest_step: float = 10.0
     estimate: tuple[str, ...] | None = None
     lockin: LockinSettings | None = None
+    earth: bool = False
 
 
 class Navigator:
@@ -79,6 +85,11 @@ class Navigator:
     ----------
     site : Site
     settings : NavigatorSettings, optional
+
+    Raises
+    ------
+    InputError
+        Where the Earth field is to be measured but the site has none.
 
     Attributes
     ----------
@@ -91,8 +102,11 @@ class Navigator:
     def __init__(self, site: Site, settings: NavigatorSettings | None = None) -> None:
         self.site = site
         self.settings = NavigatorSettings() if settings is None else settings
-        estimated = choose_blocks(site, self.settings.estimate)
-        held = held_blocks(site, estimated)
+        earth = self.settings.earth
+        if earth:
+            check_earth(site)
+        estimated = choose_blocks(site, self.settings.estimate, earth=earth)
+        held = held_blocks(site, estimated, earth=earth)
         self._held = dimension(held)
         self.blocks = (*estimated, *(_behind(b, dimension(estimated)) for b in held))
         self.counts: Counter[str] = Counter()
@@ -102,6 +116,8 @@ class Navigator:
         self._imu = Buffer("imu", 6)
         self._waveform = Buffer("magnetometer", 3)
         self._fields: list[FieldSamples] = []
+        self._steady: dict[float, SteadyFields] = {}
+        self._earth = EarthWatch(self.blocks) if earth else None
         self._estimator: SlidingWindow | ErrorStateFilter | None = None
         self._receiver: OnlineReceiver | None = None
         self._applied_offset = site.platform.imu.time_offset
@@ -140,8 +156,8 @@ class Navigator:
         self._waveform.add(stamps, np.atleast_2d(measured_sensor))
         self._advance()
 
-    def add_fields(self, samples: FieldSamples) -> None:
-        """Take demodulated phasors, channels in the site's order.
+    def add_fields(self, samples: FieldSamples, steady: SteadyFields | None = None) -> None:
+        """Take demodulated phasors, channels in the site's order, and the steady fields with them.
 
         Raises
         ------
@@ -155,6 +171,8 @@ class Navigator:
                 self.counts["field too late"] += 1
                 continue
             self._fields.append(one)
+            if steady is not None and self._earth is not None:
+                self._steady[float(one.time[0])] = steady.row(i)
         self._fields.sort(key=lambda s: float(s.time[0]))
         self._advance()
 
@@ -245,6 +263,7 @@ class Navigator:
             reached,
             self.settings.estimate,
             self.settings.lockin,
+            list(self._steady.values()) if self._earth is not None else None,
         )
         if outset is None or (
             outset.ambiguous and self._next_start < 4 * self.settings.start_duration
@@ -288,6 +307,7 @@ class Navigator:
                 self.settings.lag,
                 self._walk,
                 self._applied_offset,
+                earth=self._earth is not None,
                 held=self._held,
             )
         if outset.lockin is not None:
@@ -295,6 +315,7 @@ class Navigator:
                 outset.lockin, outset.rate_hz, state.time + outset.lockin.step
             )
         self._fields = [s for s in self._fields if s.time[0] > state.time]
+        self._steady = {t: s for t, s in self._steady.items() if t > state.time}
         self._last_epoch_time = state.time
         self._made.append(state)
         self._forget(state.time)
@@ -335,6 +356,7 @@ class Navigator:
         assert self._estimator is not None
         if samples.time[0] <= self._estimator.state.time:
             self.counts["field too late"] += 1
+            self._steady.pop(float(samples.time[0]), None)
             return True
         self._absorb(float(samples.time[0]), samples)
         return True
@@ -345,9 +367,10 @@ class Navigator:
         predicted = self._propagated(time)
         if predicted.bridged:
             self.counts["inertial gap bridged"] += 1
-        measurements, samples = self._measured(predicted, samples)
+        step = max(time - self._last_epoch_time, 1e-6)
+        measurements, samples, steady = self._measured(predicted, samples, step)
         about = None
-        if measurements is not None and samples is not None:
+        if measurements is not None and samples is not None and np.any(samples.valid):
             if predicted.state.position_sigma > LOST_POSITION and self._found_again(
                 samples, predicted
             ):
@@ -361,14 +384,24 @@ class Navigator:
             measurements = self._gated(measurements, samples, predicted, about, refused)
             if self._refused_in_a_row >= LOST_EPOCHS and self._found_again(samples, predicted):
                 return
-        self._take_in(predicted, measurements, about)
+        slow = None
+        if measurements is not None and self._earth is not None and steady is not None:
+            known = predicted.state if about is None else replace(about, cov=predicted.state.cov)
+            measurements, disturbed = self._earth.weighed(measurements, steady, known, step)
+            self.counts["Earth field disturbed"] += disturbed
+            slow = self._earth.speed_sigma(measurements, step)
+        self._take_in(predicted, measurements, about, slow)
 
     def _take_in(
-        self, predicted: Propagated, measurements: FieldMeasurements | None, about: State | None
+        self,
+        predicted: Propagated,
+        measurements: FieldMeasurements | None,
+        about: State | None,
+        slow: float | None,
     ) -> None:
         assert self._estimator is not None
         factors = None if measurements is None else single(measurements, self.blocks)
-        rest = REST_SIGMA if self._rests(predicted.state) else None
+        rest = REST_SIGMA if self._rests(predicted.state) else slow
         try:
             self._estimator.absorb(predicted, factors, rest, about)
         except EstimationError:
@@ -380,7 +413,28 @@ class Navigator:
     def _finish(self) -> None:
         assert self._estimator is not None
         self._made.append(self._estimator.state)
+        self._apply_offset_anew()
         self._forget(self._estimator.state.time)
+
+    def _apply_offset_anew(self) -> None:
+        """Cut the inertial stream by the time offset that has been learnt since.
+
+        A state is the platform's where the IMU's stamp says; under another offset it is the same
+        state, a little earlier or later on the log's clock.
+        """
+        assert self._estimator is not None
+        state = self._estimator.state
+        own = [MOTION + b.columns.start for b in self.blocks if b.kind == "time_offset"]
+        if not own:
+            return
+        lag = state.calibration.time_offset - self._applied_offset
+        if abs(lag) < max(OFFSET_STALE, 2.0 * float(np.sqrt(state.cov[own[0], own[0]]))):
+            return
+        self._applied_offset += lag
+        if isinstance(self._estimator, SlidingWindow):
+            self._estimator.applied_offset = self._applied_offset
+        self._estimator.replace_state(replace(state, time=state.time + lag))
+        self.counts["time offset applied anew"] += 1
 
     def _propagated(self, time: float) -> Propagated:
         assert self._estimator is not None
@@ -401,14 +455,14 @@ class Navigator:
     # Measurements
 
     def _measured(
-        self, predicted: Propagated, samples: FieldSamples | None
-    ) -> tuple[FieldMeasurements | None, FieldSamples | None]:
+        self, predicted: Propagated, samples: FieldSamples | None, step: float
+    ) -> tuple[FieldMeasurements | None, FieldSamples | None, SteadyFields | None]:
         state = predicted.state
-        wave = None
+        wave, steady = None, self._steady.pop(predicted.state.time, None)
         if samples is None:
             receiver = self._receiver
             if receiver is None or receiver.next_centre != state.time:
-                return None, None  # only the clock went on
+                return None, None, None  # only the clock went on
             assert self._estimator is not None
             half = receiver.settings.window / 2.0
             before = self._estimator.state
@@ -416,13 +470,14 @@ class Navigator:
                 min(before.time, state.time - half) - 0.1, state.time + half + 0.1
             )
             wave = receiver.demodulate(self._waveform, imu, before, state, self._applied_offset)
-            samples = wave.fields
-        if not np.any(samples.valid):
-            return None, None
+            samples, steady = wave.fields, wave.steady
+        if self._earth is not None:
+            samples = self._earth.heard(samples, step)
+        if not np.any(samples.valid) and (self._earth is None or steady is None):
+            return None, None, None
         pose = Trajectory(samples.time, state.world_from_body[None], state.position_world[None])
         calibrated = state.calibration.site
         cov = measurement_cov(calibrated, samples, sensor_world=sensor_positions(calibrated, pose))
-        step = max(state.time - self._last_epoch_time, 1e-6)
         self._last_epoch_time = state.time
         # Overlapping windows hold the same samples: that must not count twice.
         cov = cov * max(1.0, float(samples.window[0]) / step)
@@ -435,7 +490,7 @@ class Navigator:
             applied_offset=self._applied_offset,
             by_time_offset=np.zeros(shape) if wave is None else stacked(wave.by_time_offset),
         )
-        return measurements, samples
+        return measurements, samples, steady
 
     def _rate(self, time: float) -> Array:
         stamp = time - self._applied_offset
