@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -61,7 +62,7 @@ def test_a_users_loop(raw: SimulatedLog, estimator: Estimator) -> None:
     assert field is not None
     navigator = Navigator(surveyed_site(), NavigatorSettings(estimator=estimator))
     edges = np.arange(0.0, 14.1, 0.1)
-    for begin, end in zip(edges[:-1], edges[1:], strict=True):
+    for begin, end in pairwise(edges):
         i = (imu.time >= begin) & (imu.time < end)
         m = (field.time >= begin) & (field.time < end)
         navigator.add_imu(imu.time[i], imu.gyro_body[i], imu.accel_body[i])

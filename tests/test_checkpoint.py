@@ -1,0 +1,234 @@
+"""A navigation that is killed goes on from its checkpoint and ends with the same figures."""
+
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import Refuse, Worked, run_command
+from online_log import WINDOW, OnlineLog, epoch, navigate, online_log
+from test_navigate_stream import EKF, answered, records
+
+from magfusion.errors import InputError
+from magfusion.fusion.online import NavigatorSettings, restored
+from magfusion.fusion.state import State
+from magfusion.jobs.checkpoint import (
+    Checkpoint,
+    RowFile,
+    read_checkpoint,
+    write_checkpoint,
+)
+from magfusion.jobs.stream import StreamSettings
+from magfusion.records.log import write_log
+from magfusion.records.samples import Log
+from magfusion.site_file import save_site
+
+SCRIPT = Path(sys.executable).parent / "magfusion"
+TIMING = {"elapsed_s", "memory_mb", "update_p50_ms", "update_p99_ms", "update_max_ms"}
+RESULTS = ("trajectory.tum", "trajectory.parquet", "lagged.parquet", "site.yaml")
+
+
+def same(one: State, other: State) -> bool:
+    names = ("position_world", "world_from_body", "velocity_world", "gyro_bias_body", "cov")
+    return one.time == other.time and all(
+        np.array_equal(getattr(one, name), getattr(other, name)) for name in names
+    )
+
+
+@pytest.mark.parametrize("estimator", ["smoother", "ekf"])
+def test_a_restored_navigator_goes_on_to_the_last_bit(estimator: str) -> None:
+    """What GTSAM preintegrated is in the checkpoint, with all its digits."""
+    log, twins = online_log(8, 22.0), {}
+
+    def watch(navigator, now: float) -> None:  # type: ignore[no-untyped-def]
+        if now in (4.0, 10.0, 13.25):  # before the start, and in a full window
+            twins[now] = restored(navigator.checkpoint())
+
+    settings = NavigatorSettings(estimator, delay=0.1)  # type: ignore[arg-type]
+    navigator, states = navigate(log, settings, watch=watch)
+    for begin, twin in twins.items():
+        again = _rest(log, twin, begin)
+        expected = states[len(states) - len(again) :]
+        assert len(again) > 15
+        assert all(same(a, b) for a, b in zip(again, expected, strict=True))
+        assert twin.losses == navigator.losses
+
+
+def _rest(log: OnlineLog, navigator, begin: float) -> list[State]:  # type: ignore[no-untyped-def]
+    states: list[State] = []
+    arrival = log.fields.time + WINDOW / 2.0
+    edges = np.arange(0.0, log.imu.time[-1] + 0.25, 0.25)
+    for lo, hi in pairwise(edges):
+        if lo < begin:
+            continue
+        own = slice(*np.searchsorted(log.imu.time, [lo, hi]))
+        navigator.add_imu(log.imu.time[own], log.imu.gyro_body[own], log.imu.accel_body[own])
+        for k in range(*np.searchsorted(arrival, [lo, hi])):
+            navigator.add_fields(epoch(log.fields, k))
+        states += navigator.take()
+    return states
+
+
+@pytest.fixture(scope="module")
+def phasors(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a log that takes some seconds to navigate."""
+    path = tmp_path_factory.mktemp("phasors") / "log"
+    made = online_log(3, 120.0)
+    truth = made.motion.trajectory(made.imu.time)
+    epoch_ns = 1_700_000_000_000_000_000
+    write_log(Log("phasors", epoch_ns, "test", made.imu, None, made.fields, truth), path)
+    save_site(made.site, path / "site.yaml")
+    return path
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(phasors: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("uninterrupted") / "run"
+    run_command("navigate", phasors, "-o", output)
+    return output
+
+
+def _figures(output: Path) -> dict[str, object]:
+    figures = json.loads((output / "report.json").read_text())
+    return {key: value for key, value in figures.items() if key not in TIMING}
+
+
+def _killed(log: Path, output: Path, *options: str, kill_after: float | None) -> bool:
+    """Run the command; tell whether it was killed, so long (s) after its first checkpoint."""
+    command = [SCRIPT, "navigate", log, "-o", output, "--every", "2", *options]
+    threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    quiet = {"stdout": subprocess.DEVNULL, "env": os.environ | threads}
+    with subprocess.Popen(command, **quiet) as running:  # type: ignore[call-overload]
+        place = output / "checkpoint.bin"
+        former = place.stat().st_mtime_ns if place.is_file() else 0
+        while kill_after is not None and running.poll() is None:
+            if place.is_file() and place.stat().st_mtime_ns > former:
+                time.sleep(kill_after)
+                running.send_signal(signal.SIGKILL)
+                break
+            time.sleep(0.005)
+    assert running.returncode in (0, -signal.SIGKILL)
+    return running.returncode != 0
+
+
+def _ends_alike(log: Path, uninterrupted: Path, output: Path, moments: list[float]) -> int:
+    """Kill a run at these moments, each after the one before; return how often it was killed."""
+    kills, options = 0, []
+    for moment in [*moments, None]:
+        killed = _killed(log, output, *options, kill_after=moment)
+        kills, options = kills + killed, ["--resume"]
+        if not killed:
+            break
+    assert {p.name for p in output.iterdir()} == {p.name for p in uninterrupted.iterdir()}
+    for name in RESULTS:
+        assert (output / name).read_bytes() == (uninterrupted / name).read_bytes(), name
+    assert _figures(output) == _figures(uninterrupted)
+    return kills
+
+
+def test_a_run_killed_twice_ends_as_if_it_had_not_been(
+    phasors: Path, uninterrupted: Path, tmp_path: Path
+) -> None:
+    moments = np.random.default_rng(1).uniform(0.05, 0.6, 2).tolist()
+    assert _ends_alike(phasors, uninterrupted, tmp_path / "run", moments) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10))
+def test_a_run_killed_at_any_moment_ends_as_if_it_had_not_been(
+    phasors: Path, uninterrupted: Path, tmp_path: Path, seed: int
+) -> None:
+    moment = float(np.random.default_rng(100 + seed).uniform(0.0, 2.5))
+    _ends_alike(phasors, uninterrupted, tmp_path / "run", [moment])
+
+
+def test_killed_before_the_first_checkpoint_it_begins_again(
+    phasors: Path, uninterrupted: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "run"
+    output.mkdir()
+    (output / "checkpoint.rows").write_bytes(b"\0" * 1000)  # a row file that was begun
+    run_command("navigate", phasors, "-o", output, "--resume")
+    assert (output / "trajectory.tum").read_bytes() == (
+        uninterrupted / "trajectory.tum"
+    ).read_bytes()
+
+
+def test_the_checkpoint_may_lie_elsewhere_and_goes_when_all_is_done(
+    worked: Worked, tmp_path: Path
+) -> None:
+    place = tmp_path / "kept" / "navigator"
+    run_command("navigate", worked.log, "-o", tmp_path / "run", "--checkpoint", place)
+    assert not place.parent.exists()
+
+
+def test_the_checkpoint_of_another_run_is_refused(
+    refuse: Refuse, worked: Worked, tmp_path: Path
+) -> None:
+    write_checkpoint(Checkpoint("another", 5, 0, b""), tmp_path / "checkpoint.bin")
+    command = ("navigate", worked.log, "-o", tmp_path / "run", "--resume", "--checkpoint")
+    told = refuse(*command, tmp_path / "checkpoint.bin")
+    assert "is the checkpoint of another log, site or setting" in told
+    (tmp_path / "checkpoint.bin").write_bytes(b"nonsense")
+    assert "is no checkpoint" in refuse(*command, tmp_path / "checkpoint.bin")
+
+
+def test_rows_made_after_the_checkpoint_are_forgotten(tmp_path: Path) -> None:
+    file = RowFile(tmp_path / "rows", 3)
+    for k in range(4):
+        file.append(np.full(3, float(k)))
+    assert file.settle() == 4
+    file.append(np.full(3, 9.0))
+    file.close()
+    again = RowFile(tmp_path / "rows", 3, rows=4)
+    again.append(np.full(3, 4.0))
+    assert again.rows()[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    again.close()
+    with pytest.raises(InputError, match="shorter than its checkpoint says"):
+        RowFile(tmp_path / "rows", 3, rows=7)
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_former(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "checkpoint.bin"
+    write_checkpoint(Checkpoint("key", 1, 2, b"first"), path)
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("magfusion.jobs.checkpoint.os.fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_checkpoint(Checkpoint("key", 2, 4, b"second"), path)
+    found = read_checkpoint(path, "key")
+    assert found is not None
+    assert found.navigator == b"first"
+    assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.bin"]
+
+
+def test_a_stream_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
+    walk, site, place = online_log(3, 14.0), tmp_path / "site.yaml", tmp_path / "checkpoint"
+    save_site(walk.site, site)
+    lines = records(walk).splitlines(keepends=True)
+    whole, _ = answered(site, b"".join(lines))
+    settings = StreamSettings(EKF.navigator, checkpoint=place, every=1.0)
+    answered(site, b"".join(lines[:230]), settings)
+    found = read_checkpoint(place, _key_of(place))
+    assert found is not None
+    assert 200 < found.position <= 230
+    resumed = StreamSettings(EKF.navigator, checkpoint=place, every=1.0, resume=True)
+    later, _ = answered(site, b"".join(lines[found.position :]), resumed)
+    assert later[-1] == whole[-1]
+    assert later == whole[len(whole) - len(later) :]
+
+
+def _key_of(place: Path) -> str:
+    key: str = pickle.loads(place.read_bytes()).key
+    return key

@@ -1,0 +1,239 @@
+"""Navigation in a pipe: the records, the states, and what is no record."""
+
+import io
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from conftest import run_command
+from online_log import OnlineLog, online_log
+
+from magfusion.errors import InputError
+from magfusion.fusion.online import Navigator, NavigatorSettings
+from magfusion.jobs.replay import Replay, feed
+from magfusion.jobs.stream import StreamSettings, run_replay, run_stream, state_content
+from magfusion.records.log import write_log
+from magfusion.records.samples import FieldSamples, Log
+from magfusion.records.stream_record import (
+    FieldsRecord,
+    Format,
+    field_samples,
+    fields_content,
+    json_line,
+    read_records,
+)
+from magfusion.site_file import save_site
+
+SCRIPT = Path(sys.executable).parent / "magfusion"
+EKF = StreamSettings(NavigatorSettings("ekf"))
+
+
+@pytest.fixture(scope="module")
+def walk() -> OnlineLog:
+    return online_log(3, 14.0)
+
+
+@pytest.fixture(scope="module")
+def site(walk: OnlineLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("site") / "site.yaml"
+    save_site(walk.site, path)
+    return path
+
+
+def as_log(walk: OnlineLog) -> Log:
+    return Log("walk", 0, "test", walk.imu, None, walk.fields)
+
+
+def records(walk: OnlineLog, form: Format = "json") -> bytes:
+    sink = io.BytesIO()
+    run_replay(as_log(walk), sink, form, realtime=False)
+    return sink.getvalue()
+
+
+def answered(site: Path, given: bytes, settings: StreamSettings = EKF) -> tuple[list[Any], str]:
+    sink, told = io.BytesIO(), io.StringIO()
+    run_stream(site, settings, io.BytesIO(given), sink, told)
+    return [json.loads(line) for line in sink.getvalue().splitlines()], told.getvalue()
+
+
+@pytest.mark.parametrize("form", ["json", "msgpack"])
+def test_a_stream_leads_to_the_states_of_the_log(walk: OnlineLog, site: Path, form: Format) -> None:
+    navigator, expected = Navigator(walk.site, EKF.navigator), []
+    replayed = Replay(as_log(walk))
+    for k in range(len(replayed)):
+        feed(navigator, replayed.piece(k))
+        expected += [state_content(navigator, state) for state in navigator.take()]
+    given, _ = answered(site, records(walk, form), StreamSettings(EKF.navigator, form))
+    states = [s for s in given if s["started"]]
+    assert len(states) >= 14
+    # The site went through its file, whose angles are in degrees.
+    for found, own in zip(states, expected, strict=True):
+        assert found["time"] == own["time"]
+        for name in ("position", "quaternion", "velocity", "gyro_bias", "accel_bias"):
+            assert np.allclose(found[name], own[name], rtol=1e-6, atol=1e-8)
+    waiting = [s["time"] for s in given if not s["started"]]
+    assert np.all(np.diff(waiting) >= 1.0)
+    assert 5 <= len(waiting) <= 8
+
+
+def test_a_state_tells_all_that_is_known(walk: OnlineLog, site: Path) -> None:
+    last = answered(site, records(walk))[0][-1]
+    truth = walk.motion.trajectory(np.array([last["time"]]))
+    assert np.linalg.norm(last["position"] - truth.position_world[0]) < 0.005  # m
+    w, x, y, z = last["quaternion"]
+    forward = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+    assert np.allclose(forward, truth.world_from_body[0][:, 0], rtol=0.0, atol=0.003)
+    assert set(last["sigma"]) == {
+        "position",
+        "rotation_body",
+        "velocity",
+        "gyro_bias",
+        "accel_bias",
+    }
+    assert all(0.0 < s < 0.01 for s in last["sigma"]["position"])
+    assert set(last["distortion"]) == {"A", "B", "C", "D"}
+    assert last["ambiguous"] is False
+
+
+def test_phasors_are_the_same_on_the_other_side_of_the_pipe(walk: OnlineLog) -> None:
+    fields = walk.fields
+    phasor = fields.phasor_sensor[:1].copy()
+    phasor[0, 2] = np.nan
+    cov = fields.phasor_cov[:1] * np.array([1.0, 2.0, 3.0])
+    one = FieldSamples(fields.time[:1], fields.window[:1], fields.channels, phasor, cov)
+    line = json_line(fields_content(one))
+    (found,) = read_records(io.BytesIO(line), "json")
+    assert found.record is not None
+    assert found.record.fields is not None
+    back = field_samples(found.record.fields, fields.channels)
+    assert np.array_equal(back.phasor_sensor, phasor, equal_nan=True)
+    heard = [0, 1, 3]
+    assert np.array_equal(back.phasor_cov[:, heard], cov[:, heard])
+
+
+def test_a_sigma_is_that_of_every_component() -> None:
+    entry = FieldsRecord.model_validate(
+        {
+            "time": 1.0,
+            "window": 0.4,
+            "sigma": 2e-9,
+            "phasors": {"B": [None, [[1e-7, 0, 0], [0, 0, 3e-7]]]},
+        }
+    )
+    samples = field_samples(entry, (("A", 0), ("B", 0), ("B", 1)))
+    assert samples.valid.tolist() == [[False, False, True]]
+    assert np.array_equal(samples.phasor_sensor[0, 2], [1e-7, 0, 3e-7j])
+    assert np.allclose(samples.phasor_cov[0, 2], 4e-18 * np.eye(3), rtol=1e-12, atol=0.0)
+
+
+VECTOR = [1.0, 2.0, 3.0]
+FIELDS = {"time": 1.0, "window": 0.4, "sigma": 1e-9, "phasors": {"A": [[VECTOR, VECTOR]]}}
+
+
+@pytest.mark.parametrize(
+    ("record", "sentence"),
+    [
+        (b"{", "Invalid JSON"),
+        (b"[]", "write a mapping with the keys imu, magnetometer, fields"),
+        (b"{}", "it should hold imu, magnetometer or fields"),
+        ({"gyro": 1}, "gyro: is not a known key; remove it or write one of imu, magnetometer"),
+        ({"imu": {"time": 1.0, "gyro": VECTOR}}, "imu.accel: is missing; add it"),
+        ({"imu": {"time": "1", "gyro": VECTOR, "accel": VECTOR}}, "imu.time: found '1'; it should"),
+        ({"imu": {"time": True, "gyro": VECTOR, "accel": VECTOR}}, "imu.time: found True; it sho"),
+        ({"imu": {"time": 1, "gyro": [1, 2], "accel": VECTOR}}, "imu.gyro: found [1, 2]; it shoul"),
+        ({"imu": {"time": [1, 2], "gyro": VECTOR, "accel": VECTOR}}, "gyro has 1 rows for 2 times"),
+        (b'{"magnetometer": {"time": 1, "field": [1, 2, NaN]}}', "magnetometer.field: found [1, 2"),
+        (b'{"magnetometer": {"time": 1e999, "field": [1, 2, 3]}}', "magnetometer.time: found inf"),
+        ({"fields": {**FIELDS, "window": 0.0}}, "fields.window: found 0.0; "),
+        ({"fields": {**FIELDS, "sigma": None}}, "it should have either sigma or covariance"),
+        ({"fields": {**FIELDS, "sigma": -1.0}}, "fields.sigma: found -1.0"),
+        ({"fields": {**FIELDS, "phasors": {"A": VECTOR}}}, "fields.phasors.A: found [1.0, 2.0, 3."),
+        (
+            {"fields": {**FIELDS, "phasors": {"Q": [[VECTOR, VECTOR]]}}},
+            "holds beacon Q tone 0; the",
+        ),
+    ],
+)
+def test_a_bad_line_is_refused_in_one_sentence(
+    site: Path, record: bytes | dict[str, Any], sentence: str
+) -> None:
+    line = record if isinstance(record, bytes) else json.dumps(record).encode()
+    good = json_line({"magnetometer": {"time": 0.0, "field": VECTOR}})
+    with pytest.raises(InputError) as raised:
+        answered(site, good + b"\n" + line + b"\n")
+    told = str(raised.value)
+    assert told.startswith("standard input, line 3: ")
+    assert sentence in told
+    assert "\n" not in told
+
+
+def test_bad_lines_are_counted_and_passed_over_where_that_is_asked(
+    walk: OnlineLog, site: Path
+) -> None:
+    lines = records(walk).splitlines(keepends=True)
+    clean, _ = answered(site, b"".join(lines))
+    jumped = json_line({"imu": {"time": 1e6, "gyro": VECTOR, "accel": VECTOR}})
+    dirty = [*lines[:50], b"nonsense\n", *lines[50:200], jumped, *lines[200:]]
+    going = StreamSettings(EKF.navigator, keep_going=True)
+    found, told = answered(site, b"".join(dirty), going)
+    assert found == clean
+    assert "line 51: found" in told
+    assert "line 202: imu: its clock jumped ahead" in told
+    assert told.splitlines()[-1] == "magfusion: 2 records were passed over"
+
+
+def test_message_pack_that_breaks_off_inside_is_refused(site: Path) -> None:
+    good = msgpack.packb({"magnetometer": {"time": 0.0, "field": VECTOR}})
+    settings = StreamSettings(EKF.navigator, "msgpack")
+    with pytest.raises(InputError, match="standard input, record 2: is no MessagePack"):
+        answered(site, good + b"\xc1" + good, settings)
+    with pytest.raises(InputError, match="standard input, record 2: gyro: is not a known key"):
+        answered(site, good + msgpack.packb({"gyro": 1}), settings)
+
+
+def test_states_come_as_soon_as_their_records(walk: OnlineLog, site: Path) -> None:
+    """A reader of the states waits for no more than has been written."""
+    command = [SCRIPT, "navigate", "-", "--site", site, "--estimator", "ekf"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as running:
+        assert running.stdin is not None
+        assert running.stdout is not None
+        lines = records(walk).splitlines(keepends=True)
+        running.stdin.write(b"".join(lines[:180]))
+        running.stdin.flush()
+        seen = [json.loads(running.stdout.readline()) for _ in range(7)]
+        assert not running.poll()
+        assert seen[0]["started"] is False
+        running.stdin.close()
+        rest = running.stdout.read()
+    assert running.returncode == 0
+    assert b'"started": true' in rest or seen[-1]["started"]
+
+
+def test_a_reader_that_leaves_is_no_error(walk: OnlineLog, tmp_path: Path) -> None:
+    write_log(as_log(walk), tmp_path / "log")
+    command = f"{SCRIPT} replay {tmp_path / 'log'} | head -n 1"
+    done = subprocess.run(
+        ["bash", "-o", "pipefail", "-c", command], capture_output=True, env=os.environ, check=False
+    )
+    assert done.returncode == 0
+    assert done.stderr == b""
+    assert list(json.loads(done.stdout)) == ["imu"]
+
+
+def test_a_stream_needs_a_site_and_takes_no_options_of_a_log(
+    capfd: pytest.CaptureFixture[str], site: Path
+) -> None:
+    for options, sentence in (
+        (("navigate", "-"), "navigate - needs the site's file"),
+        (("navigate", "-", "--site", site, "-o", "out"), "--output, --start, --end"),
+        (("navigate", "-", "--site", "nowhere.yaml"), "nowhere.yaml: there is no such file"),
+    ):
+        with pytest.raises(AssertionError):
+            run_command(*options)  # it exits with 2
+        assert sentence in capfd.readouterr().err
