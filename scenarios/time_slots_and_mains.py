@@ -25,8 +25,9 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.fixes.tracker import locate_by_svd, unit_coupling
 from magfusion.receiver.ambient import Removal, subtraction_gain
+from magfusion.receiver.cycles import whole_cycles
 from magfusion.receiver.lockin import demodulate, window_operator
-from magfusion.receiver.slots import SlotSettings, demodulate_slots, whole_cycles
+from magfusion.receiver.slots import SlotSettings, demodulate_slots
 from magfusion.receiver.windows import choose_windows, default_settings
 from magfusion.records.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.simulation.field import phasors_world, synchronised_drives

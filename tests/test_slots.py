@@ -13,13 +13,13 @@ from time_slots_and_mains import UNIT, tracker
 from magfusion.errors import InputError
 from magfusion.parameters import initial_calibration, predict_channels
 from magfusion.receiver.ambient import Removal, ambient_weights, subtraction_gain
+from magfusion.receiver.cycles import whole_cycles
 from magfusion.receiver.slots import (
     SlotSettings,
     default_slot_settings,
     demodulate_slots,
     schedule,
     slot_settings_of,
-    whole_cycles,
 )
 from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz
 from magfusion.records.samples import FieldSamples, ImuSamples, Waveform

@@ -33,7 +33,8 @@ from magfusion.parameters import (
     held_blocks,
     initial_calibration,
 )
-from magfusion.receiver.slots import has_schedule, whole_cycles
+from magfusion.receiver.cycles import whole_cycles
+from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 from magfusion.records.samples import FieldSamples, Log, SteadyFields
 from magfusion.site import Site

@@ -10,6 +10,7 @@ from magfusion.fixes.fix import Fixes, Gravity
 from magfusion.fixes.likelihood import fix_epochs
 from magfusion.fusion.wave import WaveFields, demodulate_about
 from magfusion.parameters import Calibration, initial_calibration
+from magfusion.receiver.cycles import whole_cycles
 from magfusion.receiver.lockin import (
     WindowOperator,
     demodulate,
@@ -21,7 +22,6 @@ from magfusion.receiver.slots import (
     demodulate_slots,
     has_schedule,
     slot_settings_of,
-    whole_cycles,
 )
 from magfusion.receiver.windows import (
     LockinSettings,
