@@ -23,7 +23,8 @@ def write_plot(path: Path, courses: list[Course], figures: Mapping[str, object])
     for column, course in enumerate(courses):
         for row, quantity in enumerate(QUANTITIES):
             _draw_error(grid[row, column], course, quantity, figures)
-        grid[0, column].set_title(f"{course.name}\n{grid[0, column].get_title()}")
+        title = f"{course.name}\n{grid[0, column].get_title()}"
+        grid[0, column].set_title(title, fontsize=9)
         _draw_allan(grid[-2, column], course)
         _draw_pace(grid[-1, column], course)
     for row in range(len(QUANTITIES)):  # one scale for both
@@ -63,7 +64,7 @@ def _draw_error(
 
 
 def _draw_allan(axes: Axes, course: Course) -> None:
-    """Draw each error's Allan deviation, relative to that of its own shortest time."""
+    """Draw the Allan deviation of each error."""
     for quantity in QUANTITIES:
         error = quantity.scale * course.errors.error[:, quantity.part]
         time, deviation = allan_deviation(error, course.interval)

@@ -20,7 +20,7 @@ PIECES = 10.0 * np.arange(8640.0)  # s; a day
 SIGMA = np.repeat([1e-3, 4e-3, 1e-2, 5e-3, 1e-4], 3)
 
 
-def a_run(world=0, *, slope=0.0, growth=0.0, slower=0.0, sigma_error=1.0, losses=None):
+def a_run(world=0, *, slope=0.0, growth=0.0, slower=0.0, sigma_error=1.0, jump=0.0, losses=None):
     """Return a day of synthetic white errors, with what is to be found in them."""
     rng = np.random.default_rng(world)
     stamps = 60.0 * np.arange(1440.0)
@@ -39,9 +39,11 @@ def a_run(world=0, *, slope=0.0, growth=0.0, slower=0.0, sigma_error=1.0, losses
             np.ones_like(PIECES),
         ]
     )
+    measured = np.arange(len(stamps)) % 2 == 0
+    error[501, 3] += jump
     series = ErrorSeries(
         stamps,
-        np.ones(len(stamps), bool),
+        measured,
         error,
         np.tile(SIGMA, (len(stamps), 1)),
         nees[0],
@@ -68,6 +70,7 @@ def test_an_estimator_that_stands_passes():
         ({"slower": 2.0}, "latency"),
         ({"sigma_error": 2.0}, "pose_consistency"),
         ({"sigma_error": 2.0}, "bias_consistency"),
+        ({"jump": 3.0}, "carried"),
         ({"losses": {"lost and found again": 1}}, "lost"),
     ],
 )

@@ -24,6 +24,7 @@ from magfusion.units import Array, BoolArray
 
 MINUTE = 60.0  # s; errors count at the phasors of whole minutes, which rests and walks have alike
 NEES_LIMITS = (0.5, 2.0)  # of a degree of freedom; sigmas honest to within a factor of 1.4
+CARRIED_LIMIT = 1.0  # m, at rest for a minute without a phasor
 MEMORY_LIMIT = 20.0  # MiB, from the second quarter to the last
 LATENCY_LIMIT = 1.25  # last quarter to second, at rest
 TIME, SECONDS, UPDATES, MEMORY, DISTORTION = range(len(PACE))
@@ -60,7 +61,7 @@ def judged(name: str, runs: list[WorldRun]) -> tuple[Figures, list[Finding]]:
     """
     figures: Figures = {}
     findings: list[Finding] = []
-    for part in (_drifts, _consistency, _memory, _latency, _losses):
+    for part in (_drifts, _carried, _consistency, _memory, _latency, _losses):
         found, told = part(runs)
         figures |= {f"{name}_{key}": value for key, value in found.items()}
         findings += [Finding(f"{name}_{f.name}", f.verdict, f"{name}: {f.sentence}") for f in told]
@@ -108,10 +109,8 @@ def _drifts(runs: list[WorldRun]) -> tuple[Figures, list[Finding]]:
                 f" (95 %), limit {quantity.limit:g}",
             )
         )
-    between = [quantity_between(run) for run in runs]
     walking = [run.errors.rows(run.errors.measured & ~_at_minutes(run.errors)) for run in runs]
     position = QUANTITIES[0].part
-    figures["position_rms_between_fields_m"] = _rms(np.concatenate(between))
     figures["position_rms_walking_m"] = _rms(
         np.concatenate([w.rows(w.time > _STARTED).size(position) for w in walking])
     )
@@ -125,10 +124,23 @@ _WORDS = {
 }
 
 
-def quantity_between(run: WorldRun) -> Array:
-    """Return the position error of the states that the IMU carried on (m)."""
-    errors = run.errors
-    return errors.rows(~errors.measured & (errors.time > _STARTED)).size(QUANTITIES[0].part)
+def _carried(runs: list[WorldRun]) -> tuple[Figures, list[Finding]]:
+    """Judge the states at rest between two phasors, which the IMU alone carries on."""
+    found = []
+    for run in runs:
+        errors = run.errors
+        between = errors.rows(~errors.measured & (errors.time > _STARTED))
+        found.append(between.size(QUANTITIES[0].part))
+    every = np.concatenate(found)
+    largest = float(np.max(every, initial=0.0))
+    figures: Figures = {
+        "position_rms_between_fields_m": _rms(every),
+        "position_largest_between_fields_m": largest,
+    }
+    verdict = within(largest, largest, CARRIED_LIMIT)
+    word = "stays" if verdict == "pass" else "does not stay"
+    told = f"between phasors the position {word}: {_rms(every):.3g} m rms, {largest:.3g} m at most"
+    return figures, [Finding("carried", verdict, f"{told}, limit {CARRIED_LIMIT:g}")]
 
 
 def _at_minutes(series: ErrorSeries) -> BoolArray:
