@@ -17,7 +17,7 @@ from self_survey import Config, turn_deg, without_survey
 from magfusion.errors import EstimationError, InputError
 from magfusion.fusion.batch import SmootherSettings, smooth
 from magfusion.fusion.placing import heard_along, places
-from magfusion.fusion.self_survey import smooth_and_place
+from magfusion.fusion.self_survey import Hypothesis, Placement, decide, smooth_and_place
 from magfusion.parameters import initial_calibration
 from magfusion.pipeline import quiet
 from magfusion.records.log import write_log
@@ -113,6 +113,22 @@ def test_a_beacon_is_placed_by_a_short_walk_and_its_sigma_covers_the_error(
     assert placed[0].name == "B"
     assert placed[0].hypotheses[0].smoothed
     assert placed[0].hypotheses[0].chi_square == 0.0
+
+
+def test_the_whole_log_decides_between_places(walk: SimulatedLog) -> None:
+    """Even against what the first trajectory said: the wrong place comes first here."""
+    lost, surveyed = with_unknown("B"), demo_site().beacons[1]
+    sigma = replace(surveyed.sigma, position_world=np.full(3, 0.02))
+    right = replace(surveyed, sigma=sigma)
+    wrong = replace(right, position_world=right.position_world + np.array([0.0, 0.4, 0.0]))
+    told = Placement("B", (Hypothesis(wrong, 0.0), Hypothesis(right, 50.0)))
+    result, placed = decide(walk.log, lost, SmootherSettings(passes=1), quiet, [told])
+    first, second = placed[0].hypotheses
+    assert first.beacon is right
+    assert (first.chi_square, first.smoothed) == (0.0, True)
+    assert second.chi_square > 20.0
+    found = result.calibration.site.beacons[1].position_world
+    assert np.linalg.norm(found - walk.true_site.beacons[1].position_world) < 0.03
 
 
 def test_a_site_without_unknown_beacons_is_smoothed_as_ever(walk: SimulatedLog) -> None:

@@ -94,7 +94,7 @@ def smooth_and_place(
         _hypotheses(heard_along(beacon, calibration, samples, states, overlap(samples)))
         for beacon in unknown
     ]
-    return _decide(log, site, settings, report, found)
+    return decide(log, site, settings, report, found)
 
 
 def _refuse(site: Site, unknown: list[Beacon], settings: SmootherSettings) -> None:
@@ -166,14 +166,31 @@ def _with_prior(placed: Beacon, declared: Beacon) -> Beacon:
     return replace(placed, sigma=sigma, coils=declared.coils)
 
 
-def _decide(
+def decide(
     log: Log,
     site: Site,
     settings: SmootherSettings,
     report: Report,
     found: list[Placement],
 ) -> tuple[Smoothed, tuple[Placement, ...]]:
-    """Smooth the log with the likeliest places; the whole graph decides between them."""
+    """Smooth the log with the likeliest places; the whole graph decides between them.
+
+    Parameters
+    ----------
+    log : Log
+    site : Site
+    settings : SmootherSettings
+    report : callable
+    found : list of Placement
+        One for each unknown beacon of the site.
+
+    Returns
+    -------
+    Smoothed
+        With the places that explain the log best.
+    tuple of Placement
+        Best first.
+    """
     choices = list(product(*(range(len(placement.hypotheses)) for placement in found)))
 
     def misfit(choice: tuple[int, ...]) -> float:
