@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from magfusion.fusion.earth import earth_cov, with_earth
 from magfusion.fusion.ekf import ErrorStateFilter
 from magfusion.fusion.epoch import field_rows, single
 from magfusion.fusion.factors import FieldMeasurements
 from magfusion.fusion.navigator import SlidingWindow
 from magfusion.fusion.propagation import calibration_walk, propagate
 from magfusion.fusion.state import MOTION, State, between, moved
+from magfusion.observation import observe_earth
 from magfusion.parameters import GROUPS, choose_blocks, dimension, initial_calibration, prior_sigma
-from magfusion.records.samples import ImuSamples
+from magfusion.records.samples import ImuSamples, SteadyFields
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.log import simulate_fields
 from magfusion.trajectory import Trajectory
@@ -54,60 +56,71 @@ def an_imu(begin, end, rng):
     return ImuSamples(time, gyro, accel)
 
 
-def an_epoch(site, state, blocks, rng):
+def an_epoch(site, state, blocks, rng, earth=False):
     """Return the factors of an epoch measured somewhat beside the state."""
     true = moved(state, blocks, 0.3 * np.sqrt(np.diag(state.cov)) * rng.normal(size=len(state.cov)))
     pose = Trajectory(np.array([state.time]), true.world_from_body[None], true.position_world[None])
     samples = simulate_fields(site, pose, 1e-9, rng)
     cov = measurement_cov(site, samples)
-    return single(
-        FieldMeasurements(
-            time=samples.time,
-            measured=stacked(samples.phasor_sensor),
-            root=paired_whitening(cov, samples.valid),
-            rate_body=np.array([[0.3, -0.2, 0.5]]),
-            applied_offset=site.platform.imu.time_offset,
-            by_time_offset=1e-7 * rng.normal(size=(1, len(site.channels), 6)),
-        ),
-        blocks,
+    measurements = FieldMeasurements(
+        time=samples.time,
+        measured=stacked(samples.phasor_sensor),
+        root=paired_whitening(cov, samples.valid),
+        rate_body=np.array([[0.3, -0.2, 0.5]]),
+        applied_offset=site.platform.imu.time_offset,
+        by_time_offset=1e-7 * rng.normal(size=(1, len(site.channels), 6)),
     )
+    if earth:
+        there = true.calibration.site
+        seen = observe_earth(
+            there.platform.magnetometer, true.world_from_body, there.earth_field_world
+        )
+        steady = SteadyFields(samples.time, seen.measured_sensor[None], 1e-18 * np.eye(3)[None])
+        measurements = with_earth(measurements, steady, earth_cov(site, steady), 0.4)
+    return single(measurements, blocks)
 
 
-def one_interval(groups, synchronised=True, seed=SEED):
+def one_interval(groups, synchronised=True, seed=SEED, earth=False):
     """Return a start, where the IMU leads from it, and an epoch measured there."""
     rng = np.random.default_rng(seed)
     site = a_site(synchronised)
-    blocks = choose_blocks(site, groups)
+    blocks = choose_blocks(site, groups, earth=earth)
     start = a_state(site, blocks, rng)
     later = start.time + 0.4
     predicted = propagate(
         start, an_imu(start.time, later, rng), later, site, site.platform.imu.time_offset
     )
-    return start, blocks, predicted, an_epoch(site, predicted.state, blocks, rng)
+    return start, blocks, predicted, an_epoch(site, predicted.state, blocks, rng, earth)
 
 
 MEASUREMENTS = {
-    "fields, calibration known": ((), True, True, None),
-    "fields and beacons": (("beacons", "moments"), True, True, None),
-    "fields and everything": (GROUPS, True, True, None),
-    "fields of free oscillators": (("beacons", "moments", "phase"), False, True, None),
-    "rest": (("beacons",), True, False, 0.01),
-    "fields at rest": (GROUPS, False, True, 0.01),
+    "fields, calibration known": ((), True, True, None, False),
+    "fields and beacons": (("beacons", "moments"), True, True, None, False),
+    "fields and everything": (GROUPS, True, True, None, False),
+    "fields of free oscillators": (("beacons", "moments", "phase"), False, True, None, False),
+    "rest": (("beacons",), True, False, 0.01, False),
+    "fields at rest": (GROUPS, False, True, 0.01, False),
+    "fields and the Earth field": (("beacons",), True, True, None, True),
+    "fields and the Earth field, everything": (GROUPS, False, True, None, True),
+    "no field, but slow, where the Earth field is measured": (GROUPS, True, False, 1.0, True),
 }
 
 
 @pytest.mark.parametrize(
-    ("groups", "synchronised", "with_fields", "rest"), MEASUREMENTS.values(), ids=MEASUREMENTS
+    ("groups", "synchronised", "with_fields", "rest", "earth"),
+    MEASUREMENTS.values(),
+    ids=MEASUREMENTS,
 )
 def test_one_update_of_the_filter_is_one_gauss_newton_step_of_the_graph(
-    groups, synchronised, with_fields, rest
+    groups, synchronised, with_fields, rest, earth
 ):
-    start, blocks, predicted, epoch = one_interval(groups, synchronised)
+    start, blocks, predicted, epoch = one_interval(groups, synchronised, earth=earth)
     fields = epoch if with_fields else None
     light = ErrorStateFilter(start, blocks)
     light.absorb(predicted, fields, rest)
+    still = np.zeros(dimension(blocks))
     window = SlidingWindow(
-        start, blocks, 10.0, np.zeros(dimension(blocks)), epoch.measurements.applied_offset
+        start, blocks, 10.0, still, epoch.measurements.applied_offset, earth=earth
     )
     window.absorb(predicted, fields, rest)
     sigma = np.sqrt(np.diag(light.state.cov))
@@ -132,8 +145,9 @@ def test_moving_there_and_asking_the_way_are_inverse():
     assert np.max(np.abs(between(start, moved(start, blocks, step), blocks) - step)) < 1e-12
 
 
-def test_the_rows_of_an_epoch_are_its_derivative():
-    _, blocks, predicted, epoch = one_interval(GROUPS)
+@pytest.mark.parametrize("earth", [False, True])
+def test_the_rows_of_an_epoch_are_its_derivative(earth):
+    _, blocks, predicted, epoch = one_interval(GROUPS, earth=earth)
     state = predicted.state
     rows = field_rows(epoch, state)
     scale = 1e-6 * np.sqrt(np.diag(state.cov))
@@ -152,10 +166,11 @@ def test_the_rows_of_an_epoch_are_its_derivative():
 
 def test_the_calibration_gains_variance_only_where_things_drift():
     site = a_site(synchronised=False)
-    blocks = choose_blocks(site, GROUPS)
+    blocks = choose_blocks(site, GROUPS, earth=True)
     walk = calibration_walk(blocks)
+    drifting = ("log_moment", "phase", "drift", "offset", "declination", "strength")
     for block in blocks:
-        drifts = block.kind in ("log_moment", "phase", "drift")
+        drifts = block.kind in drifting
         assert np.all((walk[block.columns] > 0.0) == drifts)
 
 

@@ -11,7 +11,7 @@ from magfusion.fusion.handover import last_state
 from magfusion.fusion.state import State
 from magfusion.parameters import held_blocks
 from magfusion.receiver.windows import LockinSettings, default_settings
-from magfusion.records.samples import FieldSamples, ImuSamples, Log, Waveform
+from magfusion.records.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
 from magfusion.site import Site
 
 AMBIGUOUS_CHI_SQUARE = 20.0  # below this a mirrored trajectory explains the data nearly as well
@@ -52,6 +52,7 @@ def find_outset(
     until: float,
     estimate: tuple[str, ...] | None,
     lockin: LockinSettings | None,
+    steady: list[SteadyFields] | None = None,
 ) -> Outset | None:
     """Return the state at the last epoch before a time; None where the data do not tell it.
 
@@ -67,6 +68,8 @@ def find_outset(
     estimate : tuple of str, optional
         Groups of calibration parameters.
     lockin : LockinSettings, optional
+    steady : list of SteadyFields, optional
+        Beside ``fields``; None where the Earth field is not to be measured.
     """
     time, rows = waveform.rows()
     used = None if fields else (default_settings(site) if lockin is None else lockin)
@@ -78,11 +81,13 @@ def find_outset(
         imu=imu,
         waveform=None if fields else Waveform(time[time <= until], rows[time <= until]),
         fields=_joined(whole) if whole else None,
+        steady=_joined_steady(steady, whole) if whole and steady else None,
     )
-    settings = SmootherSettings(estimate=estimate, lockin=used, loss="huber")
+    earth = steady is not None
+    settings = SmootherSettings(estimate=estimate, lockin=used, loss="huber", earth=earth)
     try:
         result = smooth(log, site, settings)
-        state = last_state(result, held_blocks(site, result.blocks))
+        state = last_state(result, held_blocks(site, result.blocks, earth=earth))
     except (EstimationError, InputError, RuntimeError, np.linalg.LinAlgError):
         return None
     rate_hz = 0.0 if used is None else 1.0 / float(np.median(np.diff(time)))
@@ -96,4 +101,18 @@ def _joined(parts: list[FieldSamples]) -> FieldSamples:
         channels=parts[0].channels,
         phasor_sensor=np.concatenate([p.phasor_sensor for p in parts]),
         phasor_cov=np.concatenate([p.phasor_cov for p in parts]),
+    )
+
+
+def _joined_steady(parts: list[SteadyFields], fields: list[FieldSamples]) -> SteadyFields | None:
+    """Return the steady fields of the epochs; None where one has none."""
+    known = {float(part.time[0]): part for part in parts}
+    wanted = [known.get(float(s.time[0])) for s in fields]
+    found = [part for part in wanted if part is not None]
+    if len(found) < len(wanted):
+        return None
+    return SteadyFields(
+        time=np.concatenate([p.time for p in found]),
+        measured_sensor=np.concatenate([p.measured_sensor for p in found]),
+        cov=np.concatenate([p.cov for p in found]),
     )

@@ -116,10 +116,15 @@ def calibration_walk(blocks: tuple[Block, ...]) -> Array:
     """Return the variance that each calibration parameter gains in a second.
 
     What warms up or drifts does so in hours: log-moments by a thousandth, the phase and frequency
-    of a free oscillator by a degree and 0.01 ppm.  What is screwed down stays.
+    of a free oscillator by a degree and 0.01 ppm, a magnetometer's offset by 20 nT.  Where the
+    platform goes in that time the Earth field is another, by 3 degrees and a microtesla.  What is
+    screwed down stays.
     """
     hour = 3600.0
-    per_hour = {"log_moment": 1e-3, "phase": 0.02, "drift": 1e-8}
+    per_hour = {
+        **{"log_moment": 1e-3, "phase": 0.02, "drift": 1e-8},
+        **{"offset": 2e-8, "declination": 0.05, "strength": 1e-6},
+    }
     return np.concatenate(
         [np.full(len(b.sigma), per_hour.get(b.kind, 0.0) ** 2 / hour) for b in blocks]
         or [np.zeros(0)]

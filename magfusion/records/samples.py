@@ -114,6 +114,11 @@ class SteadyFields:
     def __len__(self) -> int:
         return len(self.time)
 
+    def row(self, i: int) -> "SteadyFields":
+        """Return one row, as an epoch of its own."""
+        rows = slice(i, i + 1)
+        return SteadyFields(self.time[rows], self.measured_sensor[rows], self.cov[rows])
+
 
 @dataclass(frozen=True, eq=False)
 class Log:

@@ -1,0 +1,78 @@
+"""The Earth field in an online estimator: which beacons are heard beside it, how much it counts."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.fusion.earth import EARTH_LOSS, earth_cov, heard, only, speed_sigma, with_earth
+from magfusion.fusion.epoch import field_rows, single
+from magfusion.fusion.factors import FieldMeasurements, robust_weight
+from magfusion.fusion.state import State
+from magfusion.parameters import Block
+from magfusion.records.samples import FieldSamples, SteadyFields
+from magfusion.units import Array, IntArray
+
+GATE = 30.7  # chi square of three components, one in a million
+DISTURBED = 0.25  # weight below which the field is told to be disturbed
+
+
+class EarthWatch:
+    """What an online estimator keeps to measure the Earth field.
+
+    Parameters
+    ----------
+    blocks : tuple of Block
+        Calibration parameters in the state's tangent.
+    """
+
+    def __init__(self, blocks: tuple[Block, ...]) -> None:
+        self.blocks = blocks
+        self._heard_for: IntArray | None = None  # epochs in a row, by channel
+
+    def heard(self, samples: FieldSamples, step: float) -> FieldSamples:
+        """Return an epoch's samples without the beacons that are not heard.
+
+        One that begins to be heard is passed over until a window holds nothing of its silence; one
+        that ends is for the gate, which knows what to expect of it.
+        """
+        loud = heard(samples)
+        reach = int(np.ceil(samples.window[0] / step - 1e-6))
+        if self._heard_for is None:
+            self._heard_for = np.full(loud.shape[1], reach)
+        self._heard_for = np.where(loud[0], self._heard_for + 1, 0)
+        return only(samples, loud & (self._heard_for > reach))
+
+    def weighed(
+        self, measurements: FieldMeasurements, steady: SteadyFields, state: State, step: float
+    ) -> tuple[FieldMeasurements, bool]:
+        """Return an epoch's measurements with the Earth field, and whether that is disturbed.
+
+        Parameters
+        ----------
+        measurements : FieldMeasurements
+        steady : SteadyFields
+        state : State
+            As predicted: the farther from it, the less the field counts, and at last nothing.
+        step : float
+            Since the epoch before (s).
+        """
+        cov = earth_cov(state.calibration.site, steady)
+        measured = with_earth(measurements, steady, cov, step)
+        assert measured.earth_repeats is not None
+        rows = field_rows(single(measured, self.blocks), state)
+        distance = _distance(rows.error[-6:-3], rows.jacobian[-6:-3], state.cov, measured)
+        weight = float(robust_weight(distance, EARTH_LOSS, components=3)[0]) * bool(distance < GATE)
+        root = measured.root.copy()
+        root[:, -1] *= np.sqrt(weight)
+        return replace(measured, root=root), bool(weight < DISTURBED)
+
+    def speed_sigma(self, measurements: FieldMeasurements, step: float) -> float | None:
+        """Return the sigma of no velocity, where no beacon holds the platform (m/s)."""
+        return None if np.any(measurements.root[:, :-1]) else speed_sigma(step)
+
+
+def _distance(error: Array, jacobian: Array, cov: Array, measured: FieldMeasurements) -> Array:
+    """Return the squared Mahalanobis distance of an epoch that counts in full."""
+    assert measured.earth_repeats is not None
+    spread = measured.earth_repeats * (jacobian @ cov @ jacobian.T) + np.eye(3)
+    return np.asarray(measured.earth_repeats * error @ np.linalg.solve(spread, error))
