@@ -6,8 +6,9 @@ A tracker in time slots sees each coil at another time.  The scenario turns it a
    each slot is a measurement of its own, at its own time, with the turn between them from the gyro,
    nothing is left, 1e-6 degrees or less without noise.
 2. The same in a whole system: a carrier of 10 kHz in slots of 2.5 ms, 100 poses a second, noise of
-   60 dB, hum, and an inertial stream.  Fused with it the attitude is several times better than the
-   closed form's, after the fact (the smoother) and at once (the error-state filter).
+   60 dB, hum, and an inertial stream.  Fused with it the attitude is fifty times better than the
+   closed form's after the fact (the smoother) and forty times at once (the error-state filter),
+   with an IMU of 200 Hz as with one of 1 kHz.
 """
 
 import argparse

@@ -225,6 +225,21 @@ def test_the_covariance_is_that_of_the_noise(
     )
 
 
+@pytest.mark.parametrize("carrier_hz", [0.0, 4e3])
+def test_what_turns_in_the_earth_field_is_no_noise(carrier_hz: float) -> None:
+    slots = Slots(5e-3, 4)
+    site = _with_earth(tracker(carrier_hz, slots, density=1e-10))
+    waveform, imu = _recorded(site, _turning(3.0), 16e3, 3.0)
+    settings = SlotSettings("none" if carrier_hz else "subtract", "rectangular")
+    found, _ = demodulate_slots(waveform, imu, site, settings)
+    matrix = site.platform.magnetometer.matrix
+    # White noise enters after the matrix; 128 degrees of freedom give a variance within a third.
+    expected = 1e-20 / slots.duration
+    share = np.diagonal(found.phasor_cov[found.valid], axis1=1, axis2=2) / expected
+    assert np.linalg.cond(matrix) < 1.2
+    assert np.median(share) == pytest.approx(1.0, abs=0.15)
+
+
 def test_a_cycle_as_one_epoch_is_turned_to_its_own_time() -> None:
     """About a still point the gyro undoes all of the skew."""
     site = tracker(4e3, Slots(5e-3, 4))

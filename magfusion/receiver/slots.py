@@ -205,7 +205,7 @@ def demodulate_slots(
 
     place = stretches.number % slots.count
     sums = _slot_sums(waveform.time, still, stretches, slots, carrier[place], settings)
-    noise = _noise(waveform, stretches, slots, carrier[place])
+    noise = _noise(waveform.time, still, stretches, slots, carrier[place])
     owner = _owners(site, slots)
     driven, silent = np.flatnonzero(owner[place] >= 0), np.flatnonzero(owner[place] < 0)
     index, weight = ambient_weights(
@@ -227,13 +227,12 @@ def demodulate_slots(
     # Slots share what was taken off them, and no number of slots averages that out.
     shared = 0.0 if settings.removal == "none" else 1.0 / len(np.unique(place[silent]))
     variance = sums.variance[kept] * (1.0 + np.maximum(np.sum(weight**2, axis=1), shared))
-    body_from_still = attitude_at(attitude, imu_time, gyro, sums.time[kept]).inv()
-    phasor = body_from_still.apply(value[usable].real) @ measured_from_body.T + 1j * (
-        body_from_still.apply(value[usable].imag) @ measured_from_body.T
-    )
+    body_from_still = attitude_at(attitude, imu_time, gyro, sums.time[kept]).inv().as_matrix()
+    turn = measured_from_body @ body_from_still
+    phasor = (turn @ value[usable][..., None])[..., 0]
     found = _rows(site, slots, sums.time[kept], owner[place[kept]], phasor)
-    rows = np.arange(len(kept))
-    found.phasor_cov[rows, owner[place[kept]]] = variance[:, None, None] * noise[kept]
+    cov = variance[:, None, None] * (turn @ noise[kept] @ np.swapaxes(turn, 1, 2))
+    found.phasor_cov[np.arange(len(kept)), owner[place[kept]]] = cov
     lost = int(np.sum(~usable))
     return found, dict(dropped) | ({"no silent slot beside it": lost} if lost else {})
 
@@ -358,26 +357,28 @@ def _slot_sums(
     return _Sums(centre, value, 0.5 * (cov[:, 1, 1] + cov[:, 2, 2]))
 
 
-def _noise(waveform: Waveform, stretches: _Stretches, slots: Slots, carrier_hz: Array) -> Array:
-    """Return the covariance per sample of the noise beside the carrier, (n, 3, 3), measured axes.
+def _noise(
+    time: Array, still: Array, stretches: _Stretches, slots: Slots, carrier_hz: Array
+) -> Array:
+    """Return the covariance per sample of the noise beside the carrier, (n, 3, 3), still axes.
 
     It is the power three cycles a slot away, tapered so that neither carrier nor hum leaks there.
     """
     sample, owner, begins = _samples_of(stretches)
-    rate = sample_rate_hz(waveform)
-    at = waveform.time[sample] - stretches.begin[owner]
-    weight = _hann(waveform.time[sample], stretches.begin[owner], slots, rate)
+    rate = 1.0 / float(np.median(np.diff(time)))
+    at = time[sample] - stretches.begin[owner]
+    weight = _hann(time[sample], stretches.begin[owner], slots, rate)
     away = 3.0 / slots.duration
     above = carrier_hz + away < 0.5 * rate
     probe = np.where(above, carrier_hz + away, carrier_hz - away)
     turned = weight * np.exp(-2j * np.pi * probe[owner] * at)
-    seen = np.add.reduceat(turned[:, None] * waveform.measured_sensor[sample], begins, axis=0)
+    seen = np.add.reduceat(turned[:, None] * still[sample], begins, axis=0)
     power = np.add.reduceat(weight**2, begins)
     cov = np.einsum("nx,ny->nxy", seen, np.conj(seen)).real / power[:, None, None]
     centre = stretches.begin + 0.5 * slots.duration
     number = NOISE_CYCLES * slots.count
     smooth = smoothed_over_windows(cov[:, None], centre, slots.cycle, number)[:, 0]
-    least = 1e-12 * np.max(np.abs(waveform.measured_sensor))
+    least = 1e-12 * np.max(np.abs(still))
     return np.asarray(smooth + least**2 * np.eye(3))
 
 
