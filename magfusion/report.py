@@ -12,6 +12,7 @@ from magfusion.evaluation.observability import Observability, observability
 from magfusion.fixes.ambiguity import ambiguity_figures, relations
 from magfusion.fixes.fix import Fixes
 from magfusion.fusion.batch import Smoothed
+from magfusion.fusion.earth import disturbed
 from magfusion.fusion.self_survey import Placement
 from magfusion.records.samples import Log
 from magfusion.refinement import DETERMINED_RATIO, Finding, findings
@@ -72,6 +73,21 @@ def residual_figures(residual: Array, channels: tuple[tuple[str, int], ...]) -> 
     return figures
 
 
+def _earth_figures(result: Smoothed) -> Figures:
+    """Return how the Earth field was explained, and where it had to do without beacons."""
+    residual, fields = result.earth_residual, result.problem.fields
+    if residual is None or fields is None or fields.measurements.earth_repeats is None:
+        return {}
+    held = result.fields.valid.any(axis=1)
+    return {
+        "earth_residual_rms": float(np.sqrt(np.mean(residual**2))),
+        "earth_disturbed_epochs": int(
+            np.sum(disturbed(residual, fields.measurements.earth_repeats))
+        ),
+        "epochs_without_beacon": int(np.sum(~held)),
+    }
+
+
 def smoothed_figures(result: Smoothed) -> Figures:
     """Return the figures of a smoothed log."""
     told = findings(result.declared, result.calibration, result.blocks, result.calibration_cov)
@@ -92,7 +108,7 @@ def smoothed_figures(result: Smoothed) -> Figures:
         "time_offset_s": result.calibration.time_offset,
     }
     figures |= dropped_figures(result.dropped)
-    figures |= residual_figures(result.residual, result.fields.channels)
+    figures |= residual_figures(result.residual, result.fields.channels) | _earth_figures(result)
     if result.states.pose_cov is not None:
         sigma = np.sqrt(np.diagonal(result.states.pose_cov, axis1=1, axis2=2))
         figures["position_sigma_median_m"] = float(np.median(sigma[:, 3:]))

@@ -84,6 +84,14 @@ def progress() -> Iterator[Report]:
         yield report
 
 
+Earth = Annotated[
+    bool,
+    typer.Option(
+        "--earth", help="Measure the Earth field too: it holds the heading where no beacon does."
+    ),
+]
+
+
 def log_job(
     name: str,
     log: Path,

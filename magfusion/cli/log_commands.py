@@ -8,6 +8,7 @@ import typer
 
 from magfusion.cli.app import (
     AsJson,
+    Earth,
     End,
     JobOutput,
     LogPath,
@@ -22,6 +23,7 @@ from magfusion.cli.app import (
     progress,
     show_result,
 )
+from magfusion.errors import InputError
 from magfusion.fixes.published import Method
 from magfusion.fusion.batch import SmootherSettings
 from magfusion.jobs.published import run_published_fix
@@ -86,6 +88,7 @@ def smooth(
             "default: what the site's sigmas leave open."
         ),
     ] = None,
+    earth: Earth = False,
     rate: Annotated[Rate, typer.Option(help="Epochs of the written trajectory.")] = Rate.FIELD,
     window: Window = None,
     step: Step = None,
@@ -96,11 +99,14 @@ def smooth(
     as_json: AsJson = False,
 ) -> None:
     """Smooth a log into the best trajectory, with the calibration in the same solution."""
+    if earth and coupling is Coupling.LOOSE:
+        raise InputError("--earth needs the phasors themselves; leave --coupling loose out")
     job = log_job("smooth", log, site, output, window, step, mains_hz, start, end, topics)
     settings = SmootherSettings(
         coupling=coupling.value,
         loss=None if robust is Robust.NONE else robust.value,
         estimate=groups_option(estimate),
+        earth=earth,
     )
     with progress() as report:
         figures = run_smooth(job, settings, imu_rate=rate is Rate.IMU, report=report)

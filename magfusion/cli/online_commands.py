@@ -10,6 +10,7 @@ import typer
 
 from magfusion.cli.app import (
     AsJson,
+    Earth,
     End,
     JobOutput,
     LogPath,
@@ -74,6 +75,7 @@ def navigate(
             "default: what the site's sigmas leave open."
         ),
     ] = None,
+    earth: Earth = False,
     realtime: Realtime = False,
     live: Annotated[bool, typer.Option("--live", help="Show the states in the viewer.")] = False,
     checkpoint: Annotated[
@@ -99,7 +101,11 @@ def navigate(
     """Navigate as the data come: along a log, or by records on standard input (-)."""
     _check(lag, delay, every)
     chosen = NavigatorSettings(
-        estimator=estimator.value, lag=lag, delay=delay, estimate=groups_option(estimate)
+        estimator=estimator.value,
+        lag=lag,
+        delay=delay,
+        estimate=groups_option(estimate),
+        earth=earth,
     )
     if log == STREAM:
         if site is None:

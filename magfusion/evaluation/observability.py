@@ -26,6 +26,8 @@ _AXES = "xyz"
 _UNITS = {"position": ("cm", 1e-2), "rotation": ("deg", DEGREE), "relative": ("%", 1e-2)}
 _UNITS |= {"phase": ("deg", DEGREE), "drift": ("ppm", 1e-6), "time_offset": ("ms", 1e-3)}
 _UNITS |= {"log_moment": ("%", 1e-2), "matrix": ("%", 1e-2)}
+_UNITS |= {"offset": ("nT", 1e-9), "strength": ("nT", 1e-9), "declination": ("deg", DEGREE)}
+_EARTH = {"declination": ("declination",), "strength": ("horizontal part", "vertical part")}
 
 
 class Weakness(NamedTuple):
@@ -227,6 +229,10 @@ def parameter_names(
 
 
 def _called(block: Block, i: int, coils: int) -> str:
+    if block.group == "earth":
+        return f"the {_EARTH[block.kind][i]} of the Earth field"
+    if block.kind == "offset":
+        return f"the magnetometer's offset on {_AXES[i]}"
     if block.group == "magnetometer":
         row, column = divmod(i, 3)
         if row == column:

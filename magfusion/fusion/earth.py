@@ -17,7 +17,7 @@ from gtsam.symbol_shorthand import V, X
 from scipy.ndimage import binary_erosion
 
 from magfusion.errors import InputError
-from magfusion.fusion.factors import FieldMeasurements
+from magfusion.fusion.factors import FieldMeasurements, robust_weight
 from magfusion.records.samples import FieldSamples, SteadyFields
 from magfusion.site import Site
 from magfusion.trajectory import Trajectory
@@ -25,6 +25,7 @@ from magfusion.units import Array, BoolArray
 from magfusion.weights import paired_whitening, whitening
 
 EARTH_LOSS = "geman-mcclure"
+DISTURBED = 0.25  # weight below which the field is told to be disturbed
 AMBIENT_SHARE = 0.005  # of the field's size: usual disturbance of each component, one sigma
 AMBIENT_TIME = 2.0  # s; over which it stays the same
 DEVIATION_SPAN = 5.0  # s; over which the deviation of the field's size is averaged
@@ -128,6 +129,20 @@ def only(samples: FieldSamples, channels: BoolArray) -> FieldSamples:
     return replace(
         samples, phasor_sensor=np.where(channels[..., None], samples.phasor_sensor, np.nan)
     )
+
+
+def disturbed(residual: Array, repeats: float) -> BoolArray:
+    """Tell at which epochs the motion contradicts the Earth field.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n, 3)
+        Whitened.
+    repeats : float
+        How many epochs count as one measurement.
+    """
+    weight, _ = robust_weight(repeats * np.sum(residual**2, axis=1), EARTH_LOSS, components=3)
+    return np.asarray(weight < DISTURBED)
 
 
 def hold(

@@ -4,7 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.fusion.earth import EARTH_LOSS, earth_cov, heard, only, speed_sigma, with_earth
+from magfusion.fusion.earth import (
+    DISTURBED,
+    EARTH_LOSS,
+    earth_cov,
+    heard,
+    only,
+    speed_sigma,
+    with_earth,
+)
 from magfusion.fusion.epoch import field_rows, single
 from magfusion.fusion.factors import FieldMeasurements, robust_weight
 from magfusion.fusion.state import State
@@ -13,7 +21,6 @@ from magfusion.records.samples import FieldSamples, SteadyFields
 from magfusion.units import Array, IntArray
 
 GATE = 30.7  # chi square of three components, one in a million
-DISTURBED = 0.25  # weight below which the field is told to be disturbed
 
 
 class EarthWatch:
