@@ -23,7 +23,7 @@ from magfusion.jobs.checkpoint import (
     write_checkpoint,
 )
 from magfusion.jobs.replay import PIECE, Replay, feed, paced
-from magfusion.parameters import initial_calibration
+from magfusion.parameters import choose_blocks, dimension, initial_calibration
 from magfusion.records.samples import Log
 from magfusion.records.trajectory_table import write_trajectory
 from magfusion.records.tum import write_tum
@@ -94,6 +94,11 @@ def run_navigate(job: Job, settings: NavigateSettings, report: Report) -> Figure
     """
     claimed = claim(job.output, "navigate")
     log, site = read_job(job)
+    if settings.navigator.earth and log.waveform is None:
+        raise InputError(
+            f"{job.log_path}: holds only phasors, which know nothing of the Earth field; give the"
+            " log with magnetometer.parquet, or leave --earth out"
+        )
     place = job.output / CHECKPOINT if settings.checkpoint is None else settings.checkpoint
     made = _make_parent(place)
     run = _open_run(job, settings, log, site, place)
@@ -257,11 +262,7 @@ def _results(settings: NavigateSettings, run: _Run, rows: Array) -> tuple[Figure
     smoothed = rows[rows[:, _KIND] == _LAGGED]
     current = _trajectory(own)
     lagged = _trajectory(smoothed) if len(smoothed) else None
-    told = _findings(run)
-    state = navigator.state(-np.inf)
-    refined = refined_site(
-        state.calibration, navigator.blocks, state.cov[MOTION:, MOTION:], told, log.name
-    )
+    told, refined = _calibration(run, settings.navigator)
     errors, compared = compared_with_truth(current, log)
     figures = {"job": "navigate", "log": log.name} | _settings_figures(settings.navigator)
     figures |= _run_figures(run, current) | compared
@@ -282,12 +283,18 @@ def _results(settings: NavigateSettings, run: _Run, rows: Array) -> tuple[Figure
     return figures, _Results(current, lagged, errors, innovations, refined)
 
 
-def _findings(run: _Run) -> list[Finding]:
-    navigator = run.navigator
-    state = navigator.state(-np.inf)
+def _calibration(run: _Run, settings: NavigatorSettings) -> tuple[list[Finding], Site]:
+    """Return what the data said of the calibration, and the refined site."""
+    state, blocks = (
+        run.navigator.state(-np.inf),
+        choose_blocks(run.site, settings.estimate, earth=settings.earth),
+    )
+    # What is held follows what is estimated.
+    own = slice(MOTION, MOTION + dimension(blocks))
+    cov = state.cov[own, own]
     declared = initial_calibration(run.site, state.calibration.reference_time)
-    cov = state.cov[MOTION:, MOTION:]
-    return findings(declared, state.calibration, navigator.blocks, cov)
+    told = findings(declared, state.calibration, blocks, cov)
+    return told, refined_site(state.calibration, blocks, cov, told, run.replay.log.name)
 
 
 def _settings_figures(settings: NavigatorSettings) -> Figures:
