@@ -231,17 +231,8 @@ def parameter_names(
 def _called(block: Block, i: int, coils: int) -> str:
     if block.group == "earth":
         return f"the {_EARTH[block.kind][i]} of the Earth field"
-    if block.kind == "offset":
-        return f"the magnetometer's offset on {_AXES[i]}"
-    if block.group == "magnetometer":
-        row, column = divmod(i, 3)
-        if row == column:
-            return f"the magnetometer's gain on {_AXES[row]}"
-        return f"{_AXES[column]} in the magnetometer's {_AXES[row]}"
-    if block.group == "extrinsics":
-        if block.kind == "position":
-            return f"the lever arm along {_AXES[i]}"
-        return f"the mounting's turn about the sensor's {_AXES[i]}"
+    if block.group in ("magnetometer", "extrinsics"):
+        return _sensor_called(block, i)
     if block.kind == "time_offset":
         return "the IMU's time offset"
     owner = f"beacon {block.owner}"
@@ -254,6 +245,19 @@ def _called(block: Block, i: int, coils: int) -> str:
     of_coil = f"coil {i} of {owner}" if coils > 1 else owner
     what = "drive phase" if block.kind == "phase" else "moment"
     return f"the {what} of {owner if what == 'drive phase' else of_coil}"
+
+
+def _sensor_called(block: Block, i: int) -> str:
+    if block.kind == "position":
+        return f"the lever arm along {_AXES[i]}"
+    if block.kind == "rotation":
+        return f"the mounting's turn about the sensor's {_AXES[i]}"
+    if block.kind == "offset":
+        return f"the magnetometer's offset on {_AXES[i]}"
+    row, column = divmod(i, 3)
+    if row == column:
+        return f"the magnetometer's gain on {_AXES[row]}"
+    return f"{_AXES[column]} in the magnetometer's {_AXES[row]}"
 
 
 def _in_words(
