@@ -1,6 +1,7 @@
 """What a job reads, and where it may write."""
 
 import json
+import re
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
@@ -83,6 +84,8 @@ _WRITTEN = {
 def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
     """Tell whether a directory holds nothing but an earlier result of these jobs."""
     found = {entry.name for entry in path.iterdir()}
+    # A checkpoint that was being written when its run was killed.
+    found = {name for name in found if not re.fullmatch(r"\.checkpoint\.bin\.\d+", name)}
     if any(found <= _UNFINISHED.get(kind, set()) for kind in kinds):
         return True
     try:

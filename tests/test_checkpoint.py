@@ -155,6 +155,7 @@ def test_killed_before_the_first_checkpoint_it_begins_again(
     output = tmp_path / "run"
     output.mkdir()
     (output / "checkpoint.rows").write_bytes(b"\0" * 1000)  # a row file that was begun
+    (output / ".checkpoint.bin.123").write_bytes(b"\0")  # and the first checkpoint
     run_command("navigate", phasors, "-o", output, "--resume")
     assert (output / "trajectory.tum").read_bytes() == (
         uninterrupted / "trajectory.tum"

@@ -13,7 +13,7 @@ from magfusion.fusion.state import State
 from magfusion.parameters import Calibration
 from magfusion.records.samples import FieldSamples
 from magfusion.trajectory import Trajectory
-from magfusion.units import Array, BoolArray
+from magfusion.units import BoolArray, ComplexArray
 
 MOST_REFUSED = 2  # beacons
 DOUBT = 1e-6  # probability of a worse agreement
@@ -84,7 +84,7 @@ def agreed_fix(
 def _fixed(
     samples: FieldSamples, calibration: Calibration, prior: Trajectory | None, refused: BoolArray
 ) -> AgreedFix | None:
-    silenced: Array = np.where(refused[None, :, None], np.nan, samples.phasor_sensor)
+    silenced: ComplexArray = np.where(refused[None, :, None], np.nan, samples.phasor_sensor)
     try:
         fixes = fix_epochs(replace(samples, phasor_sensor=silenced), calibration, prior=prior)
     except (EstimationError, np.linalg.LinAlgError):

@@ -257,7 +257,7 @@ def _trajectory(rows: Array) -> Trajectory:
 
 
 def _results(settings: NavigateSettings, run: _Run, rows: Array) -> tuple[Figures, _Results]:
-    log, navigator = run.replay.log, run.navigator
+    log = run.replay.log
     own = rows[rows[:, _KIND] == _CURRENT]
     smoothed = rows[rows[:, _KIND] == _LAGGED]
     current = _trajectory(own)
@@ -285,10 +285,8 @@ def _results(settings: NavigateSettings, run: _Run, rows: Array) -> tuple[Figure
 
 def _calibration(run: _Run, settings: NavigatorSettings) -> tuple[list[Finding], Site]:
     """Return what the data said of the calibration, and the refined site."""
-    state, blocks = (
-        run.navigator.state(-np.inf),
-        choose_blocks(run.site, settings.estimate, earth=settings.earth),
-    )
+    state = run.navigator.state(-np.inf)
+    blocks = choose_blocks(run.site, settings.estimate, earth=settings.earth)
     # What is held follows what is estimated.
     own = slice(MOTION, MOTION + dimension(blocks))
     cov = state.cov[own, own]

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, BinaryIO, Literal
 
 import msgpack
@@ -199,7 +200,7 @@ def read_records(stream: BinaryIO, form: Format) -> Iterator[Numbered]:
     if form == "json":
         for number, line in enumerate(stream, 1):
             if line.strip():
-                yield _checked(number, lambda line=line: Record.model_validate_json(line))
+                yield _checked(number, partial(Record.model_validate_json, line))
         return
     number, unpacker = 0, msgpack.Unpacker()
     # As much as has come: read() would wait for all of a chunk.
@@ -208,7 +209,7 @@ def read_records(stream: BinaryIO, form: Format) -> Iterator[Numbered]:
         try:
             for content in unpacker:
                 number += 1
-                yield _checked(number, lambda content=content: Record.model_validate(content))
+                yield _checked(number, partial(Record.model_validate, content))
         except (ValueError, msgpack.UnpackException) as error:
             raise InputError(
                 f"standard input, record {number + 1}: is no MessagePack ({error}); write whole"
@@ -255,20 +256,19 @@ def fields_content(samples: FieldSamples) -> dict[str, Any]:
     tones: dict[str, dict[int, int]] = {}
     for row, (name, tone) in enumerate(samples.channels):
         tones.setdefault(name, {})[tone] = row
+    valid = samples.valid[0]
     for name, rows in tones.items():
-        if not any(samples.valid[0, row] for row in rows.values()):
+        if not any(valid[row] for row in rows.values()):
             continue
         phasors[name], covariance[name] = [], []
         for tone in range(max(rows) + 1):
-            row = rows.get(tone)
-            heard = row is not None and bool(samples.valid[0, row])
-            value = samples.phasor_sensor[0, row] if heard else None
-            phasors[name].append(
-                None if value is None else [value.real.tolist(), value.imag.tolist()]
-            )
-            covariance[name].append(
-                samples.phasor_cov[0, row].tolist() if heard else np.eye(3).tolist()
-            )
+            if tone in rows and valid[rows[tone]]:
+                value = samples.phasor_sensor[0, rows[tone]]
+                phasors[name].append([value.real.tolist(), value.imag.tolist()])
+                covariance[name].append(samples.phasor_cov[0, rows[tone]].tolist())
+            else:
+                phasors[name].append(None)
+                covariance[name].append(np.eye(3).tolist())
     time, window = float(samples.time[0]), float(samples.window[0])
     content = {"time": time, "window": window, "phasors": phasors, "covariance": covariance}
     return {"fields": content}
