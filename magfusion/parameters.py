@@ -15,6 +15,7 @@ import numpy as np
 from magfusion.observation import Observation, observe, observe_from, predict
 from magfusion.site import Beacon, Site
 from magfusion.site_moves import (
+    MICROTESLA,
     beacon_difference,
     earth_difference,
     magnetometer_difference,
@@ -40,7 +41,7 @@ NEGLIGIBLE = {
     "rotation": 1.75e-3,  # rad
     "log_moment": 2e-3,
     "matrix": 1e-3,
-    "offset": 5e-9,  # T
+    "offset": 5e-3,  # uT
     "time_offset": 1e-4,  # s
     "phase": 0.0,
     "drift": 0.0,
@@ -123,12 +124,12 @@ def _candidates(site: Site, earth: bool) -> Iterable[tuple[str, str, str, Array]
     sigma = site.platform.magnetometer.sigma
     yield "magnetometer", "magnetometer", "matrix", sigma.matrix.ravel()
     if earth:
-        yield "magnetometer", "magnetometer", "offset", sigma.offset
+        yield "magnetometer", "magnetometer", "offset", sigma.offset / MICROTESLA
     yield "extrinsics", "sensor", "rotation", sigma.rotation_sensor
     yield "extrinsics", "sensor", "position", sigma.position_body
     yield "time-offset", "imu", "time_offset", np.array([site.platform.imu.time_offset_sigma])
     if earth and site.earth_field_world is not None:
-        size = float(np.linalg.norm(site.earth_field_world))
+        size = float(np.linalg.norm(site.earth_field_world)) / MICROTESLA
         yield "earth", "earth", "declination", np.array([DECLINATION_SIGMA])
         yield "earth", "earth", "strength", np.full(2, STRENGTH_SIGMA * size)
 

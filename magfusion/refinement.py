@@ -6,6 +6,7 @@ import numpy as np
 
 from magfusion.parameters import Block, Calibration, difference
 from magfusion.site import Beacon, Site
+from magfusion.site_moves import MICROTESLA
 from magfusion.units import DEGREE, NANOTESLA, Array
 
 DETERMINED_RATIO = 0.5  # posterior over prior sigma below which the data, not the prior, spoke
@@ -16,8 +17,8 @@ _DISPLAY = {
     "phase": ("deg", DEGREE),
     "declination": ("deg", DEGREE),
     "drift": ("ppm", 1e-6),
-    "offset": ("nt", NANOTESLA),
-    "strength": ("nt", NANOTESLA),
+    "offset": ("nt", NANOTESLA / MICROTESLA),
+    "strength": ("nt", NANOTESLA / MICROTESLA),
 }
 _UNITS = {"position": "m", "time_offset": "s"}
 
@@ -125,7 +126,7 @@ def _with_sigma(site: Site, block: Block, sigma: Array) -> Site:
     sensor = site.platform.magnetometer
     changed = {
         "matrix": {"matrix": sigma.reshape(3, 3)} if len(sigma) == 9 else {},
-        "offset": {"offset": sigma},
+        "offset": {"offset": MICROTESLA * sigma},
         "rotation": {"rotation_sensor": sigma},
         "position": {"position_body": sigma},
     }[block.kind]

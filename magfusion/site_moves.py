@@ -1,4 +1,7 @@
-"""How a step in one calibration parameter moves what a site declares, and the way back."""
+"""How a step in one calibration parameter moves what a site declares, and the way back.
+
+Steps of fields are in microtesla, since numbers of all sizes in one covariance cost its digits.
+"""
 
 from dataclasses import replace
 
@@ -7,6 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.site import Beacon, Magnetometer, Site
 from magfusion.units import Array
+
+MICROTESLA = 1e-6  # T
 
 
 def _turned(rotation: Array, vector: Array) -> Array:
@@ -44,7 +49,7 @@ def _moved_sensor(sensor: Magnetometer, kind: str, step: Array) -> Magnetometer:
     if kind == "matrix":
         return replace(sensor, matrix=sensor.matrix + step.reshape(3, 3))
     if kind == "offset":
-        return replace(sensor, offset=sensor.offset + step)
+        return replace(sensor, offset=sensor.offset + MICROTESLA * step)
     if kind == "rotation":
         return replace(sensor, body_from_sensor=_turned(sensor.body_from_sensor, step))
     return replace(sensor, position_body=sensor.position_body + step)
@@ -62,7 +67,7 @@ def magnetometer_difference(old: Site, new: Site, kind: str) -> Array:
     if kind == "matrix":
         return np.asarray((b.matrix - a.matrix).ravel())
     if kind == "offset":
-        return b.offset - a.offset
+        return np.asarray((b.offset - a.offset) / MICROTESLA)
     if kind == "rotation":
         return _turn_between(a.body_from_sensor, b.body_from_sensor)
     return b.position_body - a.position_body
@@ -77,14 +82,14 @@ def _cylindrical(field_world: Array) -> tuple[float, Array]:
 def moved_earth(site: Site, kind: str, step: Array) -> Site:
     """Return a site whose Earth field is turned about the vertical, or changed in strength.
 
-    ``declination`` is one angle (rad), ``strength`` the horizontal and the vertical part (T).
+    ``declination`` is one angle (rad), ``strength`` the horizontal and the vertical part (uT).
     """
     assert site.earth_field_world is not None
     azimuth, parts = _cylindrical(site.earth_field_world)
     if kind == "declination":
         azimuth += float(step[0])
     else:
-        parts = parts + step
+        parts = parts + MICROTESLA * step
     field = [parts[0] * np.cos(azimuth), parts[0] * np.sin(azimuth), parts[1]]
     return replace(site, earth_field_world=np.array(field))
 
@@ -98,7 +103,7 @@ def earth_difference(old: Site, new: Site, kind: str) -> Array:
     )
     if kind == "declination":
         return np.array([np.angle(np.exp(1j * (turn_new - turn_old)))])
-    return parts_new - parts_old
+    return np.asarray((parts_new - parts_old) / MICROTESLA)
 
 
 def earth_directions(field_world: Array) -> dict[str, Array]:
@@ -107,5 +112,5 @@ def earth_directions(field_world: Array) -> dict[str, Array]:
     horizontal = np.array([x, y, 0.0]) / np.hypot(x, y)
     return {
         "declination": np.array([[-y], [x], [0.0]]),
-        "strength": np.column_stack([horizontal, [0.0, 0.0, 1.0]]),
+        "strength": MICROTESLA * np.column_stack([horizontal, [0.0, 0.0, 1.0]]),
     }

@@ -26,7 +26,7 @@ _AXES = "xyz"
 _UNITS = {"position": ("cm", 1e-2), "rotation": ("deg", DEGREE), "relative": ("%", 1e-2)}
 _UNITS |= {"phase": ("deg", DEGREE), "drift": ("ppm", 1e-6), "time_offset": ("ms", 1e-3)}
 _UNITS |= {"log_moment": ("%", 1e-2), "matrix": ("%", 1e-2)}
-_UNITS |= {"offset": ("nT", 1e-9), "strength": ("nT", 1e-9), "declination": ("deg", DEGREE)}
+_UNITS |= {"offset": ("nT", 1e-3), "strength": ("nT", 1e-3), "declination": ("deg", DEGREE)}
 _EARTH = {"declination": ("declination",), "strength": ("horizontal part", "vertical part")}
 
 

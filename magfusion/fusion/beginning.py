@@ -17,7 +17,7 @@ from magfusion.records.samples import FieldSamples, ImuSamples, Log, SteadyField
 from magfusion.site import Site
 from magfusion.strapdown import attitude_at, attitude_from_gyro, resting
 from magfusion.trajectory import Trajectory
-from magfusion.units import Array, BoolArray
+from magfusion.units import Array
 
 LEAST_HELD = 10  # epochs at which a beacon is heard; fewer are no beginning
 AVERAGING = 2.0  # s; over which the specific force is taken for gravity
@@ -57,7 +57,7 @@ def begin(
     held = np.asarray(samples.valid.any(axis=1))
     if steady is not None and np.sum(held) < LEAST_HELD:
         return [Beginning(_by_earth(samples, steady, log.imu, calibration.site), calibration, None)]
-    heard = samples if steady is None else _rows(samples, held)
+    heard = samples if steady is None else samples.rows(held)
     fixes = first_fixes(heard, log, calibration)
     offset = calibration.time_offset
     out = []
@@ -76,16 +76,6 @@ def with_rest_bias(states: Trajectory, imu: ImuSamples, time_offset: float) -> T
     shape = (len(states), 3)
     return replace(
         states, gyro_bias_body=np.broadcast_to(bias, shape).copy(), accel_bias_body=np.zeros(shape)
-    )
-
-
-def _rows(samples: FieldSamples, kept: BoolArray) -> FieldSamples:
-    return FieldSamples(
-        samples.time[kept],
-        samples.window[kept],
-        samples.channels,
-        samples.phasor_sensor[kept],
-        samples.phasor_cov[kept],
     )
 
 

@@ -31,7 +31,7 @@ AMBIENT_TIME = 2.0  # s; over which it stays the same
 DEVIATION_SPAN = 5.0  # s; over which the deviation of the field's size is averaged
 LEAST_HORIZONTAL = 1e-6  # T; less tells no heading
 HEARD = 100.0  # chi square of a phasor of six components against nothing
-ANYWHERE, ANY_ROTATION = 100.0, 1e3  # m, rad; of a platform that no beacon ever held
+ANYWHERE, ANY_ROTATION = 100.0, 10.0  # m, rad; of a platform that no beacon ever held
 SPEED_SIGMA, SPEED_TIME = 1.0, 2.0  # m/s, s; a platform that no beacon holds stays where it is
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from magfusion.observation import EarthObservation, observe_earth
 from magfusion.parameters import Block, Calibration, dimension
-from magfusion.site_moves import earth_directions
+from magfusion.site_moves import MICROTESLA, earth_directions
 from magfusion.units import Array
 
 
@@ -72,7 +72,7 @@ def _columns(
     if block.group == "earth":
         return np.asarray(seen.earth_world @ earth_directions(field_world)[block.kind])
     if block.group == "magnetometer":
-        return seen.matrix if block.kind == "matrix" else seen.offset
+        return seen.matrix if block.kind == "matrix" else MICROTESLA * seen.offset
     if block.group == "extrinsics" and block.kind == "rotation":
         return seen.sensor_rotation
     if block.kind == "time_offset":

@@ -72,7 +72,7 @@ class NavigatorSettings:
     lag: float = 4.0
     delay: float = 0.0
     start_duration: float = 6.0
-    longest_step: float = 10.0
+    longest_step: float = 5.0
     estimate: tuple[str, ...] | None = None
     lockin: LockinSettings | None = None
     earth: bool = False
@@ -166,13 +166,13 @@ class Navigator:
         """
         check_clock("fields", samples.time, self._newest)
         for i in range(len(samples)):
-            one = _row(samples, i)
+            one = samples.rows(slice(i, i + 1))
             if self._estimator is not None and one.time[0] <= self._estimator.state.time:
                 self.counts["field too late"] += 1
                 continue
             self._fields.append(one)
             if steady is not None and self._earth is not None:
-                self._steady[float(one.time[0])] = steady.row(i)
+                self._steady[float(one.time[0])] = steady.rows(slice(i, i + 1))
         self._fields.sort(key=lambda s: float(s.time[0]))
         self._advance()
 
@@ -584,17 +584,6 @@ def restored(checkpoint: bytes) -> Navigator:
     found = pickle.loads(checkpoint)
     assert isinstance(found, Navigator)
     return found
-
-
-def _row(samples: FieldSamples, i: int) -> FieldSamples:
-    rows = slice(i, i + 1)
-    return FieldSamples(
-        samples.time[rows],
-        samples.window[rows],
-        samples.channels,
-        samples.phasor_sensor[rows],
-        samples.phasor_cov[rows],
-    )
 
 
 def _behind(block: Block, columns: int) -> Block:

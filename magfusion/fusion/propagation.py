@@ -123,7 +123,7 @@ def calibration_walk(blocks: tuple[Block, ...]) -> Array:
     hour = 3600.0
     per_hour = {
         **{"log_moment": 1e-3, "phase": 0.02, "drift": 1e-8},
-        **{"offset": 2e-8, "declination": 0.05, "strength": 1e-6},
+        **{"offset": 0.02, "declination": 0.05, "strength": 1.0},
     }
     return np.concatenate(
         [np.full(len(b.sigma), per_hour.get(b.kind, 0.0) ** 2 / hour) for b in blocks]

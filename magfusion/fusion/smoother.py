@@ -295,11 +295,19 @@ def marginals(
     """
     calibrated = bool(problem.blocks)
     ordering = nested_dissection(problem.epochs, CALIBRATION_KEY if calibrated else None)
-    tree = _eliminate(linearized(problem, estimate), ordering)
+    graph = linearized(problem, estimate)
+    tree = _eliminate(graph, ordering)
     poses = np.array([tree.marginalCovariance(X(i)) for i in range(problem.epochs)])
     calibration = np.zeros((0, 0))
     if calibrated:
-        calibration = np.array(tree.marginalCovariance(CALIBRATION_KEY))
+        try:
+            calibration = np.array(tree.marginalCovariance(CALIBRATION_KEY))
+        except RuntimeError:  # as in _eliminate, which a tree does not offer
+            states = nested_dissection(problem.epochs, None)
+            _, rest = graph.eliminatePartialSequential(states, gtsam.EliminateQR)
+            keys = gtsam.Ordering()
+            keys.push_back(CALIBRATION_KEY)
+            calibration = np.linalg.inv(rest.hessian(keys)[0])
     if held and problem.fields is not None:
         by_pose, by_calibration = _responses(problem, estimate, held)
         poses += np.einsum("hni,hnj->nij", by_pose, by_pose)

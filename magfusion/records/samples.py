@@ -87,6 +87,16 @@ class FieldSamples:
     def __len__(self) -> int:
         return len(self.time)
 
+    def rows(self, kept: BoolArray | slice) -> "FieldSamples":
+        """Return some epochs."""
+        return FieldSamples(
+            self.time[kept],
+            self.window[kept],
+            self.channels,
+            self.phasor_sensor[kept],
+            self.phasor_cov[kept],
+        )
+
     @property
     def valid(self) -> BoolArray:
         """Which channels each row holds, shape (n, channels)."""
@@ -114,10 +124,9 @@ class SteadyFields:
     def __len__(self) -> int:
         return len(self.time)
 
-    def row(self, i: int) -> "SteadyFields":
-        """Return one row, as an epoch of its own."""
-        rows = slice(i, i + 1)
-        return SteadyFields(self.time[rows], self.measured_sensor[rows], self.cov[rows])
+    def rows(self, kept: BoolArray | slice) -> "SteadyFields":
+        """Return some epochs."""
+        return SteadyFields(self.time[kept], self.measured_sensor[kept], self.cov[kept])
 
 
 @dataclass(frozen=True, eq=False)
