@@ -1,4 +1,4 @@
-"""How good is an attitude from gyro, accelerometer and the Earth field alone?
+"""How good an attitude gyro, accelerometer and the Earth field give alone.
 
 Where no beacon is heard the Earth field still tells the heading, and gravity the tilt.  Two logs
 are navigated without any of their beacons' tones: a simulated one of turning by hand, and, where it

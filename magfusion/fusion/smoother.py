@@ -307,7 +307,7 @@ def marginals(
             _, rest = graph.eliminatePartialSequential(states, gtsam.EliminateQR)
             keys = gtsam.Ordering()
             keys.push_back(CALIBRATION_KEY)
-            calibration = np.linalg.inv(rest.hessian(keys)[0])
+            calibration = np.array(np.linalg.inv(rest.hessian(keys)[0]))
     if held and problem.fields is not None:
         by_pose, by_calibration = _responses(problem, estimate, held)
         poses += np.einsum("hni,hnj->nij", by_pose, by_pose)

@@ -250,10 +250,17 @@ def fit_windows(operator: WindowOperator, rows: slice, measured_sensor: Array) -
     phasor = (cosine - 1j * sine) * reference[..., None]
     diagonal = np.einsum("nii->ni", inverse)
     unit = 0.5 * (diagonal[:, 2 : 2 + n] + diagonal[:, 2 + n : 2 + 2 * n])
-    steady = coefficients[:, 0], diagonal[:, 0]
-    real = [np.asarray(p, dtype=np.float64) for p in (unit, *steady, elapsed)]
-    rest = [np.asarray(part, dtype=np.float64) for part in (design, inverse, turned)]
-    return _Fit(phasor, *real, weight, *rest)
+    return _Fit(
+        phasor=phasor,
+        unit_variance=np.asarray(unit),
+        constant=np.asarray(coefficients[:, 0]),
+        constant_variance=np.asarray(diagonal[:, 0]),
+        elapsed=elapsed,
+        weight=weight,
+        design=np.asarray(design),
+        inverse=np.asarray(inverse),
+        turned=np.asarray(turned),
+    )
 
 
 def _design(elapsed: Array, window: float, frequencies: Array, nuisances: Array) -> Array:
