@@ -40,7 +40,7 @@ def last_state(result: Smoothed, held: tuple[Block, ...] = ()) -> State:
     except RuntimeError:  # an ill-conditioned stretch: QR needs half the digits
         _, rest = graph.eliminatePartialSequential(earlier, gtsam.EliminateQR)
     information, _ = rest.hessian(kept)
-    cov = _with_held(np.linalg.inv(information), result, estimate, held)
+    cov = _with_held(np.asarray(np.linalg.inv(information)), result, estimate, held)
     assert states.velocity_world is not None
     assert states.accel_bias_body is not None
     assert states.gyro_bias_body is not None

@@ -149,7 +149,7 @@ class SlidingWindow:
         last = len(self.nodes) - 1
         solved, rest = _eliminated(graph, _keys(range(last), None))
         information, vector = rest.hessian(_keys([last], self.calibration_key))
-        cov = np.linalg.inv(information)
+        cov = np.asarray(np.linalg.inv(information))
         step, cov = considered(cov @ vector, cov, self._held_cov, self.held)
         if not np.all(np.isfinite(step)):
             raise EstimationError("the window's step is not finite")

@@ -37,6 +37,7 @@ GATE = 38.3  # chi square of six components, one in a million
 WIDE_POSITION, WIDE_ROTATION = 0.3, 0.2  # m, rad; beyond, the prediction is no place to linearise
 LOST_EPOCHS = 5  # in a row, most of whose channels were refused: the state is wrong, not they
 REST_SIGMA = 0.01  # m/s
+KNOWN_SPEED = 0.1  # m/s; a velocity less well known is not called none
 REST_SPAN = 1.0  # s
 REST_GATE = 30.7  # chi square of three components, one in a million: days have many rests
 RATE_SPAN = 0.08  # s; motion is slower, noise is not
@@ -531,6 +532,10 @@ class Navigator:
         stamp = state.time - self._applied_offset
         time, rows = self._imu.between(stamp - REST_SPAN - 0.1, stamp + 0.1)
         if len(time) < 10 or time[0] > stamp - REST_SPAN or time[-1] < stamp - 0.1:
+            return False
+        # A gap looks quiet, and a velocity that nobody knows contradicts nothing.
+        known = np.max(np.diag(state.cov)[6:9]) < KNOWN_SPEED**2
+        if not known or np.max(np.diff(time)) > 0.1:
             return False
         still = resting(time, rows[:, :3], rows[:, 3:], REST_SPAN - 0.1)
         if not still[np.searchsorted(time, stamp - REST_SPAN / 2)]:
