@@ -152,9 +152,13 @@ def test_without_any_field_the_clock_goes_on(walk: OnlineLog, estimator: Estimat
     holed = replace(walk, fields=_rows(fields, kept))
     _, states = navigate(holed, NavigatorSettings(estimator))
     times = np.array([s.time for s in states])
-    assert np.max(np.diff(times)) == pytest.approx(10.0, abs=0.5)  # the longest step
+    longest = NavigatorSettings().longest_step
+    assert np.max(np.diff(times)) == pytest.approx(longest, abs=0.05 * longest)
     sigma = [s.position_sigma for s in states if 25.0 < s.time < 60.0]
-    assert np.all(np.diff(sigma) > 0.0)
+    known = [s.position_sigma for s in states if 20.0 < s.time < 25.0]
+    # Not ever larger: where the walk pauses, the velocity is told.
+    assert np.min(sigma) > 5.0 * np.max(known)
+    assert np.max(sigma) > 5.0 * np.min(sigma)
     time, error = distance(walk, states)
     assert np.max(error[time > 62.0]) < 0.005  # m
 
