@@ -250,7 +250,7 @@ def _quarters(run: WorldRun) -> tuple[Array, Array]:
 def _resting(pace: Array) -> Array:
     """Return the pieces of full length: those between the phasors of a walk are shorter."""
     length = np.diff(pace[:, TIME], append=np.inf)
-    return np.asarray(pace[(np.abs(length - PIECE) < 1e-6) & (pace[:, UPDATES] == 1.0)])
+    return np.asarray(pace[np.abs(length - PIECE) < 1e-6])
 
 
 def _rms(value: Array) -> float:
