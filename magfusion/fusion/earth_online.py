@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from magfusion.fusion.earth import (
+    AMBIENT_TIME,
     DISTURBED,
     EARTH_LOSS,
     earth_cov,
@@ -20,7 +21,7 @@ from magfusion.parameters import Block
 from magfusion.records.samples import FieldSamples, SteadyFields
 from magfusion.units import Array, IntArray
 
-GATE = 30.7  # chi square of three components, one in a million
+GATE = 16.3  # chi square of three components, one in a thousand
 
 
 class EarthWatch:
@@ -35,6 +36,7 @@ class EarthWatch:
     def __init__(self, blocks: tuple[Block, ...]) -> None:
         self.blocks = blocks
         self._heard_for: IntArray | None = None  # epochs in a row, by channel
+        self._refused_at = -np.inf  # s
 
     def heard(self, samples: FieldSamples, step: float) -> FieldSamples:
         """Return an epoch's samples without the beacons that are not heard.
@@ -59,7 +61,8 @@ class EarthWatch:
         measurements : FieldMeasurements
         steady : SteadyFields
         state : State
-            As predicted: the farther from it, the less the field counts, and at last nothing.
+            As predicted: the farther from it, the less the field counts, and at last nothing; nor
+            for a while after, since what lets go for an epoch would be followed where it leads.
         step : float
             Since the epoch before (s).
         """
@@ -68,7 +71,11 @@ class EarthWatch:
         assert measured.earth_repeats is not None
         rows = field_rows(single(measured, self.blocks), state)
         distance = _distance(rows.error[-6:-3], rows.jacobian[-6:-3], state.cov, measured)
-        weight = float(robust_weight(distance, EARTH_LOSS, components=3)[0]) * bool(distance < GATE)
+        weight = float(robust_weight(distance, EARTH_LOSS, components=3)[0])
+        if distance > GATE:
+            self._refused_at = state.time
+        if state.time - self._refused_at < AMBIENT_TIME:
+            weight = 0.0
         root = measured.root.copy()
         root[:, -1] *= np.sqrt(weight)
         return replace(measured, root=root), bool(weight < DISTURBED)
