@@ -9,10 +9,10 @@ from pathlib import Path
 
 from magfusion.drift_plot import write_plot
 from magfusion.errors import InputError
-from magfusion.evaluation.drift import Course, Verdict
+from magfusion.evaluation.drift import Course, Verdict, settled_after
 from magfusion.files import whole_file
 from magfusion.job import UNFINISHED_DRIFT, claim
-from magfusion.jobs.drift_figures import MINUTE, Finding, judged, minutes, settled
+from magfusion.jobs.drift_figures import MINUTE, Finding, judged, minutes
 from magfusion.jobs.drift_world import (
     Estimator,
     WorldRun,
@@ -158,7 +158,7 @@ def summarise(settings: DriftSettings, runs: list[WorldRun]) -> Figures:
         found, told = judged(estimator, own)
         figures |= found
         findings += told
-    settled_h = float(settled(runs[0]).time[0]) / 3600.0
+    settled_h = settled_after(settings.hours) / 3600.0
     head: Figures = {
         "job": "drift",
         "log": f"{settings.hours:g} h in {settings.worlds} world(s)",
