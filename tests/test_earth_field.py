@@ -14,7 +14,8 @@ from magfusion.cli import main
 from magfusion.errors import InputError
 from magfusion.evaluation.errors import trajectory_errors
 from magfusion.fusion.batch import SmootherSettings, smooth
-from magfusion.fusion.earth import HEARD, check_earth, earth_cov, heard
+from magfusion.fusion.earth import check_earth, earth_cov
+from magfusion.fusion.hearing import HEARD, heard
 from magfusion.fusion.online import Navigator, NavigatorSettings
 from magfusion.fusion.source import open_source
 from magfusion.fusion.state import as_trajectory

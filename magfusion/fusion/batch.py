@@ -9,8 +9,9 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.fixes.fix import Fixes
 from magfusion.fusion.beginning import begin, with_rest_bias
-from magfusion.fusion.earth import EARTH_LOSS, check_earth, earth_cov, heard, hold, only, with_earth
+from magfusion.fusion.earth import EARTH_LOSS, check_earth, earth_cov, hold, with_earth
 from magfusion.fusion.factors import FieldFactors, FieldMeasurements, read_poses
+from magfusion.fusion.hearing import heard, only
 from magfusion.fusion.inertial import cut_at_epochs, low_passed, preintegrate
 from magfusion.fusion.loose import survey_cov
 from magfusion.fusion.smoother import (

@@ -1,4 +1,4 @@
-"""How much the Earth field counts as a measurement, and which beacons are heard beside it.
+"""How much the Earth field counts as a measurement.
 
 Indoors the field's direction is disturbed, by iron that no model knows.  Three things keep that
 from the attitude.  The disturbance lasts as long as the platform is near the iron, so that all of
@@ -14,15 +14,14 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import V, X
-from scipy.ndimage import binary_erosion
 
 from magfusion.errors import InputError
 from magfusion.fusion.factors import FieldMeasurements, robust_weight
-from magfusion.records.samples import FieldSamples, SteadyFields
+from magfusion.records.samples import SteadyFields
 from magfusion.site import Site
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array, BoolArray
-from magfusion.weights import paired_whitening, whitening
+from magfusion.weights import paired_whitening
 
 EARTH_LOSS = "geman-mcclure"
 DISTURBED = 0.25  # weight below which the field is told to be disturbed
@@ -30,7 +29,6 @@ AMBIENT_SHARE = 0.005  # of the field's size: usual disturbance of each componen
 AMBIENT_TIME = 2.0  # s; over which it stays the same
 DEVIATION_SPAN = 5.0  # s; over which the deviation of the field's size is averaged
 LEAST_HORIZONTAL = 1e-6  # T; less tells no heading
-HEARD = 100.0  # chi square of a phasor of six components against nothing
 ANYWHERE, ANY_ROTATION = 100.0, 10.0  # m, rad; of a platform that no beacon ever held
 SPEED_SIGMA, SPEED_TIME = 1.0, 2.0  # m/s, s; a platform that no beacon holds stays where it is
 
@@ -103,31 +101,6 @@ def with_earth(
         root=np.concatenate([measurements.root, root], axis=1),
         by_time_offset=np.concatenate([measurements.by_time_offset, still], axis=1),
         earth_repeats=repeats,
-    )
-
-
-def heard(samples: FieldSamples) -> BoolArray:
-    """Tell which phasors are of a beacon, shape (n, channels): more than noise, and for longer.
-
-    A window in which a beacon falls silent, or begins, holds a part of its tone that nothing tells;
-    those that overlap a window without the beacon are therefore not of it.
-    """
-    root = whitening(samples.phasor_cov, samples.valid)
-    phasor = np.nan_to_num(samples.phasor_sensor)[..., None]
-    square = np.abs(root @ phasor.real) ** 2 + np.abs(root @ phasor.imag) ** 2
-    loud = samples.valid & (np.sum(square, axis=(-1, -2)) > HEARD)
-    if len(samples) < 2:
-        return np.asarray(loud)
-    step = float(np.median(np.diff(samples.time)))
-    reach = int(np.ceil(np.median(samples.window) / step - 1e-6))
-    whole = np.ones((2 * reach + 1, 1), dtype=bool)
-    return np.asarray(binary_erosion(loud, whole, border_value=1))
-
-
-def only(samples: FieldSamples, channels: BoolArray) -> FieldSamples:
-    """Return samples with the other channels missing."""
-    return replace(
-        samples, phasor_sensor=np.where(channels[..., None], samples.phasor_sensor, np.nan)
     )
 
 

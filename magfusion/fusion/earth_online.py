@@ -1,4 +1,4 @@
-"""The Earth field in an online estimator: which beacons are heard beside it, how much it counts."""
+"""The Earth field in an online estimator: how much it counts."""
 
 from dataclasses import replace
 
@@ -9,8 +9,6 @@ from magfusion.fusion.earth import (
     DISTURBED,
     EARTH_LOSS,
     earth_cov,
-    heard,
-    only,
     speed_sigma,
     with_earth,
 )
@@ -18,8 +16,8 @@ from magfusion.fusion.epoch import field_rows, single
 from magfusion.fusion.factors import FieldMeasurements, robust_weight
 from magfusion.fusion.state import State
 from magfusion.parameters import Block
-from magfusion.records.samples import FieldSamples, SteadyFields
-from magfusion.units import Array, IntArray
+from magfusion.records.samples import SteadyFields
+from magfusion.units import Array
 
 GATE = 16.3  # chi square of three components, one in a thousand
 
@@ -35,21 +33,7 @@ class EarthWatch:
 
     def __init__(self, blocks: tuple[Block, ...]) -> None:
         self.blocks = blocks
-        self._heard_for: IntArray | None = None  # epochs in a row, by channel
         self._refused_at = -np.inf  # s
-
-    def heard(self, samples: FieldSamples, step: float) -> FieldSamples:
-        """Return an epoch's samples without the beacons that are not heard.
-
-        One that begins to be heard is passed over until a window holds nothing of its silence; one
-        that ends is for the gate, which knows what to expect of it.
-        """
-        loud = heard(samples)
-        reach = int(np.ceil(samples.window[0] / step - 1e-6))
-        if self._heard_for is None:
-            self._heard_for = np.full(loud.shape[1], reach)
-        self._heard_for = np.where(loud[0], self._heard_for + 1, 0)
-        return only(samples, loud & (self._heard_for > reach))
 
     def weighed(
         self, measurements: FieldMeasurements, steady: SteadyFields, state: State, step: float

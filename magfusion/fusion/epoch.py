@@ -6,8 +6,12 @@ import numpy as np
 
 from magfusion.fusion.factors import FieldFactors, FieldMeasurements, Poses
 from magfusion.fusion.state import MOTION, State
+from magfusion.fusion.wave import WaveFields
 from magfusion.parameters import Block
+from magfusion.records.samples import FieldSamples
+from magfusion.trajectory import Trajectory
 from magfusion.units import Array, BoolArray
+from magfusion.weights import measurement_cov, paired_whitening, sensor_positions, stacked
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +80,46 @@ def without(measurements: FieldMeasurements, rejected: BoolArray) -> FieldMeasur
     """Return an epoch's measurements with some channels taken out."""
     root = np.where(rejected[None, :, None, None], 0.0, measurements.root)
     return replace(measurements, root=root)
+
+
+def measured_at(
+    samples: FieldSamples,
+    wave: WaveFields | None,
+    state: State,
+    rate_body: Array,
+    applied_offset: float,
+    step: float,
+) -> FieldMeasurements:
+    """Return an epoch as the estimators take it, weighed at a predicted state.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        One epoch.
+    wave : WaveFields, optional
+        Where it was demodulated about a prediction.
+    state : State
+    rate_body : ndarray, shape (3,)
+        Angular rate without its bias (rad/s).
+    applied_offset : float
+        IMU time offset with which the state was propagated (s).
+    step : float
+        Time since the epoch before (s): overlapping windows hold the same samples, and that must
+        not count twice.
+    """
+    site = state.calibration.site
+    pose = Trajectory(samples.time, state.world_from_body[None], state.position_world[None])
+    cov = measurement_cov(site, samples, sensor_world=sensor_positions(site, pose))
+    cov = cov * max(1.0, float(samples.window[0]) / step)
+    shape = (*samples.phasor_sensor.shape[:2], 6)
+    return FieldMeasurements(
+        time=samples.time,
+        measured=stacked(samples.phasor_sensor),
+        root=paired_whitening(cov, samples.valid),
+        rate_body=rate_body[None],
+        applied_offset=applied_offset,
+        by_time_offset=np.zeros(shape) if wave is None else stacked(wave.by_time_offset),
+    )
 
 
 def single(measurements: FieldMeasurements, blocks: tuple[Block, ...]) -> FieldFactors:

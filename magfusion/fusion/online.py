@@ -5,7 +5,6 @@ on request at any time since.
 """
 
 import pickle
-from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -16,35 +15,32 @@ from magfusion.fusion.buffers import Buffer, check_clock
 from magfusion.fusion.earth import check_earth
 from magfusion.fusion.earth_online import EarthWatch
 from magfusion.fusion.ekf import ErrorStateFilter
-from magfusion.fusion.epoch import channel_distances, field_rows, single, without
+from magfusion.fusion.epoch import measured_at, single
 from magfusion.fusion.factors import FieldMeasurements
+from magfusion.fusion.gate import Gate
+from magfusion.fusion.hearing import Hearing
 from magfusion.fusion.navigator import SlidingWindow
 from magfusion.fusion.outset import Outset, find_outset
-from magfusion.fusion.propagation import Propagated, calibration_walk, propagate
-from magfusion.fusion.receive import OnlineReceiver
-from magfusion.fusion.recovery import AgreedFix, agreed_fix, prior_of
+from magfusion.fusion.propagation import (
+    Propagated,
+    calibration_walk,
+    online_blocks,
+    propagate,
+)
+from magfusion.fusion.receive import OnlineReceiver, inertial_gap
+from magfusion.fusion.recovery import agreed_fix, placed, prior_of, restarted
 from magfusion.fusion.state import MOTION, State
-from magfusion.parameters import Block, choose_blocks, dimension, held_blocks
+from magfusion.fusion.stillness import REACH, REST_SIGMA, REST_SPAN, stands
 from magfusion.receiver.windows import LockinSettings
 from magfusion.records.samples import FieldSamples, ImuSamples, SteadyFields
 from magfusion.site import Site
-from magfusion.strapdown import resting
-from magfusion.trajectory import Trajectory
 from magfusion.units import Array, BoolArray
-from magfusion.weights import measurement_cov, paired_whitening, sensor_positions, stacked
 
-GATE = 38.3  # chi square of six components, one in a million
 WIDE_POSITION, WIDE_ROTATION = 0.3, 0.2  # m, rad; beyond, the prediction is no place to linearise
-LOST_EPOCHS = 5  # in a row, most of whose channels were refused: the state is wrong, not they
-REST_SIGMA = 0.01  # m/s
-KNOWN_SPEED = 0.1  # m/s; a velocity less well known is not called none
-REST_SPAN = 1.0  # s
-REST_GATE = 30.7  # chi square of three components, one in a million: days have many rests
 RATE_SPAN = 0.08  # s; motion is slower, noise is not
 LONGEST_WAIT = 5.0  # s; the fields go on without an IMU that is silent for longer
 LOST_POSITION = 10.0  # m; a prediction wider than this is worth nothing
 OFFSET_STALE = 1e-4  # s; at a radian a second, six thousandths of a degree
-SPEED_SIGMA = 1.0  # m/s; of a state that was found again
 
 
 @dataclass(frozen=True)
@@ -96,8 +92,6 @@ class Navigator:
     ----------
     counts : Counter
         What was refused, lost and recovered, with the reason.
-    distortion : dict of str to float
-        By beacon, running mean of the squared innovation in units of its expectation.
     """
 
     def __init__(self, site: Site, settings: NavigatorSettings | None = None) -> None:
@@ -106,12 +100,10 @@ class Navigator:
         earth = self.settings.earth
         if earth:
             check_earth(site)
-        estimated = choose_blocks(site, self.settings.estimate, earth=earth)
-        held = held_blocks(site, estimated, earth=earth)
-        self._held = dimension(held)
-        self.blocks = (*estimated, *(_behind(b, dimension(estimated)) for b in held))
-        self.counts: Counter[str] = Counter()
-        self.distortion: dict[str, float] = {}
+        self.blocks, self._held = online_blocks(site, self.settings.estimate, earth=earth)
+        self._hearing = Hearing()
+        self._gate = Gate(site.channels, self.blocks)
+        self.counts = self._gate.counts
         self._walk = calibration_walk(self.blocks)
         self._walk[len(self._walk) - self._held :] = 0.0
         self._imu = Buffer("imu", 6)
@@ -124,7 +116,6 @@ class Navigator:
         self._applied_offset = site.platform.imu.time_offset
         self._usual: float | None = None  # sampling interval of the IMU (s)
         self._next_start = self.settings.start_duration
-        self._refused_in_a_row = 0
         self._last_epoch_time = -np.inf
         self._made: list[State] = []
         self.rival_chi_square: float | None = None
@@ -215,6 +206,11 @@ class Navigator:
         if wanted <= last.time:
             return last
         return self._propagated(wanted).state
+
+    @property
+    def distortion(self) -> dict[str, float]:
+        """By beacon, running mean of the squared innovation in units of its expectation."""
+        return self._gate.distortion
 
     @property
     def lagged(self) -> State | None:
@@ -345,7 +341,7 @@ class Navigator:
         half = receiver.settings.window / 2.0
         begin, end = receiver.next_centre - half, receiver.next_centre + half
         imu = self._imu_samples(self._estimator.state.time - 0.1, end + 0.1)
-        silent = _has_gap(imu.time + self._applied_offset, begin, end)
+        silent = inertial_gap(imu.time + self._applied_offset, begin, end)
         if receiver.next_centre <= self._estimator.state.time:
             self.counts["window too late"] += 1
         elif receiver.usable(self._waveform, silent):
@@ -376,14 +372,10 @@ class Navigator:
                 samples, predicted
             ):
                 return
-            about, refused = None, np.zeros(len(samples.channels), dtype=bool)
-            if _wide(predicted.state):
-                state = predicted.state
-                fix = agreed_fix(samples, state.calibration, prior_of(state))
-                about = self._found(fix, predicted)
-                refused = refused if fix is None else fix.refused
-            measurements = self._gated(measurements, samples, predicted, about, refused)
-            if self._refused_in_a_row >= LOST_EPOCHS and self._found_again(samples, predicted):
+            about, refused = self._about(samples, predicted.state)
+            explained = predicted.state if about is None else about
+            measurements = self._gate.passed(measurements, explained, samples.valid[0], refused)
+            if self._gate.lost and self._found_again(samples, predicted):
                 return
         slow = None
         if measurements is not None and self._earth is not None and steady is not None:
@@ -407,7 +399,7 @@ class Navigator:
             self._estimator.absorb(predicted, factors, rest, about)
         except EstimationError:
             self.counts["update failed"] += 1
-            self._refused_in_a_row += 1
+            self._gate.refused_in_a_row += 1
             self._estimator.replace_state(predicted.state)
         self._finish()
 
@@ -472,25 +464,12 @@ class Navigator:
             )
             wave = receiver.demodulate(self._waveform, imu, before, state, self._applied_offset)
             samples, steady = wave.fields, wave.steady
-        if self._earth is not None:
-            samples = self._earth.heard(samples, step)
+        samples = self._hearing.of(samples, step)
         if not np.any(samples.valid) and (self._earth is None or steady is None):
             return None, None, None
-        pose = Trajectory(samples.time, state.world_from_body[None], state.position_world[None])
-        calibrated = state.calibration.site
-        cov = measurement_cov(calibrated, samples, sensor_world=sensor_positions(calibrated, pose))
         self._last_epoch_time = state.time
-        # Overlapping windows hold the same samples: that must not count twice.
-        cov = cov * max(1.0, float(samples.window[0]) / step)
-        shape = (*samples.phasor_sensor.shape[:2], 6)
-        measurements = FieldMeasurements(
-            time=samples.time,
-            measured=stacked(samples.phasor_sensor),
-            root=paired_whitening(cov, samples.valid),
-            rate_body=(self._rate(state.time) - state.gyro_bias_body)[None],
-            applied_offset=self._applied_offset,
-            by_time_offset=np.zeros(shape) if wave is None else stacked(wave.by_time_offset),
-        )
+        rate_body = self._rate(state.time) - state.gyro_bias_body
+        measurements = measured_at(samples, wave, state, rate_body, self._applied_offset, step)
         return measurements, samples, steady
 
     def _rate(self, time: float) -> Array:
@@ -498,65 +477,22 @@ class Navigator:
         _, rows = self._imu.between(stamp - RATE_SPAN / 2, stamp + RATE_SPAN / 2)
         return np.asarray(np.mean(rows[:, :3], axis=0)) if len(rows) else np.zeros(3)
 
-    def _gated(
-        self,
-        measurements: FieldMeasurements,
-        samples: FieldSamples,
-        predicted: Propagated,
-        about: State | None,
-        refused: BoolArray,
-    ) -> FieldMeasurements:
-        """Refuse the channels that the prediction does not explain."""
-        state = predicted.state if about is None else about
-        rows = field_rows(single(measurements, self.blocks), state)
-        channels = len(self.site.channels)
-        distance = channel_distances(rows, state.cov, channels)
-        valid = samples.valid[0]
-        rejected: BoolArray = np.asarray((distance > GATE) | refused) & valid
-        self._note_distortion(distance, valid)
-        for name, _ in np.array(self.site.channels, dtype=object)[rejected]:
-            self.counts[f"outlier of {name}"] += 1
-        most = np.sum(rejected) > 0.5 * np.sum(valid)
-        self._refused_in_a_row = self._refused_in_a_row + 1 if most else 0
-        return without(measurements, rejected) if np.any(rejected) else measurements
-
-    def _note_distortion(self, distance: Array, valid: BoolArray) -> None:
-        for name in dict.fromkeys(beacon for beacon, _ in self.site.channels):
-            own = np.array([beacon == name for beacon, _ in self.site.channels]) & valid
-            if np.any(own):
-                level = float(np.mean(distance[own])) / 6.0
-                self.distortion[name] = 0.95 * self.distortion.get(name, level) + 0.05 * level
-
     def _rests(self, state: State) -> bool:
-        """Tell whether the platform stands: the IMU is quiet and nothing says that it moves."""
         stamp = state.time - self._applied_offset
-        time, rows = self._imu.between(stamp - REST_SPAN - 0.1, stamp + 0.1)
-        if len(time) < 10 or time[0] > stamp - REST_SPAN or time[-1] < stamp - 0.1:
-            return False
-        # A gap looks quiet, and a velocity that nobody knows contradicts nothing.
-        known = np.max(np.diag(state.cov)[6:9]) < KNOWN_SPEED**2
-        if not known or np.max(np.diff(time)) > 0.1:
-            return False
-        still = resting(time, rows[:, :3], rows[:, 3:], REST_SPAN - 0.1)
-        if not still[np.searchsorted(time, stamp - REST_SPAN / 2)]:
-            return False
-        spread = state.cov[6:9, 6:9] + REST_SIGMA**2 * np.eye(3)
-        velocity = state.velocity_world
-        return bool(velocity @ np.linalg.solve(spread, velocity) < REST_GATE)
+        time, rows = self._imu.between(stamp - REST_SPAN - REACH, stamp + REACH)
+        return stands(state, time, rows[:, :3], rows[:, 3:], stamp)
 
     # Being lost, and found again
 
-    def _found(self, fix: AgreedFix | None, predicted: Propagated) -> State | None:
-        """Return where a fix finds the platform, if the prediction is too wide to tell."""
+    def _about(self, samples: FieldSamples, state: State) -> tuple[State | None, BoolArray]:
+        """Return where to linearise if a prediction is too wide for it, and what disagrees."""
+        nothing = np.zeros(len(samples.channels), dtype=bool)
+        wide = state.position_sigma > WIDE_POSITION or state.rotation_sigma > WIDE_ROTATION
+        fix = agreed_fix(samples, state.calibration, prior_of(state)) if wide else None
         if fix is None:
-            return None
-        best = fix.fixes.best()
+            return None, nothing
         self.counts["found by a fix"] += 1
-        return replace(
-            predicted.state,
-            world_from_body=best.world_from_body[0],
-            position_world=best.position_world[0],
-        )
+        return placed(state, fix), fix.refused
 
     def _found_again(self, samples: FieldSamples, predicted: Propagated) -> bool:
         """Give the pose up that explains nothing any more, and start from a fix."""
@@ -564,22 +500,9 @@ class Navigator:
         fix = agreed_fix(samples, predicted.state.calibration)
         if fix is None or not fix.fixes.determined[0, 0]:
             return False
-        best = fix.fixes.best()
-        assert best.pose_cov is not None
-        cov = predicted.state.cov.copy()
-        cov[:9] = cov[:, :9] = 0.0
-        cov[:6, :6] = 4.0 * best.pose_cov[0]
-        cov[6:9, 6:9] = SPEED_SIGMA**2 * np.eye(3)
-        state = replace(
-            predicted.state,
-            world_from_body=best.world_from_body[0],
-            position_world=best.position_world[0],
-            velocity_world=np.zeros(3),
-            cov=cov,
-        )
         self.counts["lost and found again"] += 1
-        self._refused_in_a_row = 0
-        self._estimator.replace_state(state)
+        self._gate.refused_in_a_row = 0
+        self._estimator.replace_state(restarted(predicted.state, fix))
         self._finish()
         return True
 
@@ -589,21 +512,3 @@ def restored(checkpoint: bytes) -> Navigator:
     found = pickle.loads(checkpoint)
     assert isinstance(found, Navigator)
     return found
-
-
-def _behind(block: Block, columns: int) -> Block:
-    """Return a block moved to the right in the tangent."""
-    own = slice(block.columns.start + columns, block.columns.stop + columns)
-    return block._replace(columns=own)
-
-
-def _wide(state: State) -> bool:
-    return state.position_sigma > WIDE_POSITION or state.rotation_sigma > WIDE_ROTATION
-
-
-def _has_gap(time: Array, begin: float, end: float) -> bool:
-    if len(time) < 2 or time[0] > begin + 0.02 or time[-1] < end - 0.02:
-        return True
-    step = float(np.median(np.diff(time)))
-    wide = np.diff(time) > 3.0 * step
-    return bool(np.any(wide & (time[:-1] < end) & (time[1:] > begin)))

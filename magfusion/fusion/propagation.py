@@ -8,7 +8,7 @@ from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.fusion.inertial import cut_at_epochs, preintegrate
 from magfusion.fusion.state import MOTION, State, pose_of
-from magfusion.parameters import Block
+from magfusion.parameters import Block, choose_blocks, dimension, held_blocks
 from magfusion.records.samples import ImuSamples
 from magfusion.site import Site
 from magfusion.units import Array
@@ -129,3 +129,19 @@ def calibration_walk(blocks: tuple[Block, ...]) -> Array:
         [np.full(len(b.sigma), per_hour.get(b.kind, 0.0) ** 2 / hour) for b in blocks]
         or [np.zeros(0)]
     )
+
+
+def online_blocks(
+    site: Site, estimate: tuple[str, ...] | None, *, earth: bool
+) -> tuple[tuple[Block, ...], int]:
+    """Return the calibration in an online estimator's tangent, and how much of it is held.
+
+    What is estimated comes first, then what is only considered.
+    """
+    estimated = choose_blocks(site, estimate, earth=earth)
+    held = held_blocks(site, estimated, earth=earth)
+    behind = dimension(estimated)
+    moved = tuple(
+        b._replace(columns=slice(b.columns.start + behind, b.columns.stop + behind)) for b in held
+    )
+    return (*estimated, *moved), dimension(held)

@@ -15,6 +15,7 @@ from magfusion.trajectory import Trajectory
 from magfusion.units import Array
 
 LEAST_SHARE = 0.9  # of the samples that a window should hold
+EDGE = 0.02  # s; of a window that the inertial stream may leave out
 SATURATED_RUN = 3  # consecutive samples at the extreme of all that was seen
 
 
@@ -130,3 +131,12 @@ def _path(states: list[State]) -> Trajectory:
         gyro_bias_body=np.array([s.gyro_bias_body for s in states]),
         accel_bias_body=np.array([s.accel_bias_body for s in states]),
     )
+
+
+def inertial_gap(time: Array, begin: float, end: float) -> bool:
+    """Tell whether inertial samples at these times leave a part of a window without any."""
+    if len(time) < 2 or time[0] > begin + EDGE or time[-1] < end - EDGE:
+        return True
+    step = float(np.median(np.diff(time)))
+    wide = np.diff(time) > 3.0 * step
+    return bool(np.any(wide & (time[:-1] < end) & (time[1:] > begin)))

@@ -17,6 +17,7 @@ from magfusion.units import BoolArray, ComplexArray
 
 MOST_REFUSED = 2  # beacons
 DOUBT = 1e-6  # probability of a worse agreement
+SPEED_SIGMA = 1.0  # m/s; of a state that was found again
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,25 @@ def prior_of(state: State) -> Trajectory:
         position_world=state.position_world[None],
         pose_cov=state.cov[None, :6, :6],
     )
+
+
+def placed(state: State, fix: AgreedFix) -> State:
+    """Return a state at the pose of a fix, all else as it is: a place to linearise at."""
+    best = fix.fixes.best()
+    return replace(
+        state, world_from_body=best.world_from_body[0], position_world=best.position_world[0]
+    )
+
+
+def restarted(state: State, fix: AgreedFix) -> State:
+    """Return a state that knows its pose from a fix alone; biases and calibration are kept."""
+    best = fix.fixes.best()
+    assert best.pose_cov is not None
+    cov = state.cov.copy()
+    cov[:9] = cov[:, :9] = 0.0
+    cov[:6, :6] = 4.0 * best.pose_cov[0]
+    cov[6:9, 6:9] = SPEED_SIGMA**2 * np.eye(3)
+    return replace(placed(state, fix), velocity_world=np.zeros(3), cov=cov)
 
 
 def agreed_fix(
