@@ -11,8 +11,9 @@ from magfusion.fusion.ekf import ErrorStateFilter
 from magfusion.fusion.epoch import field_rows, single
 from magfusion.fusion.factors import FieldMeasurements
 from magfusion.fusion.navigator import SlidingWindow
-from magfusion.fusion.propagation import calibration_walk, propagate
+from magfusion.fusion.propagation import propagate
 from magfusion.fusion.state import MOTION, State, between, moved
+from magfusion.fusion.walk import Walk, calibration_walk
 from magfusion.observation import observe_earth
 from magfusion.parameters import GROUPS, choose_blocks, dimension, initial_calibration, prior_sigma
 from magfusion.records.samples import ImuSamples, SteadyFields
@@ -118,7 +119,7 @@ def test_one_update_of_the_filter_is_one_gauss_newton_step_of_the_graph(
     fields = epoch if with_fields else None
     light = ErrorStateFilter(start, blocks)
     light.absorb(predicted, fields, rest)
-    still = np.zeros(dimension(blocks))
+    still = Walk(blocks, np.zeros(dimension(blocks)))
     window = SlidingWindow(
         start, blocks, 10.0, still, epoch.measurements.applied_offset, earth=earth
     )
@@ -167,7 +168,7 @@ def test_the_rows_of_an_epoch_are_its_derivative(earth):
 def test_the_calibration_gains_variance_only_where_things_drift():
     site = a_site(synchronised=False)
     blocks = choose_blocks(site, GROUPS, earth=True)
-    walk = calibration_walk(blocks)
+    walk = calibration_walk(blocks).variance
     drifting = ("log_moment", "phase", "drift", "offset", "declination", "strength")
     for block in blocks:
         drifts = block.kind in drifting
@@ -198,3 +199,22 @@ def test_the_covariance_carried_on_is_that_of_many_runs():
     # Means of neighbouring samples carry a little less noise at the interval's ends.
     ratio = found / np.sqrt(np.diag(mean.cov)[:9])
     assert np.all((ratio > 0.85) & (ratio < 1.15))
+
+
+def test_a_frequency_that_changes_now_has_not_turned_the_phase_before():
+    """The variance of the phase now is that of its own walk, however long the clock has run."""
+    site = a_site(synchronised=False)
+    blocks = choose_blocks(site, ("phase",))
+    walk = calibration_walk(blocks)
+    calibration = initial_calibration(site, 0.0)
+    for time in (0.0, 1e5):
+        gained = walk.cov(calibration, time, 2.0)
+        for beacon in site.beacons:
+            own = {b.kind: b.columns for b in blocks if b.owner == beacon.name}
+            rate = 2.0 * np.pi * beacon.tone_frequencies_hz[0] * time
+            by = np.zeros(dimension(blocks))
+            by[own["phase"]], by[own["drift"]] = 1.0, rate
+            expected = 2.0 * walk.variance[own["phase"]][0]
+            assert by @ gained @ by == pytest.approx(expected, rel=1e-6)
+            drift = own["drift"].start
+            assert gained[drift, drift] == 2.0 * walk.variance[drift]

@@ -15,6 +15,7 @@ from magfusion.errors import EstimationError
 from magfusion.fusion.factors import CALIBRATION_KEY, FieldFactors, FieldMeasurements
 from magfusion.fusion.propagation import Propagated
 from magfusion.fusion.state import MOTION, State, between, considered, moved_to, pose_of
+from magfusion.fusion.walk import Walk
 from magfusion.parameters import Block, dimension, retract
 from magfusion.units import Array
 
@@ -63,8 +64,8 @@ class SlidingWindow:
         Calibration parameters in its tangent.
     lag : float
         Length of the window (s).
-    calibration_noise : ndarray, shape (calibration,)
-        Variance that the calibration gains in a second.
+    walk : Walk
+        Of the calibration.
     applied_offset : float
         IMU time offset with which the inertial data are cut (s).
     earth : bool
@@ -78,7 +79,7 @@ class SlidingWindow:
         state: State,
         blocks: tuple[Block, ...],
         lag: float,
-        calibration_noise: Array,
+        walk: Walk,
         applied_offset: float,
         *,
         earth: bool = False,
@@ -86,7 +87,7 @@ class SlidingWindow:
     ) -> None:
         self.held, self._held_cov = held, state.cov
         self.applied_offset, self.earth = applied_offset, earth
-        self.blocks, self.lag, self.calibration_noise = blocks, lag, calibration_noise
+        self.blocks, self.lag, self.walk = blocks, lag, walk
         self.state = self.lagged = state
         self.left: list[State] = []  # the window, in order of time
         self.nodes: list[Node] = []
@@ -231,7 +232,8 @@ class SlidingWindow:
         graph = self._linearized([first, replace(second, rest_sigma=None, fields=_blank(second))])
         _, rest = graph.eliminatePartialSequential(_keys([0], None), gtsam.EliminateQR)
         root, right = rest.jacobian(_keys([1], self.calibration_key))
-        noise = self.calibration_noise * (second.state.time - first.state.time)
+        passed = second.state.time - first.state.time
+        noise = self.walk.cov(second.state.calibration, second.state.time, passed)
         root, right = self._carried(root, right, noise)
         self.prior = Prior(second.state, root, right)
         self.lagged = replace(first.state, cov=cov)
@@ -247,8 +249,7 @@ class SlidingWindow:
             return root, right
         inverse = np.linalg.inv(root)
         mean, cov = considered(inverse @ right, inverse @ inverse.T, self._held_cov, self.held)
-        rows = np.arange(MOTION, size)
-        cov[rows, rows] += noise
+        cov[MOTION:, MOTION:] += noise
         wide = np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
         return wide, wide @ mean
 

@@ -21,16 +21,12 @@ from magfusion.fusion.gate import Gate
 from magfusion.fusion.hearing import Hearing
 from magfusion.fusion.navigator import SlidingWindow
 from magfusion.fusion.outset import Outset, find_outset
-from magfusion.fusion.propagation import (
-    Propagated,
-    calibration_walk,
-    online_blocks,
-    propagate,
-)
+from magfusion.fusion.propagation import Propagated, online_blocks, propagate
 from magfusion.fusion.receive import OnlineReceiver, inertial_gap
 from magfusion.fusion.recovery import agreed_fix, placed, prior_of, restarted
 from magfusion.fusion.state import MOTION, State
 from magfusion.fusion.stillness import REACH, REST_SIGMA, REST_SPAN, stands
+from magfusion.fusion.walk import calibration_walk
 from magfusion.receiver.windows import LockinSettings
 from magfusion.records.samples import FieldSamples, ImuSamples, SteadyFields
 from magfusion.site import Site
@@ -104,8 +100,7 @@ class Navigator:
         self._hearing = Hearing()
         self._gate = Gate(site.channels, self.blocks)
         self.counts = self._gate.counts
-        self._walk = calibration_walk(self.blocks)
-        self._walk[len(self._walk) - self._held :] = 0.0
+        self._walk = calibration_walk(self.blocks, self._held)
         self._imu = Buffer("imu", 6)
         self._waveform = Buffer("magnetometer", 3)
         self._fields: list[FieldSamples] = []

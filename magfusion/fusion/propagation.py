@@ -8,6 +8,7 @@ from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.fusion.inertial import cut_at_epochs, preintegrate
 from magfusion.fusion.state import MOTION, State, pose_of
+from magfusion.fusion.walk import Walk
 from magfusion.parameters import Block, choose_blocks, dimension, held_blocks
 from magfusion.records.samples import ImuSamples
 from magfusion.site import Site
@@ -42,7 +43,7 @@ def propagate(
     time: float,
     site: Site,
     time_offset: float,
-    calibration_noise: Array | None = None,
+    walk: Walk | None = None,
     usual: float | None = None,
 ) -> Propagated:
     """Carry a state on to a later time.
@@ -61,8 +62,8 @@ def propagate(
         Its IMU's noise and its gravity.
     time_offset : float
         Added to the IMU's stamps (s).
-    calibration_noise : ndarray, shape (calibration,), optional
-        Variance that the calibration gains in a second.
+    walk : Walk, optional
+        Of the calibration.
     usual : float, optional
         Sampling interval of the IMU (s), as in `cut_at_epochs`.
 
@@ -91,9 +92,8 @@ def propagate(
     cov[:MOTION] = transition @ cov[:MOTION]
     cov[:, :MOTION] = cov[:, :MOTION] @ transition.T
     cov[:MOTION, :MOTION] += noise
-    if calibration_noise is not None:
-        rows = np.arange(MOTION, len(cov))
-        cov[rows, rows] += calibration_noise * (time - state.time)
+    if walk is not None:
+        cov[MOTION:, MOTION:] += walk.cov(state.calibration, time, time - state.time)
     return Propagated(replace(later, cov=cov), measurement, bool(increments.bridged[0]))
 
 
@@ -110,25 +110,6 @@ def _linear(
     rows, _ = factor.linearize(values).jacobian()
     root = np.linalg.inv(rows[:, _AFTER])
     return np.asarray(-root @ rows[:, _BEFORE]), np.asarray(root @ root.T)
-
-
-def calibration_walk(blocks: tuple[Block, ...]) -> Array:
-    """Return the variance that each calibration parameter gains in a second.
-
-    What warms up or drifts does so in hours: log-moments by a thousandth, the phase and frequency
-    of a free oscillator by a degree and 0.01 ppm, a magnetometer's offset by 20 nT.  Where the
-    platform goes in that time the Earth field is another, by 3 degrees and a microtesla.  What is
-    screwed down stays.
-    """
-    hour = 3600.0
-    per_hour = {
-        **{"log_moment": 1e-3, "phase": 0.02, "drift": 1e-8},
-        **{"offset": 0.02, "declination": 0.05, "strength": 1.0},
-    }
-    return np.concatenate(
-        [np.full(len(b.sigma), per_hour.get(b.kind, 0.0) ** 2 / hour) for b in blocks]
-        or [np.zeros(0)]
-    )
 
 
 def online_blocks(
