@@ -78,6 +78,14 @@ def test_each_fault_fails_its_own_verdict(changes, failing):
     assert verdicts(**changes)[failing] == "fail"
 
 
+@pytest.mark.parametrize(("slope_deg", "verdict"), [(3.0, "fail"), (0.1, "undecided")])
+def test_one_world_alone_drifts_only_by_more_than_it_claims(slope_deg, verdict):
+    """Biases walk: a line through one walk is no drift."""
+    _, findings = judged("ekf", [a_run(0, slope=np.deg2rad(slope_deg))])
+    found = {f.name: f.verdict for f in findings}
+    assert found["ekf_attitude_drift"] == verdict
+
+
 def test_the_figures_tell_the_slope():
     runs = [a_run(world, slope=np.deg2rad(3.0)) for world in range(8)]
     slope = drift_of(QUANTITIES[1], runs)
