@@ -133,20 +133,9 @@ def navigate(world: World, estimator: Estimator, config: Config) -> tuple[list[S
             navigator.add_imu(
                 world.imu.time[rows], world.imu.gyro_body[rows], world.imu.accel_body[rows]
             )
-        navigator.add_fields(_row(world.fields, int(k)))
+        navigator.add_fields(world.fields.rows(slice(int(k), int(k) + 1)))
         made += navigator.take()
     return made, navigator
-
-
-def _row(fields: FieldSamples, k: int) -> FieldSamples:
-    rows = slice(k, k + 1)
-    return FieldSamples(
-        fields.time[rows],
-        fields.window[rows],
-        fields.channels,
-        fields.phasor_sensor[rows],
-        fields.phasor_cov[rows],
-    )
 
 
 def errors(world: World, found: Trajectory) -> Array:

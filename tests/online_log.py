@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -115,7 +116,7 @@ def navigate(
     states: list[State] = []
     arrival = fields.time + WINDOW / 2.0 + late
     edges = np.arange(0.0, imu.time[-1] + chunk, chunk)
-    for begin, end in zip(edges[:-1], edges[1:], strict=True):
+    for begin, end in pairwise(edges):
         own = slice(*np.searchsorted(imu.time, [begin, end]))
         navigator.add_imu(imu.time[own], imu.gyro_body[own], imu.accel_body[own])
         for k in range(*np.searchsorted(arrival, [begin, end])):

@@ -63,7 +63,7 @@ def navigated(
         rows = slice(*np.searchsorted(imu.time, [fields.time[k] - 0.5, fields.time[k] + 0.5]))
         start = time.process_time()
         navigator.add_imu(imu.time[rows], imu.gyro_body[rows], imu.accel_body[rows])
-        navigator.add_fields(one_row(fields, k))
+        navigator.add_fields(fields.rows(slice(k, k + 1)))
         updates.append(time.process_time() - start)
         navigator.take()
         navigator.take_lagged()
@@ -80,18 +80,6 @@ def navigated(
         "last_to_first": float(np.median(own[-part:]) / np.median(own[:part])),
         "memory_growth_mib": memory_mib() - before,
     }
-
-
-def one_row(fields: FieldSamples, k: int) -> FieldSamples:
-    """Return one epoch."""
-    rows = slice(k, k + 1)
-    return FieldSamples(
-        fields.time[rows],
-        fields.window[rows],
-        fields.channels,
-        fields.phasor_sensor[rows],
-        fields.phasor_cov[rows],
-    )
 
 
 def bare_loop(site: Site, imu: ImuSamples) -> float:

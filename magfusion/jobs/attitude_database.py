@@ -11,7 +11,7 @@ from magfusion.errors import InputError
 from magfusion.fixes.matching import predict_field
 from magfusion.fixes.matching_database import build_database, prepare
 from magfusion.job import Job, claim, named, read_estimate, read_job
-from magfusion.match_plot import write_database_plot
+from magfusion.plots.match import write_database_plot
 from magfusion.receiver.windows import sample_rate_hz
 from magfusion.records.attitude_table import write_database
 from magfusion.records.samples import Log

@@ -16,7 +16,6 @@ from magfusion.antenna import (
     antenna_from_vector,
     antenna_of,
 )
-from magfusion.antenna_plot import write_antenna_plot
 from magfusion.calibration.antenna import (
     AntennaFit,
     AntennaSurvey,
@@ -29,6 +28,7 @@ from magfusion.calibration.antenna_observability import Observability, observabi
 from magfusion.errors import EstimationError, InputError
 from magfusion.fixes.tracker import locate_by_svd, refine_poses, whitened
 from magfusion.job import claim, named
+from magfusion.plots.antenna import write_antenna_plot
 from magfusion.records.survey import Survey, read_survey
 from magfusion.report import Figures, write_report
 from magfusion.site import Beacon, Site

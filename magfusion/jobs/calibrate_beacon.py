@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.beacon_plot import BeaconPanel, write_beacon_plot
 from magfusion.calibration.beacon import REACH, BeaconFits, BeaconMeasurements
 from magfusion.calibration.beacon_refined import RefinedBeacon, calibrate_one
 from magfusion.errors import InputError
 from magfusion.job import claim, named
 from magfusion.observation import model_error_cov, predict
+from magfusion.plots.beacon import BeaconPanel, write_beacon_plot
 from magfusion.records.survey import Survey, read_survey
 from magfusion.refinement import DETERMINED_RATIO, Finding
 from magfusion.report import AMBIGUOUS_CHI_SQUARE, Figures, write_report

@@ -8,10 +8,10 @@ import numpy as np
 
 from magfusion.calibration.fieldmap import MapFit, MapPoints, learn_field_map, thinned
 from magfusion.errors import EstimationError, InputError
-from magfusion.fieldmap_plot import write_plot
 from magfusion.fusion.source import open_source
 from magfusion.job import Job, claim, named, read_estimate, read_job
 from magfusion.parameters import initial_calibration
+from magfusion.plots.fieldmap import write_plot
 from magfusion.records.samples import FieldSamples, Log
 from magfusion.records.survey import Survey, read_survey
 from magfusion.report import Figures, dropped_figures, write_report

@@ -14,7 +14,7 @@ from magfusion.evaluation.transfer import Estimated, agreement
 from magfusion.fusion.batch import Smoothed, SmootherSettings, smooth
 from magfusion.fusion.self_survey import smooth_and_place
 from magfusion.job import Job, claim, named, read_job
-from magfusion.log_calibration_plot import write_log_calibration_plot
+from magfusion.plots.log_calibration import write_log_calibration_plot
 from magfusion.records.samples import Log
 from magfusion.refinement import Finding, findings, refined_site
 from magfusion.report import (

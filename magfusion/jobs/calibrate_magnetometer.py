@@ -9,7 +9,7 @@ from magfusion.calibration.magnetometer import field_from_measured, spread
 from magfusion.calibration.magnetometer_log import LogCalibration, calibrate_log
 from magfusion.errors import InputError
 from magfusion.job import Job, claim, named, read_job
-from magfusion.magnetometer_plot import write_magnetometer_plot
+from magfusion.plots.magnetometer import write_magnetometer_plot
 from magfusion.records.samples import Log
 from magfusion.report import Figures, write_report
 from magfusion.site import Magnetometer, Site

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from magfusion.coverage_plot import write_plot
 from magfusion.errors import InputError
 from magfusion.evaluation.coverage import (
     Coverage,
@@ -17,6 +16,7 @@ from magfusion.evaluation.coverage import (
     volume,
 )
 from magfusion.job import claim, named
+from magfusion.plots.coverage import write_plot
 from magfusion.receiver.windows import default_settings
 from magfusion.records.table import write_table
 from magfusion.report import Figures, write_report

@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from magfusion.drift_plot import write_plot
 from magfusion.errors import InputError
 from magfusion.evaluation.drift import Course, Verdict, settled_after
 from magfusion.files import whole_file
@@ -22,6 +21,7 @@ from magfusion.jobs.drift_world import (
     stretches_done,
 )
 from magfusion.monte_carlo import run_many
+from magfusion.plots.drift import write_plot
 from magfusion.report import Figures, write_report
 from magfusion.view_drift import write_drift_recording
 

@@ -18,7 +18,7 @@ from magfusion.files import whole_file
 from magfusion.fusion.inertial import preintegration_parameters
 from magfusion.fusion.online import Navigator, NavigatorSettings, restored
 from magfusion.fusion.state import ACCEL_BIAS, GYRO_BIAS, State, pose_of
-from magfusion.records.samples import FieldSamples, ImuSamples
+from magfusion.records.samples import ImuSamples
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.endurance import (
     Biases,
@@ -193,7 +193,7 @@ def navigate(navigator: Navigator, world: World, made: Stretch) -> tuple[ErrorSe
         rows = slice(inertial[i], inertial[i + 1])
         began = time.process_time()
         for k in range(heard[i], heard[i + 1]):
-            navigator.add_fields(_epoch(made.fields, k))
+            navigator.add_fields(made.fields.rows(slice(k, k + 1)))
         navigator.add_imu(made.imu.time[rows], made.imu.gyro_body[rows], made.imu.accel_body[rows])
         new = navigator.take()
         spent = time.process_time() - began
@@ -305,15 +305,4 @@ def _rows_path(place: Path, number: int) -> Path:
 def _joined(parts: list[ErrorSeries]) -> ErrorSeries:
     return ErrorSeries(
         **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ErrorSeries)}
-    )
-
-
-def _epoch(samples: FieldSamples, i: int) -> FieldSamples:
-    row = slice(i, i + 1)
-    return FieldSamples(
-        samples.time[row],
-        samples.window[row],
-        samples.channels,
-        samples.phasor_sensor[row],
-        samples.phasor_cov[row],
     )

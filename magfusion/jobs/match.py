@@ -25,8 +25,8 @@ from magfusion.fixes.matching_database import (
 )
 from magfusion.job import Job, claim, named, read_job
 from magfusion.jobs.attitude_database import MAX_GAP, TABLE, Sampling, Steady, steady
-from magfusion.match_plot import write_match_plot
 from magfusion.physics.earth import earth_field_world
+from magfusion.plots.match import write_match_plot
 from magfusion.records.attitude_table import read_database, write_attitudes
 from magfusion.records.samples import Log
 from magfusion.report import Figures, write_report

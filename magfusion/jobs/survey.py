@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.fusion.source import phasors
 from magfusion.job import Job, claim, named, read_estimate, read_job
+from magfusion.plots.survey import write_survey_plot
 from magfusion.records.samples import FieldSamples, Log
 from magfusion.records.survey import Survey, write_survey
 from magfusion.report import Figures, dropped_figures, write_report
 from magfusion.site import Site
 from magfusion.strapdown import resting
-from magfusion.survey_plot import write_survey_plot
 from magfusion.trajectory import Trajectory, interpolate
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
