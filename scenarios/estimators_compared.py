@@ -2,8 +2,8 @@
 
 Every estimator sees the same samples through the same measurement model.  The batch smoother knows
 the whole log; the fixed-lag smoother and the error-state filter take it as it comes, from a start
-they find themselves.  Where the survey is exact, the filter's position errs by about twice the
-batch's, the lagged output by about half as much more.
+they find themselves.  Where the survey is exact, the filter's position errs by a quarter more
+than the batch's, and what leaves the window by hardly more.
 
 Where the survey is wrong by centimetres the comparison asks for more than there is: the trajectory
 of a calibrated log stands in a frame that the log itself defines, and that frame moves by a

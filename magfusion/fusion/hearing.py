@@ -68,5 +68,7 @@ class Hearing:
         reach = int(np.ceil(samples.window[0] / step - 1e-6))
         if self._heard_for is None:
             self._heard_for = np.full(loud.shape[1], reach)
-        self._heard_for = np.where(loud[0], self._heard_for + 1, 0)
+        # What an epoch does not hold (another slot's tone) has not fallen silent.
+        counted = np.where(loud[0], self._heard_for + 1, 0)
+        self._heard_for = np.where(samples.valid[0], counted, self._heard_for)
         return only(samples, loud & (self._heard_for > reach))
