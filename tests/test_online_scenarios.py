@@ -28,7 +28,7 @@ def test_a_vehicle_comes_through_everything_that_goes_wrong(
 
 @pytest.mark.slow
 def test_what_not_knowing_the_future_costs() -> None:
-    config = estimators_compared.Config(duration=60.0, instants=3)
+    config = estimators_compared.Config(duration=60.0, instants=6)
     rows = {row.estimator: row for row in estimators_compared.run(config)}
     batch = rows["batch, tight"].position_cm
     assert rows["fixed lag, lagged"].position_cm < 1.5 * batch
