@@ -141,10 +141,6 @@ class SlidingWindow:
         self.nodes, self.prior = [], _prior_of(state)
         self.state = self.lagged = state
 
-    def rebuilt(self) -> None:
-        """Shorten the window to its last state."""
-        self.replace_state(self.state)
-
     def _iterate(self) -> None:
         graph = self._linearized(self.nodes)
         last = len(self.nodes) - 1
