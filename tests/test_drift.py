@@ -6,9 +6,11 @@ from scipy.signal import lfilter
 
 from magfusion.evaluation.drift import (
     DAY,
+    THREE_SIGMA,
     ErrorSeries,
     Slope,
     allan_deviation,
+    common_slope,
     evenly,
     in_windows,
     settled_after,
@@ -74,6 +76,41 @@ def test_a_slope_that_is_there_is_found_and_one_that_is_not_is_not():
     for true, verdict in ((0.0, "pass"), (2.0, "fail")):
         values = [true * MINUTES / DAY + correlated(rng, 600.0) for _ in range(8)]
         assert slope_over_worlds([MINUTES] * 8, values).verdict(0.5) == verdict
+
+
+HOURS = 3600.0 * np.arange(48.0)
+
+
+def test_chance_alone_goes_beyond_three_standard_errors_as_rarely_as_it_says():
+    rng = np.random.default_rng(9)
+    correlations = np.array([[1.0, 0.0, 0.0], [0.9, 0.3, 0.0], [0.0, 0.5, 2.0]])
+    draws = 3000
+    found = [
+        common_slope([HOURS] * 8, list(rng.standard_normal((8, 48, 3)) @ correlations)).probability
+        for _ in range(draws)
+    ]
+    for level in (0.05, THREE_SIGMA):
+        spread = np.sqrt(level * (1.0 - level) / draws)
+        assert abs(np.mean(np.array(found) < level) - level) < 3.5 * spread
+
+
+def test_what_goes_one_way_is_found_although_no_error_becomes_longer():
+    """Half of the worlds err along the drift, half against it."""
+    rng = np.random.default_rng(10)
+    drift = np.outer(HOURS / DAY, [0.0, 0.3, 0.0])
+    worlds = [
+        [0.0, 5.0 * (-1.0) ** k, 0.0] + drift + 0.1 * rng.standard_normal((48, 3)) for k in range(8)
+    ]
+    length = slope_over_worlds([HOURS] * 8, [np.linalg.norm(w, axis=1) for w in worlds])
+    assert abs(length.per_day) < 3.0 * length.standard_error
+    common = common_slope([HOURS] * 8, worlds)
+    assert common.verdict == "fail"
+    assert np.allclose(common.per_day, [0.0, 0.3, 0.0], atol=5.0 * common.standard_error.max())
+
+
+def test_few_worlds_have_no_slope_in_common():
+    with pytest.raises(ValueError, match="at least 5 worlds"):
+        common_slope([HOURS] * 4, [np.zeros((48, 3))] * 4)
 
 
 def test_an_interval_on_both_sides_of_a_limit_tells_nothing():

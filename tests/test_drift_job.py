@@ -37,6 +37,7 @@ def a_run(world=0, *, slope=0.0, growth=0.0, slower=0.0, sigma_error=1.0, jump=0
             np.ones_like(PIECES),
             200.0 + growth * share,
             np.ones_like(PIECES),
+            np.full_like(PIECES, 3e-6),
         ]
     )
     measured = np.arange(len(stamps)) % 2 == 0
@@ -66,6 +67,7 @@ def test_an_estimator_that_stands_passes():
     ("changes", "failing"),
     [
         ({"slope": np.deg2rad(3.0)}, "attitude_drift"),
+        ({"slope": np.deg2rad(0.04)}, "attitude_common_drift"),
         ({"growth": 100.0}, "memory"),
         ({"slower": 2.0}, "latency"),
         ({"sigma_error": 2.0}, "pose_consistency"),
@@ -84,6 +86,23 @@ def test_one_world_alone_drifts_only_by_more_than_it_claims(slope_deg, verdict):
     _, findings = judged("ekf", [a_run(0, slope=np.deg2rad(slope_deg))])
     found = {f.name: f.verdict for f in findings}
     assert found["ekf_attitude_drift"] == verdict
+
+
+@pytest.mark.parametrize(("worlds", "verdict"), [(3, "undecided"), (4, "fail")])
+def test_sigmas_too_large_need_several_worlds_to_be_told_from_luck(worlds, verdict):
+    """One survey may happen to err little; not all of them."""
+    _, findings = judged("ekf", [a_run(world, sigma_error=0.5) for world in range(worlds)])
+    found = next(f for f in findings if f.name == "ekf_pose_consistency")
+    assert found.verdict == verdict
+    assert "too large" in found.sentence
+
+
+def test_the_machine_growing_slower_is_not_the_estimator_growing_slower():
+    run = a_run(0, slower=2.0)
+    slowed = np.array(run.pace)
+    slowed[:, 5] *= 1.0 + 2.0 * PIECES / PIECES[-1]
+    _, findings = judged("ekf", [replace(run, pace=slowed)])
+    assert {f.name: f.verdict for f in findings}["ekf_latency"] == "pass"
 
 
 def test_the_figures_tell_the_slope():

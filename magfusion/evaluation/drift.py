@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.stats import f as fisher
 from scipy.stats import t as student
 
 from magfusion.units import Array, BoolArray
@@ -16,6 +17,8 @@ from magfusion.units import Array, BoolArray
 DAY = 86_400.0  # s
 BLOCKS = 12  # of a single world's errors
 CONFIDENCE = 0.95
+FEWEST_COMMON = 5  # worlds whose scatter tells three slopes from none
+THREE_SIGMA = 0.0027  # how often chance alone goes beyond three standard errors
 # Columns of an error, as of the estimators' states.
 ATTITUDE, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 ACCEL_BIAS, GYRO_BIAS = slice(9, 12), slice(12, 15)
@@ -34,8 +37,9 @@ class ErrorSeries:
     measured : ndarray of bool, shape (n,)
         Whether a field was measured there; the states between are carried on by the IMU.
     error, sigma : ndarray, shape (n, 15)
-        Attitude (rad) and position (m) in body axes, velocity (m/s), biases of the accelerometer
-        (m/s^2) and the gyro (rad/s).
+        Attitude (rad), position (m) and velocity (m/s) in world axes, so that what goes one way
+        for days adds up whatever way the body looks; biases of the accelerometer (m/s^2) and the
+        gyro (rad/s) in body axes.
     pose_nees, bias_nees : ndarray, shape (n,)
         Normalised errors squared, of six degrees of freedom each.
     """
@@ -102,6 +106,59 @@ def within(low: float, high: float, limit: float) -> Verdict:
     if high < limit:
         return "pass"
     return "fail" if low > limit else "undecided"
+
+
+@dataclass(frozen=True, eq=False)
+class CommonSlope:
+    """What the components of an error have in common in all worlds: the way they go with time.
+
+    The length of an error hides it: a drift of a millimetre adds nothing to a constant error of a
+    centimetre that lies across it.
+
+    Parameters
+    ----------
+    per_day : ndarray, shape (3,)
+        Mean over the worlds.
+    standard_error : ndarray, shape (3,)
+        From their scatter.
+    probability : float
+        That chance alone gives slopes as far from none, by Hotelling's test of all three
+        components at once; below `THREE_SIGMA` they are beyond three standard errors.
+    """
+
+    per_day: Array
+    standard_error: Array
+    probability: float
+
+    @property
+    def verdict(self) -> Verdict:
+        """Tell whether the worlds drift one way."""
+        return "fail" if self.probability < THREE_SIGMA else "pass"
+
+
+def common_slope(times: Sequence[Array], values: Sequence[Array]) -> CommonSlope:
+    """Return the mean slope of the components of an error over worlds.
+
+    Parameters
+    ----------
+    times : sequence of ndarray, shape (n,)
+        One of each world (s).
+    values : sequence of ndarray, shape (n, 3)
+
+    Raises
+    ------
+    ValueError
+        With fewer than `FEWEST_COMMON` worlds, whose scatter in three components is not known.
+    """
+    worlds = len(values)
+    if worlds < FEWEST_COMMON:
+        raise ValueError(f"at least {FEWEST_COMMON} worlds are needed; got {worlds}")
+    rates = np.array([np.polyfit(t / DAY, v, 1)[0] for t, v in zip(times, values, strict=True)])
+    mean, cov = np.mean(rates, axis=0), np.cov(rates, rowvar=False) / worlds
+    square = float(mean @ np.linalg.solve(cov, mean))
+    freedom = worlds - 3
+    chance = float(fisher.sf(square * freedom / (3 * (worlds - 1)), 3, freedom))
+    return CommonSlope(mean, np.sqrt(np.diag(cov)), chance)
 
 
 def slope_of_one(time: Array, value: Array, blocks: int = BLOCKS) -> Slope:
@@ -248,8 +305,9 @@ class Course:
         At equal distances.
     interval : float
         These distances (s).
-    pace : ndarray, shape (pieces, 5)
-        Begin (s), processor time (s), updates, memory (MiB), squared innovation.
+    pace : ndarray, shape (pieces, 6)
+        Begin (s), processor time (s), updates, memory (MiB), squared innovation, processor time of
+        one sample of a bare loop at that time (s).
     """
 
     name: str

@@ -41,7 +41,7 @@ INSTABILITY = BiasInstability(gyro=1e-5, accel=1e-4, time=300.0)
 # What the user of such a drive declares of a moment (log): heat and wander.
 MOMENT_SIGMA = {"current": 0.005, "voltage": 0.08}
 Estimator = Literal["ekf", "smoother"]
-PACE = ("time", "seconds", "updates", "memory_mib", "distortion")
+PACE = ("time", "seconds", "updates", "memory_mib", "distortion", "bare_sample_seconds")
 
 
 @dataclass(frozen=True)
@@ -94,9 +94,10 @@ class WorldRun:
     task : WorldTask
     errors : ErrorSeries
         Of all states.
-    pace : ndarray, shape (pieces, 5)
+    pace : ndarray, shape (pieces, 6)
         Of each piece the columns `PACE`: begin, processor time (s), states made, resident memory
-        (MiB), mean squared innovation in units of its expectation.
+        (MiB), mean squared innovation in units of its expectation, processor time of the bare loop
+        for one sample in the same minutes (s), by which the machine's own mood cancels.
     bare_seconds : float
         Processor time of a bare loop over ``integrateMeasurement`` on all samples, extrapolated.
     losses : dict of str to int
@@ -158,9 +159,10 @@ def run_world(task: WorldTask, _rng: np.random.Generator | None = None) -> World
     kept: list[tuple[ErrorSeries, Array]] = []
     while progress.stretch < task.stretches:
         made = world.stretch(progress.stretch * STRETCH, STRETCH, progress.biases)
-        bare = bare_loop(made.imu, world.site.platform.imu, world.site.gravity)
+        sample = bare_loop(made.imu, world.site.platform.imu, world.site.gravity)
         errors, pace = navigate(navigator, world, made)
-        bare = progress.bare + bare * len(made.imu)
+        pace = np.column_stack([pace, np.full(len(pace), sample)])
+        bare = progress.bare + sample * len(made.imu)
         number = progress.stretch
         saved = navigator.checkpoint() if place is not None else b""
         progress = _Progress(number + 1, made.after, saved, bare)
@@ -181,7 +183,7 @@ def run_world(task: WorldTask, _rng: np.random.Generator | None = None) -> World
 
 
 def navigate(navigator: Navigator, world: World, made: Stretch) -> tuple[ErrorSeries, Array]:
-    """Feed a stretch piece by piece; return the errors of its states and the pace."""
+    """Feed a stretch piece by piece; return the errors of its states and their own pace."""
     states: list[State] = []
     pace = []
     # A field when it is measured, then the inertial samples up to the next one.
@@ -210,7 +212,7 @@ def navigate(navigator: Navigator, world: World, made: Stretch) -> tuple[ErrorSe
 
 
 def state_errors(states: list[State], truth: Trajectory, measured: BoolArray) -> ErrorSeries:
-    """Return what states err, in their own tangent space.
+    """Return what states err: attitude, position and velocity in world axes, biases in the body's.
 
     Parameters
     ----------
@@ -226,14 +228,17 @@ def state_errors(states: list[State], truth: Trajectory, measured: BoolArray) ->
     assert truth.gyro_bias_body is not None
     for i, state in enumerate(states):
         true = gtsam.Pose3(gtsam.Rot3(truth.world_from_body[i]), truth.position_world[i])
-        error[i, :6] = true.localCoordinates(pose_of(state))
-        error[i, 6:9] = state.velocity_world - truth.velocity_world[i]
-        error[i, ACCEL_BIAS] = state.accel_bias_body - truth.accel_bias_body[i]
-        error[i, GYRO_BIAS] = state.gyro_bias_body - truth.gyro_bias_body[i]
-        sigma[i] = np.sqrt(np.diag(state.cov)[:15])
+        own = np.empty(15)
+        own[:6] = true.localCoordinates(pose_of(state))
+        own[6:9] = state.velocity_world - truth.velocity_world[i]
+        own[ACCEL_BIAS] = state.accel_bias_body - truth.accel_bias_body[i]
+        own[GYRO_BIAS] = state.gyro_bias_body - truth.gyro_bias_body[i]
         for j, part in enumerate((slice(0, 6), slice(9, 15))):
-            own = error[i, part]
-            nees[i, j] = own @ np.linalg.solve(state.cov[part, part], own)
+            nees[i, j] = own[part] @ np.linalg.solve(state.cov[part, part], own[part])
+        turn = np.eye(15)
+        turn[:3, :3] = turn[3:6, 3:6] = truth.world_from_body[i]
+        error[i] = turn @ own
+        sigma[i] = np.sqrt(np.einsum("ij,jk,ik->i", turn, state.cov[:15, :15], turn))
     return ErrorSeries(truth.time, measured, error, sigma, nees[:, 0], nees[:, 1])
 
 
