@@ -7,7 +7,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from magfusion.evaluation.drift import QUANTITIES, Course
+from magfusion.evaluation.drift import HOUR, QUANTITIES, Course
 from magfusion.units import Array
 
 MOST_POINTS = 5000  # of a series
@@ -23,6 +23,7 @@ def write_drift_recording(path: Path, courses: list[Course], figures: Mapping[st
         recording.send_recording_name("drift")
         for course in courses:
             _log_errors(recording, course)
+            _log_consistency(recording, course)
             _log_pace(recording, course)
         notes = figures["notes"]
         assert isinstance(notes, list)
@@ -46,6 +47,13 @@ def _log_errors(recording: rr.RecordingStream, course: Course) -> None:
         both = np.stack([-sigma, sigma], axis=1)
         names = ["-3 sigma", "+3 sigma"]
         _send(recording, f"{place}/sigma", errors.time[rows], both, names, [_SIGMA, _SIGMA])
+
+
+def _log_consistency(recording: rr.RecordingStream, course: Course) -> None:
+    hours, levels = course.hourly()
+    for (name, level), colour in zip(levels.items(), _COLOURS, strict=True):
+        place = f"{course.name}/consistency/{name}"
+        _send(recording, place, HOUR * hours, level[:, None], [name], [colour])
 
 
 def _log_pace(recording: rr.RecordingStream, course: Course) -> None:
@@ -77,7 +85,7 @@ def _thinned(count: int) -> slice:
 def _blueprint(courses: list[Course]) -> rrb.Blueprint:
     columns = []
     for course in courses:
-        parts = [f"{q.name}_{q.unit}" for q in QUANTITIES] + ["pace"]
+        parts = [f"{q.name}_{q.unit}" for q in QUANTITIES] + ["consistency", "pace"]
         views = [
             rrb.TimeSeriesView(origin=f"{course.name}/{part}", name=f"{course.name} {part}")
             for part in parts

@@ -33,7 +33,7 @@ def a_run(world=0, *, slope=0.0, growth=0.0, slower=0.0, sigma_error=1.0, jump=0
     pace = np.column_stack(
         [
             PIECES,
-            2e-3 * (1.0 + slower * share),
+            2e-3 * (1.0 + slower * share) * rng.uniform(1.0, 1.02, len(PIECES)),
             np.ones_like(PIECES),
             200.0 + growth * share,
             np.ones_like(PIECES),
@@ -200,7 +200,12 @@ def test_the_command_writes_report_picture_and_recording(tmp_path, capsys):
     with pytest.raises(SystemExit) as stopped:
         main([*arguments, "--json", "-o", str(output)])
     assert not stopped.value.code
-    assert {p.name for p in output.iterdir()} == {"report.json", "drift.png", "run.rrd"}
+    assert {p.name for p in output.iterdir()} == {
+        "report.json",
+        "drift.png",
+        "stability.png",
+        "run.rrd",
+    }
     report = json.loads((output / "report.json").read_text())
     assert report == json.loads(capsys.readouterr().out.splitlines()[-1])
     assert report["job"] == "drift"

@@ -14,7 +14,7 @@ from scipy.stats import t as student
 
 from magfusion.units import Array, BoolArray
 
-DAY = 86_400.0  # s
+DAY, HOUR = 86_400.0, 3600.0  # s
 BLOCKS = 12  # of a single world's errors
 CONFIDENCE = 0.95
 FEWEST_COMMON = 5  # worlds whose scatter tells three slopes from none
@@ -280,7 +280,7 @@ class Quantity:
     limit: float
 
 
-DEG_PER_H = float(np.rad2deg(3600.0))
+DEG_PER_H = float(np.rad2deg(HOUR))
 QUANTITIES = (
     Quantity("position", "m", POSITION, 1.0, 2e-3),
     Quantity("attitude", "deg", ATTITUDE, float(np.rad2deg(1.0)), 0.05),
@@ -291,7 +291,7 @@ QUANTITIES = (
 
 def settled_after(hours: float) -> float:
     """Return when slopes begin to count (s): after twelve hours, or a quarter of a shorter run."""
-    return 3600.0 * min(12.0, 0.25 * hours)
+    return HOUR * min(12.0, 0.25 * hours)
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,16 +301,43 @@ class Course:
     Parameters
     ----------
     name : str
-    errors : ErrorSeries
-        At equal distances.
+    worlds : tuple of ErrorSeries
+        Errors in each world, at equal distances.
     interval : float
         These distances (s).
     pace : ndarray, shape (pieces, 6)
-        Begin (s), processor time (s), updates, memory (MiB), squared innovation, processor time of
-        one sample of a bare loop at that time (s).
+        Of the first world: begin (s), processor time (s), updates, memory (MiB), squared
+        innovation in units of its expectation, processor time of one sample of a bare loop at that
+        time (s).
     """
 
     name: str
-    errors: ErrorSeries
+    worlds: tuple[ErrorSeries, ...]
     interval: float
     pace: Array
+
+    @property
+    def errors(self) -> ErrorSeries:
+        """Errors in the first world."""
+        return self.worlds[0]
+
+    def hourly(self) -> tuple[Array, dict[str, Array]]:
+        """Return the middles of the hours (h) and means over all worlds of what is squared.
+
+        Returns
+        -------
+        time : ndarray, shape (hours,)
+        levels : dict of str to ndarray, shape (hours,)
+            Squared errors of pose and bias, and squared innovations of the first world, all in
+            units of what they should be.
+        """
+        edges = HOUR * np.arange(np.ceil(self.errors.time[-1] / HOUR) + 1)
+        time = np.concatenate([w.time for w in self.worlds])
+        levels = {
+            name: in_windows(time, np.concatenate([getattr(w, kind) for w in self.worlds]), edges)
+            / 6.0
+            for name, kind in (("pose", "pose_nees"), ("bias", "bias_nees"))
+        }
+        heard = self.pace[np.isfinite(self.pace[:, 4])]
+        levels["innovation"] = in_windows(heard[:, 0], heard[:, 4], edges)
+        return 0.5 * (edges[1:] + edges[:-1]) / HOUR, levels

@@ -21,7 +21,7 @@ from magfusion.jobs.drift_world import (
     stretches_done,
 )
 from magfusion.monte_carlo import run_many
-from magfusion.plots.drift import write_plot
+from magfusion.plots.drift import write_plot, write_stability
 from magfusion.report import Figures, write_report
 from magfusion.view_drift import write_drift_recording
 
@@ -142,9 +142,11 @@ def run_drift(settings: DriftSettings, output: Path, report: Report | None = Non
             workers=settings.workers,
         )
     figures = summarise(settings, runs)
+    drawn = courses(settings, runs)
     with claimed as directory:
-        write_plot(directory / "drift.png", courses(settings, runs), figures)
-        write_drift_recording(directory / "run.rrd", courses(settings, runs), figures)
+        write_plot(directory / "drift.png", drawn, figures)
+        write_stability(directory / "stability.png", drawn)
+        write_drift_recording(directory / "run.rrd", drawn, figures)
         write_report(directory, figures)
     return figures
 
@@ -182,11 +184,11 @@ def overall(verdicts: list[Verdict]) -> Verdict:
 
 
 def courses(settings: DriftSettings, runs: list[WorldRun]) -> list[Course]:
-    """Return what is drawn of each estimator: its errors in the first world, and its pace."""
+    """Return what is drawn of each estimator: its errors, and its pace in the first world."""
     out = []
     for estimator in settings.estimators:
-        run = next(r for r in runs if r.task.estimator == estimator)
-        out.append(Course(estimator, minutes(run), MINUTE, run.pace))
+        own = [r for r in runs if r.task.estimator == estimator]
+        out.append(Course(estimator, tuple(minutes(r) for r in own), MINUTE, own[0].pace))
     return out
 
 
