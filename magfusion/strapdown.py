@@ -3,10 +3,11 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.units import Array, BoolArray
+from magfusion.units import Array, BoolArray, IntArray
 
 REST_GYRO = 0.03  # rad/s; scatter of a still MEMS gyro, well below that of any motion
 REST_ACCEL = 0.25  # m/s^2
+CHUNK = 65_536  # samples at a time: what is computed of them stays in the cache
 
 
 def rotation_increments(time: Array, gyro_body: Array) -> Rotation:
@@ -81,13 +82,67 @@ def attitude_at(attitude: Rotation, time: Array, gyro_body: Array, wanted: Array
     Rotation
         m rotations.
     """
-    index = np.clip(np.searchsorted(time, wanted, side="right") - 1, 0, len(time) - 1)
+    index = _sample_before(time, wanted)
+    return attitude[index] * _turn_since(index, time, gyro_body, wanted)
+
+
+def attitude_from_gyro_at(time: Array, gyro_body: Array, wanted: Array) -> Rotation:
+    """Return the attitude at some times only: of a long stream it takes less than at every sample.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    gyro_body : ndarray, shape (n, 3)
+        (rad/s), bias removed.
+    wanted : ndarray, shape (m,)
+        Times (s); outside the stream the end rate is held.
+
+    Returns
+    -------
+    Rotation
+        m rotations, as of `attitude_at` on the chain of `attitude_from_gyro`.
+    """
+    index = _sample_before(time, wanted)
+    quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (len(wanted), 1))
+    carried = Rotation.identity()
+    for lo in range(0, len(time) - 1, CHUNK):
+        piece = slice(lo, lo + CHUNK + 1)
+        steps = rotation_increments(time[piece], gyro_body[piece])
+        here = np.flatnonzero((index > lo) & (index <= lo + len(steps)))
+        turned = carried * _products_of_first(steps, np.append(index[here] - lo, len(steps)))
+        quaternion[here] = turned[:-1].as_quat()
+        carried = turned[-1]
+    return Rotation.from_quat(quaternion) * _turn_since(index, time, gyro_body, wanted)
+
+
+def _products_of_first(rotations: Rotation, count: IntArray) -> Rotation:
+    """Products of the first rotations, as many as each count tells, by products of pairs."""
+    n = len(rotations)
+    if n == 1:
+        return Rotation.from_rotvec(count[:, None] * rotations.as_rotvec())
+    pairs = rotations[: n - 1 : 2] * rotations[1::2]
+    quaternion = _products_of_first(pairs, count // 2).as_quat()
+    odd = np.flatnonzero(count % 2)
+    if len(odd):
+        before = Rotation.from_quat(quaternion[odd])
+        quaternion[odd] = (before * rotations[count[odd] - 1]).as_quat()
+    return Rotation.from_quat(quaternion)
+
+
+def _sample_before(time: Array, wanted: Array) -> IntArray:
+    before = np.searchsorted(time, wanted, side="right") - 1
+    return np.asarray(np.clip(before, 0, len(time) - 1), dtype=np.int64)
+
+
+def _turn_since(index: IntArray, time: Array, gyro_body: Array, wanted: Array) -> Rotation:
+    """Return the turn from samples to the times that follow them."""
     after = np.minimum(index + 1, len(time) - 1)
     span = np.where(after > index, time[after] - time[index], 1.0)
     ahead = wanted - time[index]
     share = np.clip(0.5 * ahead / span, 0.0, 0.5)[:, None]
     rate = (1.0 - share) * gyro_body[index] + share * gyro_body[after]
-    return attitude[index] * Rotation.from_rotvec(rate * ahead[:, None])
+    return Rotation.from_rotvec(rate * ahead[:, None])
 
 
 def resting(time: Array, gyro_body: Array, accel_body: Array, span: float = 1.0) -> BoolArray:
@@ -110,14 +165,19 @@ def resting(time: Array, gyro_body: Array, accel_body: Array, span: float = 1.0)
     """
     lo = np.searchsorted(time, time - span / 2)
     hi = np.searchsorted(time, time + span / 2, side="right")
+    count = hi - lo
     quiet = np.ones(len(time), dtype=bool)
     for stream, limit in ((gyro_body, REST_GYRO), (accel_body, REST_ACCEL)):
-        centred = stream - np.mean(stream, axis=0)
-        total = np.concatenate([np.zeros((1, 3)), np.cumsum(centred, axis=0)])
-        square = np.concatenate([np.zeros((1, 3)), np.cumsum(centred**2, axis=0)])
-        count = (hi - lo)[:, None]
-        mean = (total[hi] - total[lo]) / count
-        variance = (square[hi] - square[lo]) / count - mean**2
-        quiet &= np.sum(variance, axis=1) < limit**2
+        scatter = np.zeros(len(time))
+        for axis, centre in zip(stream.T, np.mean(stream, axis=0), strict=True):
+            centred = axis - centre
+            mean = _sums(centred, lo, hi) / count
+            scatter += _sums(centred**2, lo, hi) / count - mean**2
+        quiet &= scatter < limit**2
     inside = (time - span / 2 >= time[0]) & (time + span / 2 <= time[-1])
     return np.asarray(quiet & inside)
+
+
+def _sums(values: Array, lo: IntArray, hi: IntArray) -> Array:
+    total = np.concatenate([np.zeros(1), np.cumsum(values)])
+    return np.asarray(total[hi] - total[lo])

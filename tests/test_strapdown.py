@@ -5,10 +5,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from magfusion import strapdown
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.simulation.motion import Rests, turning_motion
-from magfusion.strapdown import attitude_at, attitude_from_gyro, resting, rotation_increments
+from magfusion.strapdown import (
+    attitude_at,
+    attitude_from_gyro,
+    attitude_from_gyro_at,
+    resting,
+    rotation_increments,
+)
 
 
 def stream(seed, count=300):
@@ -114,6 +121,19 @@ def test_beyond_the_stream_the_end_rates_are_held():
         attitude[-1] * Rotation.from_rotvec(0.2 * gyro[-1]),
     ]
     assert largest_angle(found, Rotation.concatenate(expected)) < 1e-12
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 64, 65, 300])
+@pytest.mark.parametrize("chunk", [1, 7, 64, 65_536])
+def test_at_some_times_only_the_attitude_is_that_of_the_whole_chain(monkeypatch, count, chunk):
+    monkeypatch.setattr(strapdown, "CHUNK", chunk)
+    time, gyro = stream(8, count)
+    rng = np.random.default_rng(9)
+    between = rng.uniform(time[0], time[-1], 20)
+    wanted = np.concatenate([between, time, [time[0] - 0.1, time[-1] + 0.2], time[-1:]])
+    found = attitude_from_gyro_at(time, gyro, wanted)
+    expected = attitude_at(attitude_from_gyro(time, gyro), time, gyro, wanted)
+    assert largest_angle(found, expected) < 1e-13  # rad
 
 
 @pytest.mark.parametrize("kind", ["walk", "turn"])

@@ -12,7 +12,7 @@ from magfusion.fusion.beginning import begin, with_rest_bias
 from magfusion.fusion.earth import EARTH_LOSS, check_earth, earth_cov, hold, with_earth
 from magfusion.fusion.factors import FieldFactors, FieldMeasurements, read_poses
 from magfusion.fusion.hearing import heard, only
-from magfusion.fusion.inertial import cut_at_epochs, low_passed, preintegrate
+from magfusion.fusion.inertial import low_passed
 from magfusion.fusion.loose import survey_cov
 from magfusion.fusion.smoother import (
     Optimised,
@@ -26,6 +26,7 @@ from magfusion.fusion.smoother import (
 )
 from magfusion.fusion.source import Source, open_source
 from magfusion.fusion.start import Start
+from magfusion.fusion.thinning import preintegrate_stream
 from magfusion.fusion.wave import WaveFields
 from magfusion.parameters import (
     Block,
@@ -289,16 +290,17 @@ def _inertial(
     site = job.declared.site
     assert states.accel_bias_body is not None
     assert states.gyro_bias_body is not None
-    increments = cut_at_epochs(job.log.imu, time_offset, time)
-    preintegrated = preintegrate(
-        increments,
+    preintegrated, bridged = preintegrate_stream(
+        job.log.imu,
+        time_offset,
+        time,
         site.platform.imu,
         site.gravity,
         states.accel_bias_body,
         states.gyro_bias_body,
     )
     graph = inertial_graph(preintegrated, site.platform.imu)
-    return graph, int(np.sum(increments.bridged))
+    return graph, int(np.sum(bridged))
 
 
 def _problem(

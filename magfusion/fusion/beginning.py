@@ -15,7 +15,7 @@ from magfusion.fusion.start import Start, choose_chains, start_phases
 from magfusion.parameters import Calibration
 from magfusion.records.samples import FieldSamples, ImuSamples, Log, SteadyFields
 from magfusion.site import Site
-from magfusion.strapdown import attitude_at, attitude_from_gyro, resting
+from magfusion.strapdown import attitude_at, attitude_from_gyro, attitude_from_gyro_at, resting
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array
 
@@ -150,10 +150,8 @@ def _carried(start: Start, imu: ImuSamples, time_offset: float, time: Array) -> 
     later = known.time[after] - time < time - known.time[after - 1]
     nearest = np.where(later, after, after - 1)
     stamps = imu.time + time_offset
-    attitude = attitude_from_gyro(stamps, imu.gyro_body)
-    there, here = (
-        attitude_at(attitude, stamps, imu.gyro_body, at) for at in (known.time[nearest], time)
-    )
+    at_known, here = (attitude_from_gyro_at(stamps, imu.gyro_body, at) for at in (known.time, time))
+    there = at_known[nearest]
     turned = Rotation.from_matrix(known.world_from_body[nearest]) * there.inv() * here
     position = np.stack([np.interp(time, known.time, p) for p in known.position_world.T], axis=1)
     states = Trajectory(

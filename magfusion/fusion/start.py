@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.fixes.fix import Fixes
 from magfusion.parameters import Calibration
 from magfusion.records.samples import ImuSamples
-from magfusion.strapdown import attitude_at, attitude_from_gyro
+from magfusion.strapdown import attitude_from_gyro_at
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -68,7 +68,7 @@ def choose_chains(
         of a dipole, between which the motion must decide.
     """
     time = imu.time + time_offset
-    attitude = attitude_at(attitude_from_gyro(time, imu.gyro_body), time, imu.gyro_body, fixes.time)
+    attitude = attitude_from_gyro_at(time, imu.gyro_body, fixes.time)
     unary = np.minimum(fixes.cost - np.min(fixes.cost, axis=1, keepdims=True), LEAP_COST)
     unary = unary + _gravity_cost(fixes, imu, time, gravity)
     unary = np.where(np.isfinite(fixes.cost), unary, np.inf)
