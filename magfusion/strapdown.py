@@ -163,21 +163,28 @@ def resting(time: Array, gyro_body: Array, accel_body: Array, span: float = 1.0)
         Where rate and specific force scatter less than `REST_GYRO` and `REST_ACCEL` about their
         means over the stretch.
     """
-    lo = np.searchsorted(time, time - span / 2)
-    hi = np.searchsorted(time, time + span / 2, side="right")
-    count = hi - lo
-    quiet = np.ones(len(time), dtype=bool)
-    for stream, limit in ((gyro_body, REST_GYRO), (accel_body, REST_ACCEL)):
-        scatter = np.zeros(len(time))
-        for axis, centre in zip(stream.T, np.mean(stream, axis=0), strict=True):
-            centred = axis - centre
-            mean = _sums(centred, lo, hi) / count
-            scatter += _sums(centred**2, lo, hi) / count - mean**2
-        quiet &= scatter < limit**2
+    centres = np.mean(gyro_body, axis=0), np.mean(accel_body, axis=0)
+    quiet = np.empty(len(time), dtype=bool)
+    for begin in range(0, len(time), CHUNK):
+        here = time[begin : begin + CHUNK]
+        first = np.searchsorted(time, here[0] - span / 2)
+        last = np.searchsorted(time, here[-1] + span / 2, side="right")
+        lo = np.searchsorted(time[first:last], here - span / 2)
+        hi = np.searchsorted(time[first:last], here + span / 2, side="right")
+        quiet[begin : begin + CHUNK] = (
+            _variance(gyro_body[first:last] - centres[0], lo, hi) < REST_GYRO**2
+        ) & (_variance(accel_body[first:last] - centres[1], lo, hi) < REST_ACCEL**2)
     inside = (time - span / 2 >= time[0]) & (time + span / 2 <= time[-1])
     return np.asarray(quiet & inside)
 
 
-def _sums(values: Array, lo: IntArray, hi: IntArray) -> Array:
-    total = np.concatenate([np.zeros(1), np.cumsum(values)])
-    return np.asarray(total[hi] - total[lo])
+def _variance(centred: Array, lo: IntArray, hi: IntArray) -> Array:
+    """Return the sum of the axes' variances over rows from ``lo`` to before ``hi``."""
+    out = np.zeros(len(lo))
+    for axis in centred.T:
+        mean, square = (
+            (total[hi] - total[lo]) / (hi - lo)
+            for total in (np.concatenate([[0.0], np.cumsum(a)]) for a in (axis, axis**2))
+        )
+        out += square - mean**2
+    return out

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.fusion.inertial import cut_at_epochs, motion_at, preintegrate
+from magfusion.fusion.inertial import (
+    cut_at_epochs,
+    low_passed,
+    low_passed_rate_at,
+    motion_at,
+    preintegrate,
+)
 from magfusion.records.samples import ImuSamples
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.motion import Motion, Rests, turning_motion
@@ -226,3 +232,16 @@ def test_states_without_biases_are_refused() -> None:
         motion_at(
             motion.trajectory(np.arange(3.0)), recorded(motion), 0.0, GRAVITY, np.array([1.0])
         )
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.0137])
+def test_the_low_passed_rate_at_some_times_is_that_of_the_whole_stream(offset: float) -> None:
+    imu = recorded(moving(6))
+    rng = np.random.default_rng(6)
+    imu = replace(imu, gyro_body=imu.gyro_body + rng.normal(0.0, 0.1, imu.gyro_body.shape))
+    ends = np.array([-1.0, 0.0, 0.001, DURATION - 0.001, DURATION + 1.0])
+    wanted = np.sort(np.concatenate([ends, rng.uniform(0.0, DURATION, 500), imu.time[::97]]))
+    slow = low_passed(imu)
+    expected = [np.interp(wanted, slow.time + offset, axis) for axis in slow.gyro_body.T]
+    found = low_passed_rate_at(imu, offset, wanted)
+    assert np.allclose(found, np.stack(expected, axis=1), rtol=0.0, atol=1e-10)

@@ -182,3 +182,16 @@ def test_a_steady_turn_under_gravity_is_no_rest():
     gyro[:] = [1.0, 0.0, 0.0]
     accel[:] = 9.8 * np.stack([np.zeros_like(time), np.sin(time), np.cos(time)], axis=1)
     assert not np.any(resting(time, gyro, accel))
+
+
+@pytest.mark.parametrize("chunk", [1, 130, 1999])
+def test_a_stream_rests_in_pieces_where_it_rests_as_a_whole(monkeypatch, chunk):
+    rng = np.random.default_rng(10)
+    time = np.cumsum(rng.uniform(8e-3, 12e-3, 2000))
+    scale = np.where((time > 5.0) & (time < 12.0), 0.5, 2.0)[:, None]
+    gyro = 0.01 * scale * rng.standard_normal((2000, 3))
+    accel = 0.08 * scale * rng.standard_normal((2000, 3)) + [0.0, 0.0, 9.81]
+    whole = resting(time, gyro, accel)
+    assert 500 < np.sum(whole) < 800
+    monkeypatch.setattr(strapdown, "CHUNK", chunk)
+    assert np.array_equal(resting(time, gyro, accel), whole)

@@ -12,7 +12,7 @@ from magfusion.fusion.beginning import begin, with_rest_bias
 from magfusion.fusion.earth import EARTH_LOSS, check_earth, earth_cov, hold, with_earth
 from magfusion.fusion.factors import FieldFactors, FieldMeasurements, read_poses
 from magfusion.fusion.hearing import heard, only
-from magfusion.fusion.inertial import low_passed
+from magfusion.fusion.inertial import low_passed_rate_at
 from magfusion.fusion.loose import survey_cov
 from magfusion.fusion.smoother import (
     Optimised,
@@ -311,9 +311,7 @@ def _problem(
     wave: WaveFields | None,
 ) -> tuple[Problem, int]:
     graph, bridged = _inertial(job, samples.time, states, calibration.time_offset)
-    imu = low_passed(job.log.imu)
-    stamps = imu.time + calibration.time_offset
-    rate = np.stack([np.interp(samples.time, stamps, w) for w in imu.gyro_body.T], axis=1)
+    rate = low_passed_rate_at(job.log.imu, calibration.time_offset, samples.time)
     assert states.gyro_bias_body is not None
     shape = (*samples.phasor_sensor.shape[:2], 6)
     sensor_world = sensor_positions(calibration.site, states)

@@ -160,13 +160,44 @@ def low_passed(imu: ImuSamples) -> ImuSamples:
 
     White noise in a derivative would pass for information on the time offset.
     """
-    usual = float(np.median(np.diff(imu.time)))
-    size = 2 * int(0.5 * RATE_SPAN / usual) + 1
+    size = 2 * _reach(imu) + 1
     gyro, accel = (
         uniform_filter1d(stream, size, axis=0, mode="nearest")
         for stream in (imu.gyro_body, imu.accel_body)
     )
     return ImuSamples(imu.time, gyro, accel)
+
+
+def low_passed_rate_at(imu: ImuSamples, time_offset: float, wanted: Array) -> Array:
+    """Return the rate of the stream of `low_passed` at some times, without the whole stream.
+
+    Parameters
+    ----------
+    imu : ImuSamples
+    time_offset : float
+        (s)
+    wanted : ndarray, shape (m,)
+        (s); outside the stream its end values are held.
+
+    Returns
+    -------
+    ndarray, shape (m, 3)
+        (rad/s)
+    """
+    last, reach = len(imu) - 1, _reach(imu)
+    before = np.clip(np.searchsorted(imu.time, wanted - time_offset) - 1, 0, max(last - 1, 0))
+    after = np.minimum(before + 1, last)
+    ends = np.zeros((2, len(wanted), 3))
+    for k in range(-reach, reach + 1):
+        ends += imu.gyro_body[np.clip(np.stack([before, after]) + k, 0, last)]
+    span = np.maximum(imu.time[after] - imu.time[before], np.finfo(float).tiny)
+    share = np.clip((wanted - time_offset - imu.time[before]) / span, 0.0, 1.0)[:, None]
+    return np.asarray(((1.0 - share) * ends[0] + share * ends[1]) / (2 * reach + 1))
+
+
+def _reach(imu: ImuSamples) -> int:
+    usual = float(np.median(np.diff(imu.time)))
+    return int(0.5 * RATE_SPAN / usual)
 
 
 def motion_at(
