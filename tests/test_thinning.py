@@ -9,7 +9,7 @@ import pytest
 from magfusion.fusion import thinning
 from magfusion.fusion.batch import Smoothed, smooth
 from magfusion.fusion.inertial import Increments, cut_at_epochs, preintegrate
-from magfusion.fusion.thinning import FEWEST, JOINED, preintegrate_stream, thinned
+from magfusion.fusion.thinning import FEWEST_LEFT, JOINED, preintegrate_stream, thinned
 from magfusion.records.samples import ImuSamples, Log
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.inertial import simulate_imu
@@ -22,11 +22,13 @@ GRAVITY = 9.81
 MEMS = ImuModel(3e-4, 3e-3, 1e-5, 1e-4, 5e-3, 0.05)
 ACCEL_BIAS, GYRO_BIAS = np.array([0.1, 0.2, -0.3]), np.array([0.01, -0.02, 0.03])
 BOX_WORLD = np.array([[1.2, 1.2, 0.6], [4.8, 3.8, 1.6]])
-EPOCHS = np.array([1.0033, 25.0, 59.9981])  # s; mostly between samples
+EPOCHS = np.array([1.0033, 25.0, 79.9981])  # s; mostly between samples
+BY = (10, 20)  # steps joined in the two intervals
+FEWEST = FEWEST_LEFT * min(JOINED)  # steps of an interval that is thinned
 LONG_EPOCHS = np.arange(0.505, 119.0, 30.0)
 
 
-def recorded(rate_rms: float, duration: float = 60.0) -> ImuSamples:
+def recorded(rate_rms: float, duration: float = 80.0) -> ImuSamples:
     """Return a vibrating, biased and noisy stream at 100 Hz."""
     rng = np.random.default_rng(1)
     rests = Rests(start=0.0, move=duration, pause=0.0)
@@ -59,7 +61,7 @@ def both(
 def test_joined_steps_integrate_to_what_the_single_ones_do(rate_rms):
     increments = cut_at_epochs(recorded(rate_rms), 0.0, EPOCHS)
     steps = np.diff(thinned(increments, at(ACCEL_BIAS), at(GYRO_BIAS)).first)
-    assert np.all(steps < np.diff(increments.first) / (0.8 * JOINED))
+    assert np.all(steps < np.diff(increments.first) / (0.8 * np.array(BY)))
     for joined, single in zip(*both(increments), strict=True):
         assert np.linalg.norm(_turn(joined.deltaRij(), single.deltaRij())) < 1e-12  # rad
         assert np.max(np.abs(joined.deltaVij() - single.deltaVij())) < 1e-10  # m/s
@@ -70,13 +72,13 @@ def test_joined_steps_integrate_to_what_the_single_ones_do(rate_rms):
 def test_a_first_order_mean_of_the_steps_would_not_do():
     # What the joining is for: the plain mean of ten samples forgets how they turn and when.
     increments = cut_at_epochs(recorded(1.0), 0.0, np.array([1.0, 55.0]))
-    tens = len(increments.dt) // JOINED
+    tens = len(increments.dt) // 10
     gyro, accel = (
-        stream[: tens * JOINED].reshape(tens, JOINED, 3).mean(axis=1)
+        stream[: tens * 10].reshape(tens, 10, 3).mean(axis=1)
         for stream in (increments.gyro_body, increments.accel_body)
     )
-    dt = increments.dt[: tens * JOINED].reshape(tens, JOINED).sum(axis=1)
-    rows = np.array([0, tens * JOINED])
+    dt = increments.dt[: tens * 10].reshape(tens, 10).sum(axis=1)
+    rows = np.array([0, tens * 10])
     plain = Increments(gyro, accel, dt, np.array([0, tens]), increments.bridged)
     single = replace(increments, first=rows)
     zero = np.zeros((2, 3))
@@ -86,8 +88,8 @@ def test_a_first_order_mean_of_the_steps_would_not_do():
 
 def test_the_noise_of_joined_steps_is_that_of_the_single_ones():
     joined, single = both(cut_at_epochs(recorded(1.0), 0.0, EPOCHS))
-    for after, before in zip(joined, single, strict=True):
-        share = JOINED * 0.01 / before.deltaTij()
+    for after, before, steps in zip(joined, single, BY, strict=True):
+        share = steps * 0.01 / before.deltaTij()
         root = np.linalg.inv(np.linalg.cholesky(before.preintMeasCov()))
         whitened = root @ after.preintMeasCov() @ root.T
         # Of a variance, in its worst direction: twice that of a sigma.
@@ -98,11 +100,12 @@ def test_a_change_of_bias_moves_joined_steps_as_the_single_ones():
     increments = cut_at_epochs(recorded(1.0), 0.0, EPOCHS)
     joined, single = both(increments)
     rate = np.linalg.norm(increments.gyro_body - GYRO_BIAS, axis=1)
-    tolerance = (np.max(rate) * JOINED * 0.01) ** 2 / 12.0  # of the series in the turn of a step
-    assert tolerance < 0.02
+    steps = np.array(BY) * 0.01
+    tolerances = (np.max(rate) * steps) ** 2 / 12.0  # of the series in the turn of a step
+    assert np.all(tolerances < 0.03)
     other = gtsam.imuBias.ConstantBias(ACCEL_BIAS + 1e-3, GYRO_BIAS - 1e-4)
     still = gtsam.NavState(gtsam.Rot3(), np.zeros(3), np.zeros(3))
-    for after, before in zip(joined, single, strict=True):
+    for after, before, tolerance in zip(joined, single, tolerances, strict=True):
         moved, expected = after.predict(still, other), before.predict(still, other)
         kept = before.predict(still, before.biasHat())
         change = np.linalg.norm(expected.position() - kept.position())
@@ -165,7 +168,7 @@ def resting_log(seed: int) -> tuple[Log, object]:
 def test_a_log_is_smoothed_alike_from_joined_and_from_single_steps(monkeypatch):
     log, site = resting_log(2)
     joined = smooth(log, site)
-    monkeypatch.setattr(thinning, "FEWEST", len(log.imu))
+    monkeypatch.setattr(thinning, "FEWEST_LEFT", len(log.imu))
     single = smooth(log, site)
     assert_alike(joined, single)
 

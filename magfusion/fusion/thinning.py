@@ -1,12 +1,12 @@
 """Fewer steps of an inertial stream between epochs far apart, that integrate to the same.
 
-GTSAM integrates one step a call.  Here the steps of a long interval are joined by tens, two joined
-steps at a time: their rates make the turns of the two halves, their specific forces the velocity
-and the position gained over both, exactly as the Galilean group composes them of the single steps.
-The noise's covariance and the derivatives by the biases are those of the longer steps.  GTSAM's
-scheme of the covariance is of first order: the sigmas differ by half a step's share of the
-interval.  The derivatives differ by a twelfth of the square of the turn in a step, of a change of
-bias that the next pass makes nothing.
+GTSAM integrates one step a call.  Here the steps of a long interval are joined by tens or twenties,
+two joined steps at a time: their rates make the turns of the two halves, their specific forces the
+velocity and the position gained over both, exactly as the Galilean group composes them of the
+single steps.  The noise's covariance and the derivatives by the biases are those of the longer
+steps.  GTSAM's scheme of the covariance is of first order: the sigmas differ by half a step's share
+of the interval.  The derivatives differ by a twelfth of the square of the turn in a step, of a
+change of bias that the next pass makes nothing.
 """
 
 from dataclasses import dataclass
@@ -20,8 +20,8 @@ from magfusion.records.samples import ImuSamples
 from magfusion.site import ImuModel
 from magfusion.units import Array, BoolArray, IntArray
 
-JOINED = 10  # steps made one
-FEWEST = 2000  # steps of an interval that is thinned: a joined one is a two-hundredth at most
+JOINED = (20, 10)  # steps made one: as many as leave enough
+FEWEST_LEFT = 200  # joined steps of an interval that is thinned
 MOST_TURN = 0.5  # rad; within a joined step, for the series and for the derivatives
 CHUNK = 8192  # pairs of joined steps at a time: what is computed of them stays in the cache
 STRETCH = 1_000_000  # samples cut at a time: what is made of them is no multiple of a long log
@@ -93,40 +93,48 @@ def thinned(increments: Increments, accel_bias: Array, gyro_bias: Array) -> Incr
         The given ones where no interval is long.  Left single are intervals with a gap, steps that
         fill no pair, and those of a fast turn.
     """
-    start, owner = _pairs(increments)
-    if not len(start):
-        return increments
+    steps = np.diff(increments.first)
+    for i, joined in enumerate(JOINED):
+        long = (steps >= FEWEST_LEFT * joined) & ~increments.bridged
+        if i > 0:
+            long &= steps < FEWEST_LEFT * JOINED[i - 1]
+        if np.any(long):
+            increments = _with_joined(increments, joined, long, accel_bias, gyro_bias)
+    return increments
+
+
+def _with_joined(
+    increments: Increments, joined: int, long: BoolArray, accel_bias: Array, gyro_bias: Array
+) -> Increments:
+    start, owner = _pairs(increments, joined, long)
     kept = np.ones(len(increments.dt), dtype=bool)
-    joined, first = [], []
+    made, first = [], []
     for lo in range(0, len(start), CHUNK):
         rows, interval = start[lo : lo + CHUNK], owner[lo : lo + CHUNK]
         bias = np.concatenate([gyro_bias[interval], accel_bias[interval]], axis=1)
-        halves = _halves(increments, rows, bias)
+        halves = _halves(increments, joined, rows, bias)
         gentle = np.max(halves.path, axis=0) < MOST_TURN
-        joined.append(_joined(halves, bias)[gentle])
+        made.append(_joined(halves, bias)[gentle])
         first.append(rows[gentle])
-    begun = np.concatenate(first)
-    for k in range(2 * JOINED):
-        kept[begun + k] = k % JOINED == 0
+    begun, both = np.concatenate(first), np.concatenate(made)
+    for k in range(2 * joined):
+        kept[begun + k] = k % joined == 0
     left = np.flatnonzero(kept)
     place = np.searchsorted(left, begun)
     gyro, accel, dt = increments.gyro_body[left], increments.accel_body[left], increments.dt[left]
-    made = np.concatenate(joined)
     for half in range(2):
-        gyro[place + half] = made[:, half, :3]
-        accel[place + half] = made[:, half, 3:6]
-        dt[place + half] = made[:, half, 6]
+        gyro[place + half] = both[:, half, :3]
+        accel[place + half] = both[:, half, 3:6]
+        dt[place + half] = both[:, half, 6]
     return Increments(gyro, accel, dt, np.searchsorted(left, increments.first), increments.bridged)
 
 
-def _pairs(increments: Increments) -> tuple[IntArray, IntArray]:
+def _pairs(increments: Increments, joined: int, long: BoolArray) -> tuple[IntArray, IntArray]:
     """Return the first step of every pair of joined steps, and its interval."""
-    steps = np.diff(increments.first)
-    long = (steps >= FEWEST) & ~increments.bridged
-    number = np.where(long, steps // (2 * JOINED), 0)
-    owner = np.repeat(np.arange(len(steps)), number)
+    number = np.where(long, np.diff(increments.first) // (2 * joined), 0)
+    owner = np.repeat(np.arange(len(number)), number)
     within = np.arange(len(owner)) - np.repeat(np.cumsum(number) - number, number)
-    return increments.first[owner] + 2 * JOINED * within, owner
+    return increments.first[owner] + 2 * joined * within, owner
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,14 +160,14 @@ class _Halves:
     path: Array
 
 
-def _halves(increments: Increments, start: IntArray, bias: Array) -> _Halves:
+def _halves(increments: Increments, joined: int, start: IntArray, bias: Array) -> _Halves:
     shape = (2, len(start))
     turn, path = np.zeros((4, *shape)), np.zeros(shape)
     turn[0] = 1.0
     velocity, position, total = np.zeros((3, *shape)), np.zeros((3, *shape)), np.zeros(shape)
     gyro_bias, accel_bias = bias.T[:3, None], bias.T[3:, None]
-    for k in range(JOINED):
-        rows = np.stack([start + k, start + JOINED + k])
+    for k in range(joined):
+        rows = np.stack([start + k, start + joined + k])
         dt = increments.dt[rows]
         rotation = (np.moveaxis(increments.gyro_body[rows], 2, 0) - gyro_bias) * dt
         gained = (np.moveaxis(increments.accel_body[rows], 2, 0) - accel_bias) * dt
