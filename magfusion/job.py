@@ -49,10 +49,10 @@ class Job:
     topics: Topics | None = None
 
 
-_SITE = {"site.yaml", "site_field_map.parquet"}
+_SITE = {"site.yaml", "site_field_map.parquet", "site_correlation.parquet"}
 _RESULT = {"trajectory.tum", "trajectory.parquet", *_SITE, "run.rrd", "report.json"}
 _TABLES = {"imu.parquet", "magnetometer.parquet", "fields.parquet", "truth.parquet"}
-_TRUE_SITE = {"true_site.yaml", "true_site_field_map.parquet"}
+_TRUE_SITE = {f"true_{name}" for name in _SITE}
 _LOG = {"log.yaml", *_SITE, *_TRUE_SITE, "report.json", *_TABLES}
 UNFINISHED_DRIFT = "unfinished"
 # What stands in the directory while these jobs run.
@@ -61,20 +61,15 @@ _WRITTEN = {
     "smooth": _RESULT | {"fixes.parquet"},
     "fix": _RESULT | {"fixes.parquet"},
     "navigate": _RESULT | {"lagged.parquet"} | _UNFINISHED["navigate"],
-    "drift": {"drift.png", "run.rrd", "report.json"} | _UNFINISHED["drift"],
+    "drift": {"drift.png", "stability.png", "run.rrd", "report.json"} | _UNFINISHED["drift"],
     "simulate": _LOG,
     "demodulate": _LOG,
     "survey": {"survey.parquet", "survey.png", "report.json"},
-    "calibrate log": {"site.yaml", "site_field_map.parquet", "calibration.png", "report.json"},
-    "calibrate beacon": {"site.yaml", "site_field_map.parquet", "beacon.png", "report.json"},
-    "calibrate antenna": {"site.yaml", "site_field_map.parquet", "antenna.png", "report.json"},
-    "calibrate fieldmap": {"site.yaml", "site_field_map.parquet", "field_map.png", "report.json"},
-    "calibrate magnetometer": {
-        "site.yaml",
-        "site_field_map.parquet",
-        "magnetometer.png",
-        "report.json",
-    },
+    "calibrate log": _SITE | {"calibration.png", "report.json"},
+    "calibrate beacon": _SITE | {"beacon.png", "report.json"},
+    "calibrate antenna": _SITE | {"antenna.png", "report.json"},
+    "calibrate fieldmap": _SITE | {"field_map.png", "report.json"},
+    "calibrate magnetometer": _SITE | {"magnetometer.png", "report.json"},
     "calibrate attitude-database": {"attitudes.parquet", "attitudes.png", "report.json"},
     "match": {"attitude.parquet", "attitude.png", "report.json"},
     "coverage": {"coverage.parquet", "coverage.png", "run.rrd", "report.json"},

@@ -4,7 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from magfusion.correlation import Correlation, joined
 from magfusion.parameters import Block, Calibration, difference
+from magfusion.prior import parameters_of
 from magfusion.site import Beacon, Site
 from magfusion.site_moves import MICROTESLA
 from magfusion.units import DEGREE, NANOTESLA, Array
@@ -20,6 +22,7 @@ _DISPLAY = {
     "offset": ("nt", NANOTESLA / MICROTESLA),
     "strength": ("nt", NANOTESLA / MICROTESLA),
 }
+_OF_THE_LOG = ("phase", "earth")  # groups whose priors no site declares
 _UNITS = {"position": "m", "time_offset": "s"}
 
 
@@ -108,7 +111,25 @@ def refined_site(
         "undetermined": [f.name for f in told if not f.determined],
         "drive": {f.name: [float(f.change), float(f.sigma)] for f in told if _is_drive(f.name)},
     }
-    return replace(site, platform=replace(site.platform, imu=imu), calibration=record)
+    return replace(
+        site,
+        platform=replace(site.platform, imu=imu),
+        calibration=record,
+        correlation=_correlation(site, blocks, cov),
+    )
+
+
+def _correlation(site: Site, blocks: tuple[Block, ...], cov: Array) -> Correlation | None:
+    """Return how the errors go together now: those found anew, and those left as they were."""
+    known = parameters_of(blocks)
+    own = [i for i, parameter in enumerate(known) if parameter.group not in _OF_THE_LOG]
+    fresh = None
+    if own:
+        part = cov[np.ix_(own, own)]
+        sigma = np.sqrt(np.diagonal(part))
+        fresh = Correlation(tuple(known[i] for i in own), part / sigma[:, None] / sigma)
+    before = site.correlation
+    return joined([fresh, before and before.kept(lambda p: p not in known)])
 
 
 def _is_drive(name: str) -> bool:

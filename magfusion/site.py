@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from magfusion.correlation import Correlation
 from magfusion.field_map import FieldMap
 from magfusion.units import Array, ComplexArray, IntArray
 
@@ -268,6 +269,8 @@ class Site:
     location : Location, optional
     calibration : mapping, optional
         Where refined values came from: log, parameters that it determined and that it did not.
+    correlation : Correlation, optional
+        Of the errors that the sigmas stand for; None where all are independent.
     """
 
     gravity: float
@@ -277,6 +280,7 @@ class Site:
     earth_field_world: Array | None = None
     location: Location | None = None
     calibration: Mapping[str, object] | None = None
+    correlation: Correlation | None = None
 
     @cached_property
     def channels(self) -> tuple[tuple[str, int], ...]:

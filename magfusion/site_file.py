@@ -26,6 +26,7 @@ from magfusion.site import (
     Site,
     Slots,
 )
+from magfusion.site_correlation import load_correlation, save_correlation
 from magfusion.site_schema import (
     BeaconEntry,
     CoilEntry,
@@ -63,7 +64,7 @@ def load_site(path: Path, *, unknown: bool = False) -> Site:
         _refuse_unknown(entry, path)
     location = _location(entry.world)
     maps = _field_maps(entry, path)
-    return Site(
+    site = Site(
         gravity=entry.world.gravity_m_s2,
         model_error=entry.world.model_error,
         beacons=tuple(replace(_beacon(b), field_map=maps.get(b.name)) for b in entry.beacons),
@@ -74,6 +75,9 @@ def load_site(path: Path, *, unknown: bool = False) -> Site:
         location=location,
         calibration=entry.calibration,
     )
+    if entry.correlation is None:
+        return site
+    return replace(site, correlation=load_correlation(site, path.parent / entry.correlation))
 
 
 def _refuse_unknown(entry: SiteEntry, path: Path) -> None:
@@ -94,7 +98,7 @@ def save_site(site: Site, path: Path) -> None:
     site : Site
     path : Path
         Replaced as a whole, or left as it was if anything fails.  Field maps are written beside
-        it, as ``<stem>_field_map.parquet``.
+        it, as ``<stem>_field_map.parquet``, a correlation as ``<stem>_correlation.parquet``.
     """
     maps = {b.name: b.field_map for b in site.beacons if b.field_map is not None}
     beside = path.with_name(f"{path.stem}_field_map.parquet")
@@ -111,6 +115,10 @@ def save_site(site: Site, path: Path) -> None:
         content["calibration"] = _plain(site.calibration)
     if maps:
         write_field_maps(maps, beside)
+    if site.correlation is not None:
+        correlation = path.with_name(f"{path.stem}_correlation.parquet")
+        content["correlation"] = correlation.name
+        save_correlation(site, correlation)
     write_yaml(content, path)
 
 

@@ -296,6 +296,7 @@ class SiteEntry(StrictModel):
     beacons: Annotated[list[BeaconEntry], _some("beacon")]
     platform: PlatformEntry
     calibration: dict[str, Any] | None = None
+    correlation: Annotated[str, Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
     def _distinct_names(self) -> Self:

@@ -12,11 +12,13 @@ PACKAGE = ROOT / "magfusion"
 # The floors of the house, from the ground; what stands on one floor does not see its neighbours.
 FLOORS = (
     {"units", "errors"},
-    {"physics", "strapdown", "files", "field_map", "monte_carlo"},
-    {"site", "trajectory", "site_schema", "field_map_file"},
-    {"site_file", "shapes"},
+    {"physics", "strapdown", "files", "field_map", "correlation", "monte_carlo"},
+    {"site", "trajectory", "site_schema", "field_map_file", "correlation_file"},
+    {"site_correlation", "shapes"},
+    {"site_file"},
     {"records", "observation", "antenna", "view", "site_moves"},
     {"parameters", "weights"},
+    {"prior"},
     {"refinement"},
     {"receiver", "simulation", "calibration", "fusion", "fixes", "evaluation"},
     {"report", "job", "plots", "view_coverage", "view_drift", "view_live"},

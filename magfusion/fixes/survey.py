@@ -8,8 +8,8 @@ from magfusion.parameters import (
     choose_blocks,
     dimension,
     linearize_channels,
-    prior_sigma,
 )
+from magfusion.prior import prior_spread
 from magfusion.units import Array
 
 SURVEY_GROUPS = ("beacons", "moments", "magnetometer", "extrinsics")
@@ -42,7 +42,8 @@ def survey_jacobians(
     by_found : ndarray, shape (m, rows, 6 + nuisances)
         By the pose and by the nuisances.
     by_survey : ndarray, shape (m, rows, parameters)
-        By one sigma of each parameter of the survey.
+        By each column of the spread of the survey's prior: one sigma of each parameter, where
+        these are independent.
     """
     survey, found = choose_blocks(calibration.site, SURVEY_GROUPS), dimension(nuisances)
     behind = tuple(
@@ -52,7 +53,7 @@ def survey_jacobians(
         calibration, nuisances + behind, time, world_from_body, position_world
     )
     by_found = np.concatenate([by_pose, by_calibration[..., :found]], axis=-1)
-    by_survey = by_calibration[..., found:] * prior_sigma(survey)
+    by_survey = by_calibration[..., found:] @ prior_spread(calibration.site, survey)
     return whitened(root, by_found), whitened(root, by_survey)
 
 

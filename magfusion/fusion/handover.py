@@ -8,7 +8,8 @@ from magfusion.fusion.batch import Smoothed
 from magfusion.fusion.factors import CALIBRATION_KEY
 from magfusion.fusion.smoother import Estimate, held_steps, linearized
 from magfusion.fusion.state import State
-from magfusion.parameters import Block, prior_sigma
+from magfusion.parameters import Block
+from magfusion.prior import prior_spread
 from magfusion.units import Array
 
 
@@ -61,12 +62,12 @@ def _with_held(cov: Array, result: Smoothed, estimate: Estimate, held: tuple[Blo
     if not held or result.problem.fields is None:
         return cov
     last = len(result.states) - 1
-    sigma = prior_sigma(held)
+    spread = prior_spread(result.declared.site, held)
     columns = []
     for step in held_steps(result.problem, estimate, held):
         own = [step.at(X(last)), step.at(V(last)), step.at(B(last))]
         own += [step.at(CALIBRATION_KEY)] if result.blocks else []
         columns.append(np.concatenate(own))
     response = np.stack(columns, axis=1)
-    across = response * sigma
-    return np.block([[cov + response @ response.T, across], [across.T, np.diag(sigma**2)]])
+    across = response @ spread.T
+    return np.block([[cov + response @ response.T, across], [across.T, spread @ spread.T]])

@@ -16,6 +16,7 @@ from magfusion.fusion.factors import (
 )
 from magfusion.fusion.ordering import nested_dissection
 from magfusion.parameters import Block, Calibration, difference, prior_sigma, retract
+from magfusion.prior import prior_root, prior_spread
 from magfusion.site import ImuModel
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array
@@ -155,10 +156,10 @@ def _robust(noise: gtsam.noiseModel.Gaussian, loss: str | None) -> gtsam.noiseMo
 
 
 def _prior_factor(problem: Problem, calibration: Calibration) -> gtsam.JacobianFactor:
-    share = 1.0 / prior_sigma(problem.blocks)
-    error = -share * difference(problem.declared, calibration, problem.blocks)
-    unit = gtsam.noiseModel.Unit.Create(len(share))
-    return gtsam.JacobianFactor(CALIBRATION_KEY, np.diag(share), error, unit)
+    root = prior_root(problem.declared.site, problem.blocks)
+    error = -root @ difference(problem.declared, calibration, problem.blocks)
+    unit = gtsam.noiseModel.Unit.Create(len(root))
+    return gtsam.JacobianFactor(CALIBRATION_KEY, root, error, unit)
 
 
 def cost_of(problem: Problem, estimate: Estimate) -> float:
@@ -168,7 +169,8 @@ def cost_of(problem: Problem, estimate: Estimate) -> float:
         total += problem.fields.cost(read_poses(estimate.values), estimate.calibration)
     if problem.blocks:
         step = difference(problem.declared, estimate.calibration, problem.blocks)
-        total += 0.5 * float(np.sum((step / prior_sigma(problem.blocks)) ** 2))
+        root = prior_root(problem.declared.site, problem.blocks)
+        total += 0.5 * float(np.sum((root @ step) ** 2))
     return total
 
 
@@ -318,7 +320,7 @@ def marginals(
 def _responses(
     problem: Problem, estimate: Estimate, held: tuple[Block, ...]
 ) -> tuple[Array, Array]:
-    """Return the steps that one sigma of each held parameter causes.
+    """Return the steps that the held parameters cause, one for each column of their spread.
 
     Of the poses, shape (held, n, 6), and of the calibration, shape (held, dimension).
     """
@@ -333,10 +335,10 @@ def _responses(
 def held_steps(
     problem: Problem, estimate: Estimate, held: tuple[Block, ...]
 ) -> list[gtsam.VectorValues]:
-    """Return the step of every variable that one sigma of each held parameter causes.
+    """Return the step of every variable that each column of the held parameters' spread causes.
 
-    The held parameters are left over when all else is eliminated, so that one elimination serves
-    them all.
+    One sigma of each where they are independent.  The held parameters are left over when all else
+    is eliminated, so that one elimination serves them all.
     """
     assert problem.fields is not None
     graph = problem.native.linearize(estimate.values)
@@ -348,7 +350,8 @@ def held_steps(
     if calibrated:
         graph.push_back(_prior_factor(problem, problem.declared))
     poses = read_poses(estimate.values)
-    columns = problem.fields.sensitivity(poses, estimate.calibration, held) * prior_sigma(held)
+    spread = prior_spread(problem.declared.site, held)
+    columns = problem.fields.sensitivity(poses, estimate.calibration, held) @ spread
     graph.push_back(problem.fields.with_others(HELD_KEY, columns))
     ordering = nested_dissection(problem.epochs, CALIBRATION_KEY if calibrated else None)
     try:

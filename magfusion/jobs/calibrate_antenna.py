@@ -310,9 +310,11 @@ def _refined(site: Site, beacon: Beacon, fit: AntennaFit, figures: Figures) -> S
         "determined": figures["determined"],
         "undetermined": figures["undetermined"],
     }
+    known, owners = site.correlation, (beacon.name, "magnetometer")
     return replace(
         site,
         beacons=tuple(refined if b.name == beacon.name else b for b in site.beacons),
         platform=replace(site.platform, magnetometer=magnetometer),
         calibration=record,
+        correlation=known and known.without(("moments", "magnetometer"), owners),
     )

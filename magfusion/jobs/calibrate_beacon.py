@@ -253,4 +253,10 @@ def _refined_site(site: Site, found: list[_Calibrated], path: Path, figures: Fig
         "undetermined": figures["undetermined"],
     }
     beacons = tuple(new.get(b.name, b) for b in site.beacons)
-    return replace(site, beacons=beacons, calibration=record)
+    known = site.correlation
+    return replace(
+        site,
+        beacons=beacons,
+        calibration=record,
+        correlation=known and known.without(("beacons", "moments"), new),
+    )

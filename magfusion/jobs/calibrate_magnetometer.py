@@ -81,7 +81,13 @@ def _refined_site(site: Site, found: LogCalibration, log_name: str, figures: Fig
         "undetermined": figures["undetermined"],
     }
     platform = replace(site.platform, magnetometer=found.magnetometer)
-    return replace(site, platform=platform, calibration=record)
+    known = site.correlation
+    return replace(
+        site,
+        platform=platform,
+        calibration=record,
+        correlation=known and known.without(("magnetometer",), ["magnetometer"]),
+    )
 
 
 @dataclass(frozen=True)

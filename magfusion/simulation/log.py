@@ -1,5 +1,6 @@
 """Whole logs from a site: a true calibration is drawn, a body moves, the instruments record."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import date
 from typing import Literal
@@ -7,6 +8,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.correlation import Correlation, Parameter
 from magfusion.errors import InputError
 from magfusion.physics.earth import earth_field_world
 from magfusion.records.samples import FieldSamples, Log
@@ -25,6 +27,7 @@ from magfusion.site import Beacon, Magnetometer, Site
 from magfusion.trajectory import Trajectory
 from magfusion.units import Array
 
+Draw = Callable[[str, str, str, Array], Array]
 DRIFT_SIGMA = 2e-5  # relative; ordinary crystal oscillators
 EPOCH_NS = 1_700_000_000_000_000_000
 
@@ -229,9 +232,11 @@ def perturb_site(site: Site, rng: np.random.Generator) -> Site:
 
     Rotations are perturbed on the right, in beacon and in sensor axes; positions in world axes
     (beacons) and in body axes (magnetometer); moments by the exponential of their logarithm's.
+    What goes together is drawn together.
     """
-    beacons = tuple(_perturb_beacon(beacon, rng) for beacon in site.beacons)
-    magnetometer = _perturb_magnetometer(site.platform.magnetometer, rng)
+    draw = _draws(site.correlation, rng)
+    beacons = tuple(_perturb_beacon(beacon, draw) for beacon in site.beacons)
+    magnetometer = _perturb_magnetometer(site.platform.magnetometer, draw)
     platform = replace(site.platform, magnetometer=magnetometer)
     return replace(site, beacons=beacons, platform=platform)
 
@@ -244,14 +249,33 @@ def draw_drives(site: Site, rng: np.random.Generator) -> Drives:
     return Drives(phase, rng.normal(0.0, DRIFT_SIGMA, len(free)) * free)
 
 
-def _perturb_beacon(beacon: Beacon, rng: np.random.Generator) -> Beacon:
-    sigma = beacon.sigma
-    turn = Rotation.from_rotvec(rng.normal(0.0, sigma.rotation_beacon)).as_matrix()
-    factors = np.exp(rng.normal(0.0, sigma.log_moment))
+def _draws(correlation: Correlation | None, rng: np.random.Generator) -> Draw:
+    """Return a function that draws the error of a parameter, in unison with its relatives."""
+    own: dict[Parameter, float] = {}
+    if correlation is not None:
+        unit = rng.standard_normal(len(correlation.parameters))
+        drawn = np.linalg.cholesky(correlation.coefficients) @ unit
+        own = dict(zip(correlation.parameters, drawn.tolist(), strict=True))
+
+    def draw(group: str, owner: str, kind: str, sigma: Array) -> Array:
+        error = rng.normal(0.0, sigma)
+        for i, at in enumerate(np.ndindex(sigma.shape)):
+            known = own.get(Parameter(group, owner, kind, i))
+            error[at] = error[at] if known is None else sigma[at] * known
+        return error
+
+    return draw
+
+
+def _perturb_beacon(beacon: Beacon, draw: Draw) -> Beacon:
+    name, sigma = beacon.name, beacon.sigma
+    turn = Rotation.from_rotvec(draw("beacons", name, "rotation", sigma.rotation_beacon))
+    factors = np.exp(draw("moments", name, "log_moment", sigma.log_moment))
+    error = draw("beacons", name, "position", sigma.position_world)
     return replace(
         beacon,
-        position_world=beacon.position_world + rng.normal(0.0, sigma.position_world),
-        world_from_beacon=beacon.world_from_beacon @ turn,
+        position_world=beacon.position_world + error,
+        world_from_beacon=beacon.world_from_beacon @ turn.as_matrix(),
         coils=tuple(
             replace(coil, moment_beacon=factor * coil.moment_beacon)
             for coil, factor in zip(beacon.coils, factors, strict=True)
@@ -259,15 +283,18 @@ def _perturb_beacon(beacon: Beacon, rng: np.random.Generator) -> Beacon:
     )
 
 
-def _perturb_magnetometer(magnetometer: Magnetometer, rng: np.random.Generator) -> Magnetometer:
+def _perturb_magnetometer(magnetometer: Magnetometer, draw: Draw) -> Magnetometer:
     sigma = magnetometer.sigma
-    turn = Rotation.from_rotvec(rng.normal(0.0, sigma.rotation_sensor)).as_matrix()
+    turn = Rotation.from_rotvec(draw("extrinsics", "sensor", "rotation", sigma.rotation_sensor))
+    matrix = draw("magnetometer", "magnetometer", "matrix", sigma.matrix)
+    offset = draw("magnetometer", "magnetometer", "offset", sigma.offset)
+    lever = draw("extrinsics", "sensor", "position", sigma.position_body)
     return replace(
         magnetometer,
-        matrix=magnetometer.matrix + rng.normal(0.0, sigma.matrix),
-        offset=magnetometer.offset + rng.normal(0.0, sigma.offset),
-        body_from_sensor=magnetometer.body_from_sensor @ turn,
-        position_body=magnetometer.position_body + rng.normal(0.0, sigma.position_body),
+        matrix=magnetometer.matrix + matrix,
+        offset=magnetometer.offset + offset,
+        body_from_sensor=magnetometer.body_from_sensor @ turn.as_matrix(),
+        position_body=magnetometer.position_body + lever,
     )
 
 
