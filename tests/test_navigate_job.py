@@ -56,6 +56,7 @@ def test_it_writes_what_smooth_writes_and_the_lagged_states(smoothed: Path) -> N
         "report.json",
         "run.rrd",
         "site.yaml",
+        "site_correlation.parquet",
     }
     epochs = report(smoothed)["epochs"]
     assert file_interface.read_tum_trajectory_file(smoothed / "trajectory.tum").num_poses == epochs

@@ -164,7 +164,16 @@ def test_coils_in_time_slots_are_refused_for_a_waveform():
 
 
 def test_the_simulator_does_not_know_the_estimators():
-    allowed = ("errors", "physics", "records", "simulation", "site", "trajectory", "units")
+    allowed = (
+        "correlation",
+        "errors",
+        "physics",
+        "records",
+        "simulation",
+        "site",
+        "trajectory",
+        "units",
+    )
     for path in Path(magfusion.simulation.__file__).parent.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("magfusion"):
