@@ -198,8 +198,10 @@ def calibrated(log: Log, site: Site, config: Config) -> Iterator[Row]:
     rest = part_of(log, middle, np.inf)
     yield row(rest, "batch, calibrated", smooth(rest, known).states)
     for estimator, label in ONLINE.items():
-        now, _ = online(rest, known, NavigatorSettings(estimator=estimator, lag=config.lag))
+        now, left = online(rest, known, NavigatorSettings(estimator=estimator, lag=config.lag))
         yield row(rest, f"{label}, calibrated", now)
+        if len(left):
+            yield row(rest, f"{label}, lagged, calibrated", left)
 
 
 def inputs(config: Config) -> Iterator[tuple[Log, Site]]:
