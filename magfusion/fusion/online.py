@@ -11,32 +11,28 @@ from typing import Literal
 import numpy as np
 
 from magfusion.errors import EstimationError
-from magfusion.fusion.buffers import Buffer, check_clock
+from magfusion.fusion.arrivals import Arrivals
 from magfusion.fusion.earth import check_earth
 from magfusion.fusion.earth_online import EarthWatch
 from magfusion.fusion.ekf import ErrorStateFilter
-from magfusion.fusion.epoch import measured_at, single
+from magfusion.fusion.epoch import single
 from magfusion.fusion.factors import FieldMeasurements
 from magfusion.fusion.gate import Gate
-from magfusion.fusion.hearing import Hearing
 from magfusion.fusion.navigator import SlidingWindow
 from magfusion.fusion.outset import Outset, find_outset
 from magfusion.fusion.propagation import Propagated, online_blocks, propagate
-from magfusion.fusion.receive import OnlineReceiver, inertial_gap
+from magfusion.fusion.receive import OnlineReceiver
 from magfusion.fusion.recovery import agreed_fix, placed, prior_of, restarted
-from magfusion.fusion.state import MOTION, State
-from magfusion.fusion.stillness import REACH, REST_SIGMA, REST_SPAN, stands
+from magfusion.fusion.state import State
+from magfusion.fusion.stillness import REST_SIGMA
 from magfusion.fusion.walk import calibration_walk
 from magfusion.receiver.windows import LockinSettings
-from magfusion.records.samples import FieldSamples, ImuSamples, SteadyFields
+from magfusion.records.samples import FieldSamples, SteadyFields
 from magfusion.site import Site
 from magfusion.units import Array, BoolArray
 
 WIDE_POSITION, WIDE_ROTATION = 0.3, 0.2  # m, rad; beyond, the prediction is no place to linearise
-RATE_SPAN = 0.08  # s; motion is slower, noise is not
-LONGEST_WAIT = 5.0  # s; the fields go on without an IMU that is silent for longer
 LOST_POSITION = 10.0  # m; a prediction wider than this is worth nothing
-OFFSET_STALE = 1e-4  # s; at a radian a second, six thousandths of a degree
 
 
 @dataclass(frozen=True)
@@ -97,21 +93,13 @@ class Navigator:
         if earth:
             check_earth(site)
         self.blocks, self._held = online_blocks(site, self.settings.estimate, earth=earth)
-        self._hearing = Hearing()
         self._gate = Gate(site.channels, self.blocks)
         self.counts = self._gate.counts
         self._walk = calibration_walk(self.blocks, self._held)
-        self._imu = Buffer("imu", 6)
-        self._waveform = Buffer("magnetometer", 3)
-        self._fields: list[FieldSamples] = []
-        self._steady: dict[float, SteadyFields] = {}
+        self._arrived = Arrivals(site.platform.imu.time_offset)
         self._earth = EarthWatch(self.blocks) if earth else None
         self._estimator: SlidingWindow | ErrorStateFilter | None = None
-        self._receiver: OnlineReceiver | None = None
-        self._applied_offset = site.platform.imu.time_offset
-        self._usual: float | None = None  # sampling interval of the IMU (s)
         self._next_start = self.settings.start_duration
-        self._last_epoch_time = -np.inf
         self._made: list[State] = []
         self.rival_chi_square: float | None = None
 
@@ -125,9 +113,7 @@ class Navigator:
         InputError
             Where a number is not finite or the clock jumped.
         """
-        stamps = np.atleast_1d(time)
-        check_clock("imu", stamps, self._newest)
-        self._imu.add(stamps, np.hstack([np.atleast_2d(gyro_body), np.atleast_2d(accel_body)]))
+        self._arrived.add_imu(time, gyro_body, accel_body)
         self._advance()
 
     def add_magnetometer(self, time: Array, measured_sensor: Array) -> None:
@@ -138,9 +124,7 @@ class Navigator:
         InputError
             Where a number is not finite or the clock jumped.
         """
-        stamps = np.atleast_1d(time)
-        check_clock("magnetometer", stamps, self._newest)
-        self._waveform.add(stamps, np.atleast_2d(measured_sensor))
+        self._arrived.add_magnetometer(time, measured_sensor)
         self._advance()
 
     def add_fields(self, samples: FieldSamples, steady: SteadyFields | None = None) -> None:
@@ -151,23 +135,11 @@ class Navigator:
         InputError
             Where the clock jumped.
         """
-        check_clock("fields", samples.time, self._newest)
-        for i in range(len(samples)):
-            one = samples.rows(slice(i, i + 1))
-            if self._estimator is not None and one.time[0] <= self._estimator.state.time:
-                self.counts["field too late"] += 1
-                continue
-            self._fields.append(one)
-            if steady is not None and self._earth is not None:
-                self._steady[float(one.time[0])] = steady.rows(slice(i, i + 1))
-        self._fields.sort(key=lambda s: float(s.time[0]))
+        after = -np.inf if self._estimator is None else self._estimator.state.time
+        late = self._arrived.add_fields(samples, None if self._earth is None else steady, after)
+        if late:
+            self.counts["field too late"] += late
         self._advance()
-
-    @property
-    def _newest(self) -> float:
-        """Newest stamp of all streams (s)."""
-        heard = self._fields[-1].time[0] if self._fields else -np.inf
-        return float(max(self._imu.newest, self._waveform.newest, heard))
 
     # What comes out
 
@@ -197,7 +169,7 @@ class Navigator:
         if self._estimator is None:
             raise EstimationError("there is no state yet: the navigator is still gathering data")
         last = self._estimator.state
-        wanted = self._imu.newest + self._applied_offset if time is None else time
+        wanted = self._arrived.inertial if time is None else time
         if wanted <= last.time:
             return last
         return self._propagated(wanted).state
@@ -225,9 +197,7 @@ class Navigator:
     @property
     def losses(self) -> dict[str, int]:
         """All that was refused, lost or recovered, with the reason: `counts`, windows, samples."""
-        late = {f"{b.name} sample too late": b.late for b in (self._imu, self._waveform) if b.late}
-        dropped = {} if self._receiver is None else self._receiver.dropped
-        return {**self.counts, **{f"window: {k}": v for k, v in dropped.items()}, **late}
+        return {**self.counts, **self._arrived.losses}
 
     def checkpoint(self) -> bytes:
         """Return everything needed to go on: `restored` makes a navigator of it."""
@@ -243,52 +213,32 @@ class Navigator:
 
     def _begin(self) -> bool:
         """Find the first state, once enough has come."""
-        first = self._first_time()
-        reached = self._reached() - self.settings.delay
-        if not reached - first >= self._next_start:
+        arrived = self._arrived
+        reached = arrived.reached - self.settings.delay
+        if not reached - arrived.first >= self._next_start:
             return False
         outset = find_outset(
             self.site,
-            self._imu_samples(),
-            self._waveform,
-            self._fields,
+            arrived.inertial_samples(),
+            arrived.waveform,
+            arrived.fields,
             reached,
             self.settings.estimate,
             self.settings.lockin,
-            list(self._steady.values()) if self._earth is not None else None,
+            list(arrived.steady.values()) if self._earth is not None else None,
         )
         if outset is None or (
             outset.ambiguous and self._next_start < 4 * self.settings.start_duration
         ):
             self._next_start += 0.5 * self.settings.start_duration
-            self._forget_before_start()
+            arrived.forget_before_start(4.0 * self.settings.start_duration)
             return False
         self._start_at(outset)
         return True
 
-    def _first_time(self) -> float:
-        if self._fields:
-            return float(self._fields[0].time[0])
-        time, _ = self._waveform.rows()
-        return float(time[0]) if len(time) else np.inf
-
-    def _reached(self) -> float:
-        """Until when everything has come."""
-        inertial = self._imu.newest + self._applied_offset
-        heard = self._fields[-1].time[0] if self._fields else self._waveform.newest
-        return float(min(inertial, heard))
-
-    def _forget_before_start(self) -> None:
-        """Keep no more than four times what a start takes."""
-        oldest = self._reached() - 4.0 * self.settings.start_duration
-        for buffer in (self._imu, self._waveform):
-            buffer.forget(oldest, oldest)
-        self._fields = [s for s in self._fields if s.time[0] >= oldest]
-
     def _start_at(self, outset: Outset) -> None:
         state = outset.state
-        self._applied_offset = state.calibration.time_offset
-        self._usual = float(np.median(np.diff(self._imu.rows()[0])))
+        self._arrived.start(outset)
         self.rival_chi_square = outset.rival_chi_square
         if self.settings.estimator == "ekf":
             self._estimator = ErrorStateFilter(state, self.blocks, self._held)
@@ -298,48 +248,36 @@ class Navigator:
                 self.blocks,
                 self.settings.lag,
                 self._walk,
-                self._applied_offset,
+                self._arrived.applied_offset,
                 earth=self._earth is not None,
                 held=self._held,
             )
-        if outset.lockin is not None:
-            self._receiver = OnlineReceiver(
-                outset.lockin, outset.rate_hz, state.time + outset.lockin.step
-            )
-        self._fields = [s for s in self._fields if s.time[0] > state.time]
-        self._steady = {t: s for t, s in self._steady.items() if t > state.time}
-        self._last_epoch_time = state.time
         self._made.append(state)
-        self._forget(state.time)
 
     def _step(self) -> bool:
         """Process the next epoch, if all that it needs has come."""
         assert self._estimator is not None
         now = self._estimator.state.time
-        heard = self._fields[-1].time[0] if self._fields else self._waveform.newest
-        inertial = max(self._imu.newest + self._applied_offset, heard - LONGEST_WAIT)
-        inertial = float(inertial) - self.settings.delay
-        if self._receiver is not None and self._waveform.newest >= self._receiver.next_end:
-            return self._step_window(self._receiver, inertial)
-        if self._fields and self._fields[0].time[0] <= inertial:
-            return self._step_fields(self._fields.pop(0))
+        arrived, receiver = self._arrived, self._arrived.receiver
+        inertial = arrived.awaited - self.settings.delay
+        if receiver is not None and arrived.waveform.newest >= receiver.next_end:
+            return self._step_window(receiver, inertial)
+        if arrived.fields and arrived.fields[0].time[0] <= inertial:
+            return self._step_fields(arrived.fields.pop(0))
         if inertial - now >= self.settings.longest_step:
             self._absorb(now + self.settings.longest_step, None)
             return True
         return False
 
     def _step_window(self, receiver: OnlineReceiver, inertial: float) -> bool:
-        ahead = self._waveform.newest - self.settings.delay
+        ahead = self._arrived.waveform.newest - self.settings.delay
         if min(inertial, ahead) < receiver.next_end:
             return False
         assert self._estimator is not None
-        half = receiver.settings.window / 2.0
-        begin, end = receiver.next_centre - half, receiver.next_centre + half
-        imu = self._imu_samples(self._estimator.state.time - 0.1, end + 0.1)
-        silent = inertial_gap(imu.time + self._applied_offset, begin, end)
-        if receiver.next_centre <= self._estimator.state.time:
+        before = self._estimator.state
+        if receiver.next_centre <= before.time:
             self.counts["window too late"] += 1
-        elif receiver.usable(self._waveform, silent):
+        elif self._arrived.window_usable(receiver, before):
             self._absorb(receiver.next_centre, None)
         receiver.skip()
         return True
@@ -348,7 +286,7 @@ class Navigator:
         assert self._estimator is not None
         if samples.time[0] <= self._estimator.state.time:
             self.counts["field too late"] += 1
-            self._steady.pop(float(samples.time[0]), None)
+            self._arrived.steady.pop(float(samples.time[0]), None)
             return True
         self._absorb(float(samples.time[0]), samples)
         return True
@@ -359,21 +297,25 @@ class Navigator:
         predicted = self._propagated(time)
         if predicted.bridged:
             self.counts["inertial gap bridged"] += 1
-        step = max(time - self._last_epoch_time, 1e-6)
-        measurements, samples, steady = self._measured(predicted, samples, step)
-        about = None
-        if measurements is not None and samples is not None and np.any(samples.valid):
-            if predicted.state.position_sigma > LOST_POSITION and self._found_again(
-                samples, predicted
-            ):
+        step = max(time - self._arrived.last_epoch, 1e-6)
+        found = self._arrived.measured(
+            self._estimator.state, predicted.state, samples, step, earth=self._earth is not None
+        )
+        if found is None:
+            self._take_in(predicted, None, None, None)
+            return
+        measurements, heard, steady = found
+        about = slow = None
+        if np.any(heard.valid):
+            lost = predicted.state.position_sigma > LOST_POSITION
+            if lost and self._found_again(heard, predicted):
                 return
-            about, refused = self._about(samples, predicted.state)
+            about, refused = self._about(heard, predicted.state)
             explained = predicted.state if about is None else about
-            measurements = self._gate.passed(measurements, explained, samples.valid[0], refused)
-            if self._gate.lost and self._found_again(samples, predicted):
+            measurements = self._gate.passed(measurements, explained, heard.valid[0], refused)
+            if self._gate.lost and self._found_again(heard, predicted):
                 return
-        slow = None
-        if measurements is not None and self._earth is not None and steady is not None:
+        if self._earth is not None and steady is not None:
             known = predicted.state if about is None else replace(about, cov=predicted.state.cov)
             measurements, disturbed = self._earth.weighed(measurements, steady, known, step)
             self.counts["Earth field disturbed"] += disturbed
@@ -389,7 +331,7 @@ class Navigator:
     ) -> None:
         assert self._estimator is not None
         factors = None if measurements is None else single(measurements, self.blocks)
-        rest = REST_SIGMA if self._rests(predicted.state) else slow
+        rest = REST_SIGMA if self._arrived.rests(predicted.state) else slow
         try:
             self._estimator.absorb(predicted, factors, rest, about)
         except EstimationError:
@@ -400,82 +342,22 @@ class Navigator:
 
     def _finish(self) -> None:
         assert self._estimator is not None
-        self._made.append(self._estimator.state)
-        self._apply_offset_anew()
-        self._forget(self._estimator.state.time)
-
-    def _apply_offset_anew(self) -> None:
-        """Cut the inertial stream by the time offset that has been learnt since.
-
-        A state is the platform's where the IMU's stamp says; under another offset it is the same
-        state, a little earlier or later on the log's clock.
-        """
-        assert self._estimator is not None
         state = self._estimator.state
-        own = [MOTION + b.columns.start for b in self.blocks if b.kind == "time_offset"]
-        if not own:
-            return
-        lag = state.calibration.time_offset - self._applied_offset
-        if abs(lag) < max(OFFSET_STALE, 2.0 * float(np.sqrt(state.cov[own[0], own[0]]))):
-            return
-        self._applied_offset += lag
-        if isinstance(self._estimator, SlidingWindow):
-            self._estimator.applied_offset = self._applied_offset
-        self._estimator.replace_state(replace(state, time=state.time + lag))
-        self.counts["time offset applied anew"] += 1
+        self._made.append(state)
+        lag = self._arrived.apply_offset_anew(state, self.blocks)
+        if lag:
+            if isinstance(self._estimator, SlidingWindow):
+                self._estimator.applied_offset = self._arrived.applied_offset
+            self._estimator.replace_state(replace(state, time=state.time + lag))
+            self.counts["time offset applied anew"] += 1
+        self._arrived.forget(self._estimator.state.time)
 
     def _propagated(self, time: float) -> Propagated:
         assert self._estimator is not None
         state = self._estimator.state
-        begin, end = state.time - self._applied_offset, time - self._applied_offset
-        imu = self._imu_samples(begin, end)
-        return propagate(state, imu, time, self.site, self._applied_offset, self._walk, self._usual)
-
-    def _imu_samples(self, begin: float = -np.inf, end: float = np.inf) -> ImuSamples:
-        time, rows = self._imu.between(begin, end)
-        return ImuSamples(time, rows[:, :3], rows[:, 3:])
-
-    def _forget(self, time: float) -> None:
-        reach = 2.0 + (0.0 if self._receiver is None else self._receiver.settings.window)
-        self._imu.forget(time - reach, time - self._applied_offset - 1.0)
-        self._waveform.forget(time - reach, time - reach)
-
-    # Measurements
-
-    def _measured(
-        self, predicted: Propagated, samples: FieldSamples | None, step: float
-    ) -> tuple[FieldMeasurements | None, FieldSamples | None, SteadyFields | None]:
-        state = predicted.state
-        wave, steady = None, self._steady.pop(predicted.state.time, None)
-        if samples is None:
-            receiver = self._receiver
-            if receiver is None or receiver.next_centre != state.time:
-                return None, None, None  # only the clock went on
-            assert self._estimator is not None
-            half = receiver.settings.window / 2.0
-            before = self._estimator.state
-            imu = self._imu_samples(
-                min(before.time, state.time - half) - 0.1, state.time + half + 0.1
-            )
-            wave = receiver.demodulate(self._waveform, imu, before, state, self._applied_offset)
-            samples, steady = wave.fields, wave.steady
-        samples = self._hearing.of(samples, step)
-        if not np.any(samples.valid) and (self._earth is None or steady is None):
-            return None, None, None
-        self._last_epoch_time = state.time
-        rate_body = self._rate(state.time) - state.gyro_bias_body
-        measurements = measured_at(samples, wave, state, rate_body, self._applied_offset, step)
-        return measurements, samples, steady
-
-    def _rate(self, time: float) -> Array:
-        stamp = time - self._applied_offset
-        _, rows = self._imu.between(stamp - RATE_SPAN / 2, stamp + RATE_SPAN / 2)
-        return np.asarray(np.mean(rows[:, :3], axis=0)) if len(rows) else np.zeros(3)
-
-    def _rests(self, state: State) -> bool:
-        stamp = state.time - self._applied_offset
-        time, rows = self._imu.between(stamp - REST_SPAN - REACH, stamp + REACH)
-        return stands(state, time, rows[:, :3], rows[:, 3:], stamp)
+        offset, usual = self._arrived.applied_offset, self._arrived.usual
+        imu = self._arrived.inertial_samples(state.time - offset, time - offset)
+        return propagate(state, imu, time, self.site, offset, self._walk, usual)
 
     # Being lost, and found again
 
