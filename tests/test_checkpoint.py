@@ -61,6 +61,14 @@ def test_a_restored_navigator_goes_on_to_the_last_bit(estimator: str) -> None:
         assert twin.losses == navigator.losses
 
 
+@pytest.mark.parametrize(
+    "foreign", [pickle.dumps((0, None)), pickle.dumps("navigator"), b"", b"cmagfusion.gone\nIt\n."]
+)
+def test_a_checkpoint_of_another_version_is_refused(foreign: bytes) -> None:
+    with pytest.raises(InputError, match="another version of magfusion; run without --resume"):
+        restored(foreign)
+
+
 def _rest(log: OnlineLog, navigator, begin: float) -> list[State]:  # type: ignore[no-untyped-def]
     states: list[State] = []
     arrival = log.fields.time + WINDOW / 2.0

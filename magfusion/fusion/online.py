@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from magfusion.errors import EstimationError
+from magfusion.errors import EstimationError, InputError
 from magfusion.fusion.arrivals import Arrivals
 from magfusion.fusion.earth import check_earth
 from magfusion.fusion.earth_online import EarthWatch
@@ -31,6 +31,7 @@ from magfusion.records.samples import FieldSamples, SteadyFields
 from magfusion.site import Site
 from magfusion.units import Array, BoolArray
 
+CHECKPOINT_FORMAT = 2  # to be raised with every change of what a navigator holds
 WIDE_POSITION, WIDE_ROTATION = 0.3, 0.2  # m, rad; beyond, the prediction is no place to linearise
 LOST_POSITION = 10.0  # m; a prediction wider than this is worth nothing
 
@@ -201,7 +202,7 @@ class Navigator:
 
     def checkpoint(self) -> bytes:
         """Return everything needed to go on: `restored` makes a navigator of it."""
-        return pickle.dumps(self)
+        return pickle.dumps((CHECKPOINT_FORMAT, self))
 
     # How it goes on
 
@@ -385,7 +386,20 @@ class Navigator:
 
 
 def restored(checkpoint: bytes) -> Navigator:
-    """Return the navigator of a checkpoint.  Only open checkpoints that you have written."""
-    found = pickle.loads(checkpoint)
-    assert isinstance(found, Navigator)
-    return found
+    """Return the navigator of a checkpoint.  Only open checkpoints that you have written.
+
+    Raises
+    ------
+    InputError
+        Where another version of magfusion wrote it.
+    """
+    other = "the checkpoint is of another version of magfusion; run without --resume"
+    try:
+        found = pickle.loads(checkpoint)
+    except (pickle.UnpicklingError, AttributeError, EOFError, ImportError) as error:
+        raise InputError(other) from error
+    if not isinstance(found, tuple) or found[0] != CHECKPOINT_FORMAT:
+        raise InputError(other)
+    navigator = found[1]
+    assert isinstance(navigator, Navigator)
+    return navigator
