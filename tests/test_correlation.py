@@ -13,6 +13,7 @@ from example_site import mixed_site
 from magfusion.correlation import Correlation, Parameter, joined
 from magfusion.errors import InputError
 from magfusion.evaluation.consistency import average_nees_bounds
+from magfusion.evaluation.coverage import coverage
 from magfusion.evaluation.errors import trajectory_errors
 from magfusion.fixes.likelihood import fix_epochs
 from magfusion.fusion.batch import Smoothed, SmootherSettings, smooth
@@ -240,6 +241,16 @@ def roughly(site: Site) -> Site:
     """Return a site surveyed by eye, so that a log tells far more than the survey."""
     sigma = BeaconSigma(np.full(3, 0.05), np.full(3, 2.0 * DEGREE), np.full(2, 0.03))
     return replace(site, beacons=tuple(replace(b, sigma=sigma) for b in site.beacons))
+
+
+def test_the_bound_of_the_coverage_knows_what_goes_together() -> None:
+    site = moved_together(demo_site(coil_radius=None))
+    points = np.array([[2.0, 1.5, 1.0], [1.0, 2.0, 1.5]])
+    together = coverage(site, points, 1.0).position_sigma
+    np.testing.assert_allclose(together, np.sqrt(3.0) * COMMON, rtol=0.05, atol=0.0)
+    assert np.all(
+        coverage(replace(site, correlation=None), points, 1.0).position_sigma < 0.8 * together
+    )
 
 
 def exactly(site: Site) -> Site:

@@ -18,8 +18,8 @@ from magfusion.parameters import (
     choose_blocks,
     initial_calibration,
     linearize_channels,
-    prior_sigma,
 )
+from magfusion.prior import prior_spread
 from magfusion.site import Beacon, Site
 from magfusion.units import Array, BoolArray, IntArray
 from magfusion.weights import model_error, paired_whitening
@@ -179,7 +179,7 @@ def coverage(
             calibration, blocks, variance, attitude, position_world[rows]
         )
         by_pose = by_pose[..., 3:] if attitude_known else by_pose
-        cov[rows], determined[rows] = _bound(_root_information(by_pose, by_nuisance, blocks))
+        cov[rows], determined[rows] = _bound(_root_information(by_pose, by_nuisance, site, blocks))
     return _summary(position_world, attitude, cov, heard, determined)
 
 
@@ -270,7 +270,9 @@ def _whitened(
     )
 
 
-def _root_information(by_pose: Array, by_nuisance: Array, blocks: tuple[Block, ...]) -> Array:
+def _root_information(
+    by_pose: Array, by_nuisance: Array, site: Site, blocks: tuple[Block, ...]
+) -> Array:
     """Triangular root of the pose's information with the nuisances marginalised.
 
     By QR of Jacobian and prior: where the survey is fine and the field strong, the difference of
@@ -278,11 +280,12 @@ def _root_information(by_pose: Array, by_nuisance: Array, blocks: tuple[Block, .
     """
     kinds = [b.kind for b in blocks for _ in b.sigma]
     free = np.array([kind == "phase" for kind in kinds], dtype=bool)
-    sigma = np.where(free, 1.0, prior_sigma(blocks))
+    spread = prior_spread(site, blocks)
+    spread[free, free] = 1.0
     count, _, width = by_nuisance.shape
     prior = np.zeros((count, width, width + by_pose.shape[-1]))
     prior[:, np.arange(width), np.arange(width)] = ~free
-    stacked = np.concatenate([by_nuisance * sigma, by_pose], axis=2)
+    stacked = np.concatenate([by_nuisance @ spread, by_pose], axis=2)
     rows = np.concatenate([stacked, prior], axis=1)
     missing = max(rows.shape[2] - rows.shape[1], 0)  # fewer channels than unknowns
     rows = np.pad(rows, ((0, 0), (0, missing), (0, 0)))
