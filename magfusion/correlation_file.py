@@ -24,7 +24,7 @@ def write_correlation(correlation: Correlation, sigma: Array, path: Path) -> Non
     ----------
     correlation : Correlation
     sigma : ndarray, shape (n,)
-        In the tangent's units.
+        SI.
     path : Path
     """
     columns = dict(zip(_NAMES, zip(*correlation.parameters, strict=True), strict=True))

@@ -8,9 +8,10 @@ than the batch's, and what leaves the window by hardly more.
 Where the survey is wrong by centimetres the comparison asks for more than there is: the trajectory
 of a calibrated log stands in a frame that the log itself defines, and that frame moves by a
 centimetre while the calibration is still being learnt.  The row ``batch up to now`` shows it:
-it smooths the log anew up to each of some instants and keeps the last state alone, which is the
-best that anybody without the future can do.  No online estimator can be expected to beat it; the
-rows ``..., then`` are the online estimators' states of the same instants.
+it smooths the log anew up to each of some instants and keeps the last state alone: all that was
+known by then, in one solution.  An online estimator can be expected to come near it, not to beat it
+by much; one log is one draw, and on one of ours they err by less.  The rows ``..., then`` are the
+online estimators' states of the same instants.
 
 Who calibrates once and navigates from then on has left that behind: ``..., calibrated`` are the
 estimators on the second half of the log, with the site that the smoother made of the first.

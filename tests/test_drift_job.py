@@ -20,7 +20,17 @@ PIECES = 10.0 * np.arange(8640.0)  # s; a day
 SIGMA = np.repeat([1e-3, 4e-3, 1e-2, 5e-3, 1e-4], 3)
 
 
-def a_run(world=0, *, slope=0.0, growth=0.0, slower=0.0, sigma_error=1.0, jump=0.0, losses=None):
+def a_run(
+    world=0,
+    *,
+    slope=0.0,
+    growth=0.0,
+    slower=0.0,
+    sigma_error=1.0,
+    jump=0.0,
+    losses=None,
+    memory=200.0,
+):
     """Return a day of synthetic white errors, with what is to be found in them."""
     rng = np.random.default_rng(world)
     stamps = 60.0 * np.arange(1440.0)
@@ -35,7 +45,7 @@ def a_run(world=0, *, slope=0.0, growth=0.0, slower=0.0, sigma_error=1.0, jump=0
             PIECES,
             2e-3 * (1.0 + slower * share) * rng.uniform(1.0, 1.02, len(PIECES)),
             np.ones_like(PIECES),
-            200.0 + growth * share,
+            memory + growth * share,
             np.ones_like(PIECES),
             np.full_like(PIECES, 3e-6),
         ]
@@ -69,6 +79,7 @@ def test_an_estimator_that_stands_passes():
         ({"slope": np.deg2rad(3.0)}, "attitude_drift"),
         ({"slope": np.deg2rad(0.04)}, "attitude_common_drift"),
         ({"growth": 100.0}, "memory"),
+        ({"growth": 25.0, "memory": 400.0}, "memory"),
         ({"slower": 2.0}, "latency"),
         ({"sigma_error": 2.0}, "pose_consistency"),
         ({"sigma_error": 2.0}, "bias_consistency"),
