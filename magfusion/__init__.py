@@ -21,3 +21,57 @@ Phasors
     axes, as the instrument gave it: ``measured = matrix @ field_sensor + offset``.
 Standard deviations end in ``_sigma``, covariances in ``_cov``.
 """
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from magfusion.errors import EstimationError as EstimationError
+    from magfusion.errors import InputError as InputError
+    from magfusion.estimation.batch import SmootherSettings as SmootherSettings
+    from magfusion.estimation.batch import smooth as smooth
+    from magfusion.estimation.integrity.judge import judged as judged
+    from magfusion.estimation.navigator import Navigator as Navigator
+    from magfusion.estimation.navigator import NavigatorSettings as NavigatorSettings
+    from magfusion.estimation.snapshot.likelihood import fix_epochs as fix_epochs
+    from magfusion.files.open import open_log as open_log
+    from magfusion.files.site import load_site as load_site
+    from magfusion.files.site import save_site as save_site
+    from magfusion.model.samples import Log as Log
+    from magfusion.model.site import Site as Site
+    from magfusion.model.trajectory import Trajectory as Trajectory
+    from magfusion.results.errors import trajectory_errors as trajectory_errors
+    from magfusion.simulation.log import simulate_log as simulate_log
+
+# What most users need, and where it is; the file is read when the name is first asked for.
+_HOMES = {
+    "EstimationError": "errors",
+    "InputError": "errors",
+    "Log": "model.samples",
+    "Navigator": "estimation.navigator",
+    "NavigatorSettings": "estimation.navigator",
+    "Site": "model.site",
+    "SmootherSettings": "estimation.batch",
+    "Trajectory": "model.trajectory",
+    "fix_epochs": "estimation.snapshot.likelihood",
+    "judged": "estimation.integrity.judge",
+    "load_site": "files.site",
+    "open_log": "files.open",
+    "save_site": "files.site",
+    "simulate_log": "simulation.log",
+    "smooth": "estimation.batch",
+    "trajectory_errors": "results.errors",
+}
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'magfusion' has no attribute {name!r}")
+    found = getattr(import_module(f"magfusion.{_HOMES[name]}"), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

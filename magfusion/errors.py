@@ -2,7 +2,7 @@
 
 
 class InputError(ValueError):
-    """Input that a user can mend.
+    """Input that a user can correct.
 
     The message is one sentence that names the file, the place in it, what was found and the
     remedy; the command line prints it and exits with 2.

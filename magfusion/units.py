@@ -15,3 +15,4 @@ MU0_OVER_4PI = 1e-7  # T m / A
 NANOTESLA = 1e-9  # T
 DEGREE = np.pi / 180.0  # rad
 NANOSECOND = 1e-9  # s
+STANDARD_GRAVITY = 9.80665  # m/s^2

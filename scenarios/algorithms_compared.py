@@ -16,34 +16,32 @@ The lines of algorithm 1 carry `World.line_bias`, a change since they were fitte
 algorithm 3, which takes from its lines the slope alone.
 """
 
-import argparse
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scale import Scale, add_scale_options, chosen_scale, show_progress
+from harness import Scale, blank_figure, chosen_scale, conclude, rms, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.fieldmap import MapPoints, learn_field_map
-from magfusion.evaluation.coverage import coverage
-from magfusion.fixes.direction import angles_as_printed
-from magfusion.fixes.fingerprint import (
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.files.survey import Survey
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.papers.p004_fingerprints.algorithms import attitude_as_published, locate_by_lines
+from magfusion.papers.p004_fingerprints.equations import distances, eq_23_angles, eq_25_fingerprint
+from magfusion.papers.p004_fingerprints.fingerprint import (
     FingerprintDatabase,
-    amplitude_of,
     fingerprint_database,
     locate_by_differential_range,
     locate_by_neighbours,
 )
-from magfusion.fixes.likelihood import fix_epochs
-from magfusion.fixes.published import attitude_as_published, locate_by_lines
-from magfusion.fixes.rssi import RssiLines, distances, fit_lines
-from magfusion.monte_carlo import run_many
-from magfusion.parameters import initial_calibration
+from magfusion.papers.p004_fingerprints.rssi import RssiLines, fit_lines
 from magfusion.receiver.ellipse import plane_normal
-from magfusion.records.samples import FieldSamples
-from magfusion.records.survey import Survey
+from magfusion.results.coverage import coverage
+from magfusion.simulation.monte_carlo import run_many
 from magfusion.simulation.worlds import (
     ROOM,
     S0,
@@ -53,7 +51,6 @@ from magfusion.simulation.worlds import (
     World,
     draw_world,
 )
-from magfusion.site import Site
 from magfusion.units import DEGREE, Array
 
 MODEL_ERROR = 0.02  # relative; half a per cent to five give nearly the same
@@ -93,7 +90,7 @@ class Trial:
     @property
     def amplitude(self) -> Array:
         """Of each beacon at each target (T)."""
-        return amplitude_of(self.samples.phasor_sensor[:, :, None])
+        return eq_25_fingerprint(self.samples.phasor_sensor[:, :, None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +225,7 @@ def try_world(task: Task, rng: np.random.Generator) -> Outcome:
     trial = Trial(world, world.survey(rng), world.measure(targets, LEVEL, rng))
     found = {name: METHODS[name](trial) for name in task.methods}
     angles = {
-        name: angles_as_printed(np.swapaxes(poses.world_from_body, -1, -2))
+        name: eq_23_angles(np.swapaxes(poses.world_from_body, -1, -2))
         for name, poses in found.items()
     }
     position_bound, attitude_bound = bound(world, targets)
@@ -257,7 +254,7 @@ def bound(world: World, position_world: Array) -> tuple[Array, Array]:
 
 def angle_deg(rotation: Array) -> Array:
     """Return the angle of rotations (n, 3, 3) (deg)."""
-    return np.asarray(Rotation.from_matrix(rotation).magnitude() / DEGREE)
+    return Rotation.from_matrix(rotation).magnitude() / DEGREE
 
 
 def _size(vector: Array) -> Array:
@@ -273,7 +270,7 @@ def run(
         for name in config.scenarios
         for _ in range(config.worlds)
     ]
-    found = run_many(try_world, tasks, seed=config.seed, report=show_progress, **(scale or {}))
+    found = run_many(try_world, tasks, seed=config.seed, **(scale or {}))
     return {
         name: found[i * config.worlds : (i + 1) * config.worlds]
         for i, name in enumerate(config.scenarios)
@@ -322,7 +319,7 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, dict[str, float]]:
             row[key] = float(np.mean(value))
             row[key + "_se"] = standard_error(value)
         every = np.concatenate([o.position[method] for o in outcomes])
-        row["position_rms_m"] = _rms(every)
+        row["position_rms_m"] = rms(every)
         found[method] = row
     return found
 
@@ -335,8 +332,8 @@ def standard_error(value: Array) -> float:
 def bounds(outcomes: Sequence[Outcome]) -> tuple[float, float]:
     """Return the root mean square bound of position (m) and attitude (deg) over all targets."""
     return (
-        _rms(np.concatenate([o.position_bound for o in outcomes])),
-        _rms(np.concatenate([o.attitude_bound for o in outcomes])),
+        rms(np.concatenate([o.position_bound for o in outcomes])),
+        rms(np.concatenate([o.attitude_bound for o in outcomes])),
     )
 
 
@@ -346,10 +343,6 @@ def worst_ratio(outcomes: Sequence[Outcome], method: str) -> tuple[float, float]
     published = np.array([means(outcomes, "position", name) for name in PUBLISHED])
     overall = float(np.mean(ours) / np.mean(published, axis=1).min())
     return overall, float(np.max(ours / published.min(axis=0)))
-
-
-def _rms(value: Array) -> float:
-    return float(np.sqrt(np.mean(value**2)))
 
 
 def report(found: Mapping[str, Sequence[Outcome]], tilts: Mapping[float, float]) -> str:
@@ -401,11 +394,9 @@ def _table(
 
 def draw(directory: Path, found: Mapping[str, Sequence[Outcome]]) -> None:
     """Write the paper's figures 7 and 8 as PNGs."""
-    from matplotlib.figure import Figure
-
     shown = "F1" if "F1" in found else next(iter(found))
     colours = {name: f"C{i}" for i, name in enumerate(METHODS)}
-    figure = Figure(figsize=(12.0, 5.0), layout="constrained")
+    figure = blank_figure(12.0, 5.0)
     axes = figure.subplots(1, 2)
     for name, colour in colours.items():
         for axis, quantity in zip(axes, ("position", "euler"), strict=True):
@@ -420,16 +411,14 @@ def draw(directory: Path, found: Mapping[str, Sequence[Outcome]]) -> None:
     axes[0].set(title=f"{shown}; dotted: means of the paper", xlabel="position error (m)")
     axes[1].set(title="level sensor", xlabel="attitude error, mean |Euler| (deg)")
     axes[0].legend(fontsize=8)
-    figure.savefig(directory / "figure_7.png", dpi=110, metadata={"Software": None})
+    save_picture(figure, directory / "figure_7.png")
     _draw_bars(directory / "figure_8.png", found, colours)
 
 
 def _draw_bars(
     path: Path, found: Mapping[str, Sequence[Outcome]], colours: Mapping[str, str]
 ) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12.0, 7.0), layout="constrained")
+    figure = blank_figure(12.0, 7.0)
     axes = figure.subplots(2, 1, sharex=True)
     width = 0.8 / len(colours)
     labels = ("mean position error (m)", "mean attitude error, |Euler| (deg)")
@@ -445,42 +434,33 @@ def _draw_bars(
     axes[1].set_xticks(np.arange(len(found)), list(found))
     handles, names = axes[0].get_legend_handles_labels()
     figure.legend(handles, names, loc="outside upper center", ncols=len(colours), fontsize=8)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save_picture(figure, path)
 
 
 def main() -> None:
     """Print the tables and one JSON line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
+    quick = "two worlds of fifty targets"
+    parser = scenario_parser(__doc__, Config.seed, quick, parallel=True)
     parser.add_argument("--worlds", type=int, help=f"of each scenario (default {Config.worlds})")
-    parser.add_argument("--quick", action="store_true", help="two worlds of fifty targets")
-    parser.add_argument("-o", "--output", type=Path, help="directory of the pictures")
-    add_scale_options(parser)
     given = parser.parse_args()
     if given.worlds is not None and given.worlds < 2:
         parser.error("--worlds must be at least 2, for a standard error")
     small = Config(worlds=2, targets=50, tilted=200) if given.quick else Config()
     config = replace(small, seed=given.seed, worlds=given.worlds or small.worlds)
     found, tilts = run(config, chosen_scale(given)), likelihood_at_tilts(config)
-    print(report(found, tilts))
     if given.output is not None:
-        given.output.mkdir(parents=True, exist_ok=True)
         draw(given.output, found)
-    scenarios = {name: summary(outcomes) for name, outcomes in found.items()}
     bound_m, bound_deg = bounds(next(iter(found.values())))
-    print(
-        json.dumps(
-            {
-                "worlds": config.worlds,
-                "seed": config.seed,
-                "scenarios": scenarios,
-                "bound_rms_m": bound_m,
-                "bound_rms_deg": bound_deg,
-                "map_over_best_published": {n: worst_ratio(o, MAPPED) for n, o in found.items()},
-                "ml_attitude_by_tilt_deg": tilts,
-            }
-        )
-    )
+    figures = {
+        "worlds": config.worlds,
+        "seed": config.seed,
+        "scenarios": {name: summary(outcomes) for name, outcomes in found.items()},
+        "bound_rms_m": bound_m,
+        "bound_rms_deg": bound_deg,
+        "map_over_best_published": {n: worst_ratio(o, MAPPED) for n, o in found.items()},
+        "ml_attitude_by_tilt_deg": tilts,
+    }
+    conclude(report(found, tilts), figures)
 
 
 if __name__ == "__main__":

@@ -15,12 +15,11 @@ within 5 degrees, with no assumption on the yaw.  The scenario finds:
 Angles are printed as in the paper (north, east, down; pitch up is positive).
 """
 
-import argparse
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from harness import blank_figure, conclude, rms, save_picture, scenario_parser
 from roll_matching import (
     FIELD_WORLD,
     MILLIGAUSS,
@@ -32,14 +31,19 @@ from roll_matching import Config as Instruments
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from magfusion.fixes.matching import (
+from magfusion.files.attitude_table import AttitudeDatabase
+from magfusion.papers.p001_magnetometer.matching import (
     attitude_with_gravity,
     match_roll_pitch,
     predict_field,
     wrap,
 )
-from magfusion.fixes.matching_database import Index, match_interpolated, match_nearest, prepare
-from magfusion.records.attitude_table import AttitudeDatabase
+from magfusion.papers.p001_magnetometer.matching_database import (
+    Index,
+    match_interpolated,
+    match_nearest,
+    prepare,
+)
 from magfusion.units import DEGREE, Array
 
 METHODS = ("nearest", "interpolated", "closed form")
@@ -154,7 +158,7 @@ def by_step(config: Config, step_deg: float) -> Step:
     return Step(
         step_deg=step_deg,
         entries=len(index.database),
-        rms={name: float(np.sqrt(np.mean(np.square(e)))) for name, e in errors.items()},
+        rms={name: rms(np.array(e)) for name, e in errors.items()},
         median_max={name: float(np.median([x.max() for x in e])) for name, e in errors.items()},
     )
 
@@ -209,7 +213,7 @@ def with_gravity(config: Config) -> float:
     share = config.noise_mg * MILLIGAUSS / float(np.linalg.norm(FIELD_WORLD))
     found = attitude_with_gravity(measured, force, FIELD_WORLD, share, force_noise)
     turn = Rotation.from_matrix(found).inv() * Rotation.from_euler("xyz", true)
-    return float(np.sqrt(np.mean(turn.magnitude() ** 2)) / DEGREE)
+    return rms(turn.magnitude()) / DEGREE
 
 
 def run(config: Config) -> Result:
@@ -255,14 +259,12 @@ def report(result: Result) -> str:
 
 def draw(config: Config, path: Path) -> None:
     """Write a picture like the paper's figure 6, and what becomes of it with another yaw."""
-    from matplotlib.figure import Figure
-
     rng = np.random.default_rng(config.seed)
     index = database(config, 5.0, rng)
     time = np.linspace(0.0, 60.0, 1201)
     swing = 0.5 * np.sum(PITCH_NED_DEG) + 35.0 * np.sin(0.3 * time)
     roll_deg = 180.0 * wrap(0.5 * time) / np.pi
-    figure = Figure(figsize=(9.0, 8.0), layout="constrained")
+    figure = blank_figure(9.0, 8.0)
     panels = figure.subplots(3, 1, sharex=True)
     for yaw_deg, color in ((0.0, "tab:blue"), (5.0, "tab:orange")):
         rpy = from_ned(np.stack([roll_deg, swing, np.full_like(time, yaw_deg)], axis=1))
@@ -281,22 +283,17 @@ def draw(config: Config, path: Path) -> None:
     for axes in panels:
         axes.legend(loc="upper right")
     panels[2].set(xlabel="time (s); red: the paper's claim")
-    figure.savefig(path, dpi=110)
+    save_picture(figure, path)
 
 
 def main() -> None:
     """Print the tables and one JSON line; draw where an output directory is given."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
-    parser.add_argument("-o", "--output", type=Path, help="directory of the picture")
-    given = parser.parse_args()
+    given = scenario_parser(__doc__, Config.seed).parse_args()
     config = Config(seed=given.seed)
     result = run(config)
-    print(report(result))
     if given.output is not None:
-        given.output.mkdir(parents=True, exist_ok=True)
         draw(config, given.output / "attitude_matching.png")
-    print(json.dumps({"paper_max_deg": PAPER_DEG} | asdict(result)))
+    conclude(report(result), {"paper_max_deg": PAPER_DEG} | vars(result))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ The paper calibrates a rotating beacon with three or four magnetometers, 1000 ti
 0.011 and 0.009 m, 0.17 and 0.13 degrees (figures 5 and 6; drawn here with -o).  The scenario asks:
 
 1. Do its equations give its figures?  Only if the normals are measured in the beacon's own axes,
-   which nobody knows yet, and somebody tells each direction's hemisphere.  Then, with one percent
+   which are not known yet, and each direction's hemisphere is given.  Then, with one percent
    of noise on each component, they do: 0.0107 and 0.0080 m.
 2. And as a magnetometer measures, in its own axes?  One degree of tilt moves the centre by 0.21 m;
    with the attitude of the paper's own simulation there is no usable result; a turn about the
@@ -17,29 +17,27 @@ The paper calibrates a rotating beacon with three or four magnetometers, 1000 ti
    are.
 """
 
-import argparse
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scale import Scale, add_scale_options, chosen_scale, show_progress
+from harness import blank_figure, chosen_scale, conclude, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.beacon import BeaconMeasurements, calibrate_beacon
-from magfusion.calibration.beacon_paper import (
+from magfusion.calibration.beacon_refined import attitudes, fit_known_moments
+from magfusion.estimation.snapshot.candidates import wahba
+from magfusion.model.site import Beacon, BeaconSigma, Coil, Magnetometer
+from magfusion.papers.p002_beacon.calibration import (
     calibrate_as_printed,
     consistent_centres,
-    directions,
 )
-from magfusion.calibration.beacon_refined import attitudes, fit_known_moments
-from magfusion.fixes.candidates import wahba
-from magfusion.fixes.direction import angles_as_printed
-from magfusion.monte_carlo import run_many
+from magfusion.papers.p002_beacon.equations import eq_04_direction, eq_21_angles
+from magfusion.receiver.ellipse import plane_normal
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.field import phasors_world
-from magfusion.site import Beacon, BeaconSigma, Coil, Magnetometer
+from magfusion.simulation.monte_carlo import run_many
 from magfusion.units import DEGREE, Array, ComplexArray
 
 PLACES_WORLD = np.array([[2, 2, 0.5], [-2, 2, 0.5], [2, -2, 0.5], [-2, -2, 0.5]])  # m
@@ -103,7 +101,7 @@ class Errors:
 
 
 def beacon(position_world: Array | None = None, rotation: Array | None = None) -> Beacon:
-    """Return the paper's beacon; at the origin and level where not told otherwise."""
+    """Return the paper's beacon; at the origin and level unless given otherwise."""
     coils = (Coil(np.array([MOMENT, 0, 0])), Coil(np.array([0, MOMENT, 0]), -np.pi / 2.0))
     sigma = BeaconSigma(np.full(3, 0.5), np.full(3, 1.0), np.full(2, 0.03))
     place = np.zeros(3) if position_world is None else position_world
@@ -178,7 +176,7 @@ def run_block(block: Block, rng: np.random.Generator) -> tuple[Array, Array, Arr
     turned, _ = attitudes(measured.beacon, nine.moments_world)
     centre, known, cov = fit_known_moments(measured, nine.centre_world, turned)
     places_found = np.stack([printed.centre_world, nine.centre_world, centre])
-    angles = np.stack([printed.angles, angles_as_printed(turned), angles_as_printed(known)])
+    angles = np.stack([printed.angles, eq_21_angles(turned), eq_21_angles(known)])
     square = np.stack([nine.cov[:, :3, :3], cov[:, 3:, 3:]])
     bound = np.sqrt(np.trace(square, axis1=2, axis2=3))
     return (
@@ -246,7 +244,7 @@ def false_centres() -> list[float]:
     """Return how far off the centres are (m) that fit three exact normals as well as the truth."""
     rotation, places = paper_rotation(), PLACES_WORLD[:3]
     exact = phasors_world(beacon(rotation=rotation), places)[:, 0] @ rotation
-    found = consistent_centres(directions(exact), places, 1e-6)
+    found = consistent_centres(eq_04_direction(plane_normal(exact)), places, 1e-6)
     return sorted(float(np.linalg.norm(centre)) for _, centre in found)
 
 
@@ -285,12 +283,12 @@ def report(errors: dict[tuple[str, int], Errors]) -> str:
         f"{'rms angle':>10}{'rms/bound':>10}"
     ]
     for (noise, count), found in errors.items():
-        told = found.summary()
+        own = found.summary()
         for i, method in enumerate(METHODS):
-            ratio = "" if i == 0 else told["position_rms_m"][i] / told["bound_rms_m"][i - 1]
+            ratio = "" if i == 0 else own["position_rms_m"][i] / own["bound_rms_m"][i - 1]
             lines.append(
-                f"{noise:<10}{count:>8} {method:<15}{told['position_m'][i]:11.4f}"
-                f"{told['attitude_deg'][i]:10.3f}{told['attitude_rms_deg'][i]:10.3f}"
+                f"{noise:<10}{count:>8} {method:<15}{own['position_m'][i]:11.4f}"
+                f"{own['attitude_deg'][i]:10.3f}{own['attitude_rms_deg'][i]:10.3f}"
                 + (f"{ratio:10.3f}" if ratio else "")
             )
     for count, (position, angle) in PAPER.items():
@@ -305,24 +303,19 @@ def failures() -> tuple[str, dict[str, Any]]:
              for tilt in (1.0, 2.0, 5.0, 10.0)}  # fmt: skip
     cases |= {"30 deg about z": Rotation.from_euler("z", 30.0, degrees=True)}
     cases |= {"88, 0, 88 deg (paper)": Rotation.from_matrix(paper_rotation())}
-    told = {name: printed_from(turn.as_matrix(), np.eye(3)) for name, turn in cases.items()}
-    told["88, 0, 88, beacon axes"] = printed_from(paper_rotation(), paper_rotation())
-    lines += [f"{name:<24}{'; '.join(map(str, cells))}" for name, cells in told.items()]
+    cases_found = {name: printed_from(turn.as_matrix(), np.eye(3)) for name, turn in cases.items()}
+    cases_found["88, 0, 88, beacon axes"] = printed_from(paper_rotation(), paper_rotation())
+    lines += [f"{name:<24}{'; '.join(map(str, cells))}" for name, cells in cases_found.items()]
     false = false_centres()
     lines.append(
         f"centres that fit exact normals of three: {', '.join(f'{f:.3f} m' for f in false)}"
     )
-    figures = {name: [asdict(cell) for cell in cells] for name, cells in told.items()}
-    return "\n".join(lines), figures | {"centres_that_fit_m": false}
+    return "\n".join(lines), cases_found | {"centres_that_fit_m": false}
 
 
 def draw(errors: dict[tuple[str, int], Errors], directory: Path) -> Path:
     """Draw the cumulative distributions of figures 5 and 6; return the picture's path."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 4.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(11.0, 4.5)
     left, right = figure.subplots(1, 2)
     for count, style in zip(PAPER, ("-", "--"), strict=True):
         found = errors["component", count]
@@ -338,34 +331,31 @@ def draw(errors: dict[tuple[str, int], Errors], directory: Path) -> Path:
     right.set(xlabel="mean error of the three angles (deg)", title="figure 6")
     left.legend(fontsize=8)
     figure.suptitle("Calibration of a beacon, 1 % noise; grey: mean that paper 002 reports")
-    directory.mkdir(parents=True, exist_ok=True)
     path = directory / "beacon_calibration.png"
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save_picture(figure, path)
     return path
 
 
 def main() -> None:
     """Print the tables and one JSON line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
+    parser = scenario_parser(__doc__, Config.seed, parallel=True)
     parser.add_argument("--runs", type=int, default=Config.runs)
-    parser.add_argument("-o", "--output", type=Path, help="directory of the picture")
-    add_scale_options(parser)
     options = parser.parse_args()
     config = Config(runs=options.runs, seed=options.seed)
-    scale: Scale = chosen_scale(options)
-    errors = run(config, report=show_progress, **scale)
-    print(report(errors))
-    text, told = failures()
-    print(text)
+    errors = run(config, **chosen_scale(options))
+    text, naive = failures()
     found, (nine, six) = anywhere(config), uneven_coils()
-    print(f"\nbeacons anywhere within a metre, any attitude: {100.0 * found:.0f} % found")
-    print(f"coils off by 3 % and 2 deg: {nine:.1e} m with nine unknowns, {six:.4f} m with six")
+    lines = [
+        report(errors),
+        text,
+        f"\nbeacons anywhere within a metre, any attitude: {100.0 * found:.0f} % found",
+        f"coils off by 3 % and 2 deg: {nine:.1e} m with nine unknowns, {six:.4f} m with six",
+    ]
     if options.output is not None:
-        print(f"picture in {draw(errors, options.output)}")
+        lines.append(f"picture in {draw(errors, options.output)}")
     figures = {f"{n}_{c}": e.summary() for (n, c), e in errors.items()}
-    rest = {"naive": told, "found_anywhere": found, "uneven_coils_m": [nine, six]}
-    print(json.dumps({"methods": METHODS, "errors": figures} | rest))
+    rest = {"naive": naive, "found_anywhere": found, "uneven_coils_m": [nine, six]}
+    conclude("\n".join(lines), {"methods": METHODS, "errors": figures} | rest)
 
 
 if __name__ == "__main__":

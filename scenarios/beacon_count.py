@@ -12,8 +12,6 @@ targets lie, in the fitted rooms of `algorithms_compared` (F1), whose lines are 
 The workers of a ``--cluster`` need this directory on their PYTHONPATH.
 """
 
-import argparse
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,9 +25,9 @@ from algorithms_compared import (
     standard_error,
     try_world,
 )
-from scale import Scale, add_scale_options, chosen_scale, show_progress
+from harness import Scale, blank_figure, chosen_scale, conclude, save_picture, scenario_parser
 
-from magfusion.monte_carlo import run_many
+from magfusion.simulation.monte_carlo import run_many
 from magfusion.simulation.worlds import F1, ring
 from magfusion.units import Array
 
@@ -58,7 +56,7 @@ def run(
         for count in COUNTS
         for _ in range(config.worlds)
     ]
-    found = run_many(try_world, tasks, seed=config.seed, report=show_progress, **(scale or {}))
+    found = run_many(try_world, tasks, seed=config.seed, **(scale or {}))
     return {
         count: found[i * config.worlds : (i + 1) * config.worlds] for i, count in enumerate(COUNTS)
     }
@@ -104,9 +102,7 @@ def _row(name: str, value: Sequence[float] | Array, spread: Sequence[float] | No
 
 def draw(path: Path, found: Mapping[int, Sequence[Outcome]]) -> None:
     """Write the paper's figure 11 as a PNG."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.0, 5.0), layout="constrained")
+    figure = blank_figure(8.0, 5.0)
     axis = figure.subplots()
     axis.plot(COUNTS, PAPER, "k--o", label="paper")
     for method in METHODS:
@@ -117,37 +113,27 @@ def draw(path: Path, found: Mapping[int, Sequence[Outcome]]) -> None:
     axis.set(yscale="log", xticks=COUNTS, xlabel="beacons", ylabel="mean position error (m)")
     axis.grid(visible=True, which="both", alpha=0.3)
     axis.legend()
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save_picture(figure, path)
 
 
 def main() -> None:
     """Print the table and one JSON line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
-    parser.add_argument("--quick", action="store_true", help="two rooms of fifty targets")
-    parser.add_argument("-o", "--output", type=Path, help="directory of the picture")
-    add_scale_options(parser)
-    given = parser.parse_args()
+    quick = "two rooms of fifty targets"
+    given = scenario_parser(__doc__, Config.seed, quick, parallel=True).parse_args()
     small = Config(worlds=2, targets=50) if given.quick else Config()
     config = replace(small, seed=given.seed)
     found = run(config, chosen_scale(given))
-    print(report(found))
     if given.output is not None:
-        given.output.mkdir(parents=True, exist_ok=True)
         draw(given.output / "figure_11.png", found)
-    result = {method: errors(found, method).mean(axis=1).tolist() for method in METHODS}
-    print(
-        json.dumps(
-            {
-                "beacons": COUNTS,
-                "paper_m": PAPER,
-                "position_m": result,
-                "bound_rms_m": bounds(found).tolist(),
-                "worlds": config.worlds,
-                "seed": config.seed,
-            }
-        )
-    )
+    figures = {
+        "beacons": COUNTS,
+        "paper_m": PAPER,
+        "position_m": {m: errors(found, m).mean(axis=1).tolist() for m in METHODS},
+        "bound_rms_m": bounds(found).tolist(),
+        "worlds": config.worlds,
+        "seed": config.seed,
+    }
+    conclude(report(found), figures)
 
 
 if __name__ == "__main__":

@@ -17,31 +17,29 @@ the paper's gain (0.108 m and 3.25 degrees of what calibration takes away), and 
    beacons, by a quarter to a fifth with calibrated ones.
 """
 
-import argparse
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from beacon_calibration import PLACES_WORLD, bare_magnetometer
-from scale import add_scale_options, chosen_scale, show_progress
+from harness import between_deg, blank_figure, chosen_scale, conclude, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation
-from tilted_attitude import between_deg, build
+from tilted_attitude import build
 
 from magfusion.calibration.beacon import REACH, BeaconMeasurements
 from magfusion.calibration.beacon_refined import calibrate_one
-from magfusion.fixes.direction import attitude_from_vectors
-from magfusion.fixes.likelihood import fix_epochs
-from magfusion.fixes.rssi import ranges_from_minor_axis, trilaterate
-from magfusion.monte_carlo import run_many
-from magfusion.parameters import initial_calibration, predict_channels
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.parameters import initial_calibration, predict_channels
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Beacon, BeaconSigma, MagnetometerSigma, Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.papers.p004_fingerprints.direction import attitude_from_vectors
+from magfusion.papers.p004_fingerprints.rssi import ranges_from_minor_axis, trilaterate
 from magfusion.receiver.ellipse import semi_axes
-from magfusion.records.samples import FieldSamples
 from magfusion.simulation.field import phasors_world
 from magfusion.simulation.log import perturb_site, simulate_fields
-from magfusion.site import Beacon, BeaconSigma, MagnetometerSigma, Site
-from magfusion.trajectory import Trajectory
+from magfusion.simulation.monte_carlo import run_many
 from magfusion.units import DEGREE, Array
 
 LOW, HIGH = np.array([0.6, 0.6, 0.5]), np.array([5.1, 3.9, 0.5])  # m; where the targets are
@@ -162,10 +160,10 @@ def means(errors: Array) -> dict[str, dict[str, list[float]]]:
     }
 
 
-def report(told: dict[str, dict[str, list[float]]]) -> str:
+def report(table: dict[str, dict[str, list[float]]]) -> str:
     """Return one table."""
     lines = [f"{'site':<12}" + "".join(f"{m:>36}" for m in METHODS) + f"{'paper':>18}"]
-    for site, own in told.items():
+    for site, own in table.items():
         cells = (own[m] for m in METHODS)
         row = "".join(f"{p:11.4f} ±{ps:6.4f} m {a:7.3f} ±{s:5.2f}°" for p, a, ps, s in cells)
         printed = PAPER.get(site)
@@ -177,49 +175,40 @@ def report(told: dict[str, dict[str, list[float]]]) -> str:
 
 def draw(errors: Array, directory: Path) -> Path:
     """Draw the errors of the first world's targets by trilateration: figures 9 and 10."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 6.0), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(10.0, 6.0)
     panels = figure.subplots(2, 1, sharex=True)
     for axes, k, label in zip(panels, (0, 1), ("position (m)", "attitude (deg)"), strict=True):
         for i, colour in ((0, "tab:blue"), (1, "tab:red")):
             own = errors[0, i, 0, :, k]
-            told = f"{SITES[i]}, mean {np.mean(own):.3f}; paper {PAPER[SITES[i]][k]:g}"
-            axes.plot(own, ".-", color=colour, linewidth=0.5, markersize=3, label=told)
+            shown = f"{SITES[i]}, mean {np.mean(own):.3f}; paper {PAPER[SITES[i]][k]:g}"
+            axes.plot(own, ".-", color=colour, linewidth=0.5, markersize=3, label=shown)
         axes.set(ylabel=f"error of {label}")
         axes.legend(loc="upper right", fontsize=8)
     panels[1].set(xlabel="target")
     figure.suptitle("Fixes by trilateration with beacons as built and as calibrated, one world")
-    directory.mkdir(parents=True, exist_ok=True)
     path = directory / "calibrated_navigation.png"
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save_picture(figure, path)
     return path
 
 
 def main() -> None:
     """Print both tables and one JSON line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
+    parser = scenario_parser(__doc__, Config.seed, parallel=True)
     parser.add_argument("--worlds", type=int, default=Config.worlds)
     parser.add_argument("--targets", type=int, default=Config.targets)
     parser.add_argument("--amplitude-error", type=float, default=0.0275, help="of the second table")
-    parser.add_argument("-o", "--output", type=Path, help="directory of the picture")
-    add_scale_options(parser)
     options = parser.parse_args()
     config = Config(targets=options.targets, worlds=options.worlds, seed=options.seed)
-    scale = chosen_scale(options)
-    tables = {}
+    figures: dict[str, object] = {"columns": ["position_m", "attitude_deg", "sd_m", "sd_deg"]}
+    lines = []
     for error in (0.0, options.amplitude_error):
-        errors = run(replace(config, amplitude_error=error), report=show_progress, **scale)
-        tables[f"{error:g}"] = means(errors)
-        print(f"\nmean error of {config.targets} targets ± from world to world; amplitudes off by"
-              f" {100.0 * error:g} %")  # fmt: skip
-        print(report(tables[f"{error:g}"]))
+        errors = run(replace(config, amplitude_error=error), **chosen_scale(options))
+        table = figures[f"{error:g}"] = means(errors)
+        title = f"mean error of {config.targets} targets ± from world to world"
+        lines += [f"\n{title}; amplitudes off by {100.0 * error:g} %", report(table)]
     if options.output is not None:
-        print(f"picture in {draw(errors, options.output)}")
-    print(json.dumps({"columns": ["position_m", "attitude_deg", "sd_m", "sd_deg"]} | tables))
+        lines.append(f"picture in {draw(errors, options.output)}")
+    conclude("\n".join(lines), figures)
 
 
 if __name__ == "__main__":

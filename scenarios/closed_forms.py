@@ -9,27 +9,23 @@ Near the beacon's plane Eq 7 loses the direction, the completed tensor does not:
 the axis the mean square errors differ by a factor of 85.
 """
 
-import argparse
-import json
 from dataclasses import dataclass, replace
 
 import numpy as np
+from harness import conclude, scenario_parser
 from scipy.spatial.transform import Rotation
 
-from magfusion.fixes.direction import (
-    direction_from_normal,
-    locate_by_tensor,
-    normal_from_direction,
-)
-from magfusion.fixes.likelihood import fix_epochs
-from magfusion.observation import predict
-from magfusion.parameters import initial_calibration
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.field import predict
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.papers.p004_fingerprints.direction import locate_by_tensor
+from magfusion.papers.p004_fingerprints.equations import eq_05_normal, eq_07_direction
 from magfusion.receiver.ellipse import plane_normal, rms_amplitude, semi_axes
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.field import Drives
 from magfusion.simulation.log import simulate_fields
-from magfusion.site import Site
-from magfusion.trajectory import Trajectory
 from magfusion.units import MU0_OVER_4PI, Array, ComplexArray
 
 PLACES = np.array([[0.0, 0.0, 0.0], [3.0, 0.5, 0.0], [1.0, 3.0, 0.0]])  # m, all in one plane
@@ -75,12 +71,12 @@ def exactness(config: Config) -> dict[str, float]:
     direction = rng.standard_normal((config.directions, 3))
     direction[:, 2] = np.abs(direction[:, 2])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    again = direction_from_normal(normal_from_direction(direction))
+    again = eq_07_direction(eq_05_normal(direction))
     site = one_beacon()
     beacon = site.beacons[0]
     distance = rng.uniform(1.0, 6.0, (config.directions, 1))
     phasor = phasors_at(site, direction * distance)
-    seen = direction_from_normal(plane_normal(phasor))
+    seen = eq_07_direction(plane_normal(phasor))
     moment = float(np.linalg.norm(beacon.moments_beacon[0]))
     scale = MU0_OVER_4PI * moment / distance[:, 0] ** 3
     sine_square = 1.0 - direction[:, 2] ** 2
@@ -142,7 +138,7 @@ def coefficients(config: Config, polar_deg: float = 80.0) -> dict[str, float]:
     sigma = unit * MU0_OVER_4PI * moment / distance**3
     noisy = clean + sigma * (noise[0] + 1j * noise[1])
     by_tensor = locate_by_tensor(beacon, noisy[:, None]).direction_beacon
-    by_normal = direction_from_normal(plane_normal(noisy))
+    by_normal = eq_07_direction(plane_normal(noisy))
     squares = {
         name: np.sum((found - direction) ** 2, axis=1)
         for name, found in (("tensor", by_tensor), ("eq_7", by_normal))
@@ -181,11 +177,9 @@ def report(figures: dict[str, float]) -> str:
 
 def main() -> None:
     """Print the table and one JSON line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
-    figures = run(Config(seed=parser.parse_args().seed))
-    print(report(figures))
-    print(json.dumps(figures))
+    given = scenario_parser(__doc__, Config.seed, output=None).parse_args()
+    figures = run(Config(seed=given.seed))
+    conclude(report(figures), figures)
 
 
 if __name__ == "__main__":

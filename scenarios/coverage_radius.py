@@ -13,17 +13,17 @@ square of the angle between found and true direction, at a known attitude, and a
    the beacon's axis it needs a third of the samples, at 80 degrees an eighty-fifth.
 """
 
-import argparse
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from harness import blank_figure, conclude, save_picture, scenario_parser
 
-from magfusion.fixes.direction import direction_from_normal, locate_by_tensor
+from magfusion.model.site import Beacon, BeaconSigma, Coil
+from magfusion.papers.p004_fingerprints.direction import locate_by_tensor
+from magfusion.papers.p004_fingerprints.equations import eq_07_direction
 from magfusion.receiver.ellipse import plane_normal
 from magfusion.simulation.field import phasors_world
-from magfusion.site import Beacon, BeaconSigma, Coil
 from magfusion.units import DEGREE, MU0_OVER_4PI, NANOTESLA, Array, ComplexArray
 
 PAPER_RADIUS = 20.0  # m, figure 6
@@ -141,7 +141,7 @@ def square_angles(source: Beacon, phasor: ComplexArray, true: Array) -> tuple[Ar
     """Return the squared error of the direction by Eq 7 and by the tensor (deg^2), each (runs,)."""
     by_tensor = locate_by_tensor(source, phasor[:, None]).direction_beacon
     return (
-        between_deg(direction_from_normal(plane_normal(phasor)), true) ** 2,
+        between_deg(eq_07_direction(plane_normal(phasor)), true) ** 2,
         between_deg(by_tensor, true) ** 2,
     )
 
@@ -162,7 +162,7 @@ def coefficients(polar_deg: float) -> tuple[float, float]:
     steps = step * np.concatenate([np.eye(3), 1j * np.eye(3)])
     phasor = phasors_world(source, true[None])[0, 0] + np.concatenate([steps, -steps])
     found = (
-        direction_from_normal(plane_normal(phasor)),
+        eq_07_direction(plane_normal(phasor)),
         locate_by_tensor(source, phasor[:, None]).direction_beacon,
     )
     slopes = [(f[:6] - f[6:]) / (2.0 * step) for f in found]
@@ -282,11 +282,7 @@ def report(outcome: Outcome) -> str:
 
 def draw(path: Path, outcome: Outcome) -> None:
     """Write a PNG of the curves beside the paper's radii."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.0, 5.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(8.0, 5.5)
     axes = figure.subplots()
     for colour, found in zip(("tab:red", "tab:blue", "tab:green"), outcome.curves, strict=True):
         name = f"{found.moment:g} A m², {found.samples} samples"
@@ -311,26 +307,18 @@ def draw(path: Path, outcome: Outcome) -> None:
         title="Reach of one beacon, 45° from its axis; dotted: the law, crosses: analysed",
     )
     axes.legend(fontsize=8, loc="lower right")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save_picture(figure, path)
 
 
 def main() -> None:
     """Print the tables and one JSON line; draw them where a directory is given."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
-    parser.add_argument("--quick", action="store_true", help="a tenth of the runs")
-    parser.add_argument("-o", "--output", type=Path, help="directory for coverage_radius.png")
-    given = parser.parse_args()
-    plain = Config(seed=given.seed)
+    given = scenario_parser(__doc__, Config.seed, "a tenth of the runs").parse_args()
     share = 10 if given.quick else 1
-    outcome = run(
-        Config(seed=given.seed, runs=plain.runs // share, raw_runs=plain.raw_runs // share)
-    )
-    print(report(outcome))
+    runs, raw_runs = Config.runs // share, Config.raw_runs // share
+    outcome = run(Config(seed=given.seed, runs=runs, raw_runs=raw_runs))
     if given.output is not None:
         draw(given.output / "coverage_radius.png", outcome)
-    print(json.dumps({"ranges": RANGES, **asdict(outcome)}))
+    conclude(report(outcome), {"ranges": RANGES, **vars(outcome)})
 
 
 if __name__ == "__main__":

@@ -17,17 +17,15 @@ time of an update (processor time, which other work on the machine disturbs litt
 The default is a few minutes long, and tells less: slopes of a short run are mostly undecided.
 """
 
-import argparse
-import json
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from scale import add_scale_options, chosen_scale, show_progress
+from harness import conclude, scenario_parser, show_progress
 
-from magfusion.evaluation.drift import QUANTITIES
 from magfusion.jobs.drift import ESTIMATORS, DriftSettings, run_drift
-from magfusion.report import Figures
+from magfusion.results.drift import QUANTITIES
+from magfusion.results.report import Figures
 
 CASES = {
     "free": DriftSettings(),
@@ -76,20 +74,20 @@ def report(config: Config, found: dict[str, Figures]) -> str:
                 key = f"{estimator}_{quantity.name}"
                 slope = _float(figures[f"{key}_slope_{quantity.unit}_per_day"])
                 error = _float(figures[f"{key}_slope_standard_error"])
-                verdict = figures[f"{key}_drift_verdict"]
+                verdict = figures[f"{key}_drift_stability"]
                 cells.append(f"{slope:+11.3g} +-{error:8.2g} {verdict!s:<10}")
             lines.append(f" {case:7}{estimator:10}" + "".join(f"{cell:>34}" for cell in cells))
     lines += ["", f"{'':18}   rms: position   attitude     NEES / dof   an update   bare   memory"]
     lines.append(f"{'':18}           (mm)      (deg)  pose   biases     p50 (ms)  loops    (MiB)")
     for case, figures in found.items():
         for estimator in ESTIMATORS:
-            told = {k.removeprefix(f"{estimator}_"): v for k, v in figures.items()}
+            own = {k.removeprefix(f"{estimator}_"): v for k, v in figures.items()}
             lines.append(
-                f" {case:7}{estimator:10}{1e3 * _float(told['position_rms_m']):15.2f}"
-                f"{_float(told['attitude_rms_deg']):11.3f}"
-                f"{_float(told['pose_nees_per_dof']):6.2f}{_float(told['bias_nees_per_dof']):9.2f}"
-                f"{_float(told['update_ms_median']):13.2f}{_float(told['bare_loops']):7.1f}"
-                f"{_float(told['memory_growth_mib']):+9.2f}"
+                f" {case:7}{estimator:10}{1e3 * _float(own['position_rms_m']):15.2f}"
+                f"{_float(own['attitude_rms_deg']):11.3f}"
+                f"{_float(own['pose_nees_per_dof']):6.2f}{_float(own['bias_nees_per_dof']):9.2f}"
+                f"{_float(own['update_ms_median']):13.2f}{_float(own['bare_loops']):7.1f}"
+                f"{_float(own['memory_growth_mib']):+9.2f}"
             )
     lines.append(f"a snapshot's attitude in the trap: {SNAPSHOT_TRAP} deg a day")
     return "\n".join(lines)
@@ -102,33 +100,31 @@ def _float(value: object) -> float:
 
 def main() -> None:
     """Print the table and one JSON line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
+    parser = scenario_parser(
+        __doc__,
+        Config.seed,
+        "half an hour of each",
+        "directory of the reports and pictures",
+        parallel=True,
+    )
     parser.add_argument("--hours", type=float, default=Config.hours)
     parser.add_argument("--worlds", type=int, default=Config.worlds)
     parser.add_argument("--case", choices=tuple(CASES), help="one case only")
-    parser.add_argument("--quick", action="store_true", help="half an hour of each")
-    parser.add_argument("--resume", action="store_true", help="go on with what was interrupted")
-    parser.add_argument("-o", "--output", type=Path, help="directory of the reports and pictures")
-    add_scale_options(parser)
+    parser.add_argument("--resume", action="store_true", help="continue interrupted runs")
     given = parser.parse_args()
     cases = tuple(CASES) if given.case is None else (given.case,)
     hours = 0.5 if given.quick else given.hours
     config = Config(hours=hours, worlds=given.worlds, cases=cases, seed=given.seed)
-    scale = chosen_scale(given)
     with tempfile.TemporaryDirectory() as scratch:
         place = Path(scratch) if given.output is None else given.output
         found = {
-            case: run_case(
-                config, case, place, scale.get("cluster"), scale.get("workers"), given.resume
-            )
+            case: run_case(config, case, place, given.cluster, given.workers, given.resume)
             for case in cases
         }
-    print(report(config, found))
-    told = {
-        case: {k: v for k, v in figures.items() if k != "notes"} for case, figures in found.items()
-    }
-    print(json.dumps({"hours": config.hours, "worlds": config.worlds, "cases": told}))
+    shown = {case: {k: v for k, v in own.items() if k != "notes"} for case, own in found.items()}
+    conclude(
+        report(config, found), {"hours": config.hours, "worlds": config.worlds, "cases": shown}
+    )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How good an attitude gyro, accelerometer and the Earth field give alone.
 
-Where no beacon is heard the Earth field still tells the heading, and gravity the tilt.  Two logs
+Where no beacon is detected the Earth field still tells the heading, and gravity the tilt.  Two logs
 are navigated without any of their beacons' tones: a simulated one of turning by hand, and, where it
 is at hand, a real one (BROAD, slow rotation about all axes, hand-held; its magnetometer is
 simulated along the optical reference, in a field that nothing disturbs).  Each by the smoother and
@@ -13,34 +13,33 @@ magnetometers, in places with disturbances that are part of the test, and so no 
 
 The answer: with a calibrated magnetometer 0.3 degrees by the smoother and 0.7 by the filter; as
 good where the smoother finds the calibration itself; 1 to 2.5 degrees where a wrong one is
-believed.  The claimed sigma is that of the field's declination in a building, 3 degrees, which no
-turning tells; in these logs the declared field is the true one.
+believed.  The estimated standard deviation (est. sd) is that of the field's declination in a
+building, 3 degrees, which no turning determines; in these logs the declared field is the true one.
 """
 
-import argparse
-import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from harness import conclude, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.magnetometer_log import calibrate_log
-from magfusion.evaluation.errors import trajectory_errors
-from magfusion.fusion.batch import SmootherSettings, smooth
-from magfusion.fusion.online import Navigator, NavigatorSettings
-from magfusion.fusion.source import open_source
-from magfusion.fusion.state import as_trajectory
-from magfusion.parameters import initial_calibration
-from magfusion.records.open import open_log
-from magfusion.records.samples import Log
+from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.estimation.demodulation import demodulated
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.state import as_trajectory
+from magfusion.files.open import open_log
+from magfusion.files.site import load_site
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.simulation.motion import Rests
-from magfusion.site import Site
-from magfusion.site_file import load_site
-from magfusion.trajectory import Trajectory
 from magfusion.units import Array
 
 REAL = Path(__file__).parents[2] / "shared" / "logs" / "turn_miscalibrated"
@@ -99,8 +98,8 @@ def simulated(config: Config) -> tuple[Log, Site]:
 
 def alone(log: Log, site: Site) -> Log:
     """Return a log with the steady fields of another and no beacon at all."""
-    source, calibration = open_source(log, site, None), initial_calibration(site, 0.0)
-    fields = source.first(calibration)
+    source, calibration = demodulated(log, site, None), initial_calibration(site, 0.0)
+    fields = source.fields
     silent = replace(fields, phasor_sensor=np.full_like(fields.phasor_sensor, np.nan))
     return replace(log, waveform=None, fields=silent, steady=source.steady(calibration))
 
@@ -117,16 +116,16 @@ def navigated(log: Log, site: Site, estimate: tuple[str, ...]) -> Trajectory:
     navigator = Navigator(site, NavigatorSettings("ekf", estimate=estimate, earth=True))
     assert log.fields is not None
     assert log.steady is not None
-    begun = heard = 0
+    begun = detected = 0
     for until in np.arange(log.imu.time[0] + PIECE, log.imu.time[-1] + PIECE, PIECE):
         stop = int(np.searchsorted(log.imu.time, until))
         part = slice(begun, stop)
         navigator.add_imu(log.imu.time[part], log.imu.gyro_body[part], log.imu.accel_body[part])
         begun = stop
         stop = int(np.searchsorted(log.fields.time, until))
-        part = slice(heard, stop)
+        part = slice(detected, stop)
         navigator.add_fields(log.fields.rows(part), log.steady.rows(part))
-        heard = stop
+        detected = stop
     states = as_trajectory(navigator.take())
     return _rows(states, states.time > log.imu.time[0] + SETTLED)
 
@@ -147,7 +146,7 @@ def row(name: str, magnetometer: str, estimator: str, states: Trajectory, truth:
     turned = Rotation.from_matrix(errors.world_from_body).apply(errors.attitude_body)
     square = np.rad2deg(turned) ** 2
     assert errors.pose_cov is not None
-    claimed = np.trace(errors.pose_cov[:, :3, :3], axis1=1, axis2=2)
+    variance = np.trace(errors.pose_cov[:, :3, :3], axis1=1, axis2=2)
     return Row(
         log=name,
         magnetometer=magnetometer,
@@ -155,7 +154,7 @@ def row(name: str, magnetometer: str, estimator: str, states: Trajectory, truth:
         heading_deg=float(np.sqrt(np.mean(square[:, 2]))),
         tilt_deg=float(np.sqrt(np.mean(np.sum(square[:, :2], axis=1)))),
         total_deg=float(np.sqrt(np.mean(np.sum(square, axis=1)))),
-        claimed_deg=float(np.rad2deg(np.sqrt(np.mean(claimed)))),
+        claimed_deg=float(np.rad2deg(np.sqrt(np.mean(variance)))),
     )
 
 
@@ -189,7 +188,7 @@ def report(rows: tuple[Row, ...]) -> str:
     lines = [
         "attitude without beacons, root mean square (deg)",
         f"{'log':10}{'magnetometer':13}{'estimator':10}{'heading':>8}{'tilt':>8}{'total':>8}"
-        f"{'claimed':>8}",
+        f"{'est. sd':>8}",
     ]
     lines += [
         f"{r.log:10}{r.magnetometer:13}{r.estimator:10}{r.heading_deg:8.2f}{r.tilt_deg:8.2f}"
@@ -205,16 +204,13 @@ def report(rows: tuple[Row, ...]) -> str:
 
 def main() -> None:
     """Print the table and one JSON line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
-    parser.add_argument("--quick", action="store_true", help="a short log, the smoother alone")
-    given = parser.parse_args()
+    quick = "a short log, the smoother alone"
+    given = scenario_parser(__doc__, Config.seed, quick, output=None).parse_args()
     config = Config(seed=given.seed)
     if given.quick:
         config = replace(config, duration=40.0, estimators=("smoother",), real=None)
     rows = run(config)
-    print(report(rows))
-    print(json.dumps({"rows": [asdict(r) for r in rows], "published_deg": PUBLISHED_DEG}))
+    conclude(report(rows), {"rows": rows, "published_deg": PUBLISHED_DEG})
 
 
 if __name__ == "__main__":

@@ -20,32 +20,31 @@ Also in the table: the fixes alone, the batch smoother fed with fixes (loose), a
 with the surveyed calibration held.
 """
 
-import argparse
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from harness import blank_figure, conclude, save_picture, scenario_parser
 
-from magfusion.evaluation.errors import TrajectoryErrors, trajectory_errors
-from magfusion.fusion.batch import SmootherSettings, smooth
-from magfusion.fusion.online import Navigator, NavigatorSettings
-from magfusion.fusion.source import first_fixes, phasors
-from magfusion.fusion.state import State, as_trajectory
-from magfusion.parameters import initial_calibration
-from magfusion.records.open import open_log
-from magfusion.records.samples import ImuSamples, Log, Waveform
-from magfusion.refinement import findings, refined_site
+from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.estimation.demodulation import first_fixes, phasors
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.state import State, as_trajectory
+from magfusion.files.open import open_log
+from magfusion.files.site import load_site
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import ImuSamples, Log, Waveform
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.results.errors import TrajectoryErrors, trajectory_errors
+from magfusion.results.refinement import result_site
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
-from magfusion.site import Site
-from magfusion.site_file import load_site
-from magfusion.trajectory import Trajectory
 from magfusion.units import Array
 
-HELD = ("phase", "time-offset")  # what no survey tells
+HELD = ("phase", "time-offset")  # what no survey gives
 PIECE = 0.1  # s, fed at once
 FIRST = 8.0  # s; first instant of the batch up to now
 ONLINE: dict[Literal["smoother", "ekf"], str] = {"smoother": "fixed lag", "ekf": "filter"}
@@ -191,11 +190,10 @@ def compare(log: Log, site: Site, config: Config) -> Iterator[Row]:
 
 
 def calibrated(log: Log, site: Site, config: Config) -> Iterator[Row]:
-    """Smooth the first half of a log, and run the estimators on the second with what it told."""
+    """Smooth the first half of a log, and run the estimators on the second as calibrated by it."""
     middle = 0.5 * float(log.imu.time[0] + log.imu.time[-1])
     before = smooth(part_of(log, -np.inf, middle), site)
-    told = findings(before.declared, before.calibration, before.blocks, before.calibration_cov)
-    known = refined_site(before.calibration, before.blocks, before.calibration_cov, told, log.name)
+    known = result_site(before, log.name)
     rest = part_of(log, middle, np.inf)
     yield row(rest, "batch, calibrated", smooth(rest, known).states)
     for estimator, label in ONLINE.items():
@@ -240,25 +238,20 @@ def run(config: Config) -> list[Row]:
 
 def main() -> None:
     """Print the table and one JSON line; draw where a directory is given."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = scenario_parser(__doc__, Config.seed)
     parser.add_argument("logs", nargs="*", type=Path, help="with truth and site.yaml")
-    parser.add_argument("--seed", type=int, default=Config.seed)
     parser.add_argument("--lag", type=float, default=Config.lag)
-    parser.add_argument("-o", "--output", type=Path)
     options = parser.parse_args()
     rows = run(Config(logs=tuple(options.logs), lag=options.lag, seed=options.seed))
-    print(report(rows))
     if options.output is not None:
         draw(rows, options.output)
-    print(json.dumps({"rows": [vars(r) for r in rows]}))
+    conclude(report(rows), {"rows": rows})
 
 
 def draw(rows: list[Row], directory: Path) -> None:
     """Write the table's aligned errors as bars."""
-    from matplotlib.figure import Figure
-
     names = list(dict.fromkeys(r.log for r in rows))
-    figure = Figure(figsize=(6.0 * len(names), 5.0), layout="constrained")
+    figure = blank_figure(6.0 * len(names), 5.0)
     for axes, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
         own = [r for r in rows if r.log == name][::-1]
         axes.barh([r.estimator for r in own], [r.aligned_position_cm for r in own], color="0.7")
@@ -270,8 +263,7 @@ def draw(rows: list[Row], directory: Path) -> None:
         )
         axes.set(title=name, xscale="log", xlabel="position error, aligned (cm)")
     figure.suptitle("grey: the whole log; blue: its second half, when the calibration is known")
-    directory.mkdir(parents=True, exist_ok=True)
-    figure.savefig(directory / "estimators_compared.png", dpi=100)
+    save_picture(figure, directory / "estimators_compared.png", dpi=100)
 
 
 if __name__ == "__main__":

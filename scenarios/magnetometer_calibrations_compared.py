@@ -13,18 +13,21 @@ field that the calibrated sensor gives, all round the sphere:
    tenth of that; the graph, which weighs the two by the noise they share, half of it again.
 """
 
-import argparse
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from harness import blank_figure, conclude, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.ellipsoid import fit_ellipsoid, fit_ellipsoid_gravity
 from magfusion.calibration.magnetometer import MagnetometerFit, field_from_measured, from_paper
 from magfusion.calibration.magnetometer_graph import Epochs, Prior, fit_graph
-from magfusion.calibration.twelve_positions import closed_form, least_squares, positions
+from magfusion.papers.p001_magnetometer.twelve_positions import (
+    closed_form,
+    least_squares,
+    positions,
+)
 from magfusion.units import DEGREE, Array
 
 MILLIGAUSS = 1e-7  # T
@@ -255,10 +258,8 @@ def _cell(value: float | None, expected: float | None) -> str:
 
 def draw(path: Path, rows: dict[str, dict[str, float]]) -> None:
     """Write a PNG: the error of each method by hand and on a tilted table."""
-    from matplotlib.figure import Figure
-
     shown = [name for name in rows if "graph" in rows[name]]
-    figure = Figure(figsize=(11.0, 4.5), layout="constrained")
+    figure = blank_figure(11.0, 4.5)
     axes = figure.subplots(1, len(shown), sharey=True)
     for panel, name in zip(axes, shown, strict=True):
         bars = {k: v for k, v in rows[name].items() if k in _COLUMNS}
@@ -266,25 +267,19 @@ def draw(path: Path, rows: dict[str, dict[str, float]]) -> None:
         panel.set_title(name, fontsize=9)
         panel.tick_params(axis="x", labelsize=7)
     axes[0].set_ylabel("RMS angle of the field (deg)")
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save_picture(figure, path)
 
 
 def main() -> None:
     """Print the table and one JSON line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
-    parser.add_argument("--quick", action="store_true", help="a tenth of the sensors")
-    parser.add_argument("-o", "--output", type=Path, help="directory of the picture")
-    given = parser.parse_args()
+    given = scenario_parser(__doc__, Config.seed, quick="a tenth of the sensors").parse_args()
     config = Config(seed=given.seed)
     if given.quick:
         config = Config(sensors=20, graph_sensors=10, seed=given.seed)
     rows = run(config)
-    print(report(rows))
     if given.output is not None:
-        given.output.mkdir(parents=True, exist_ok=True)
         draw(given.output / "magnetometer_calibrations_compared.png", rows)
-    print(json.dumps({"config": asdict(config), "rows": rows}))
+    conclude(report(rows), {"config": asdict(config), "rows": rows})
 
 
 if __name__ == "__main__":

@@ -8,23 +8,22 @@ anything of it is left afterwards: the position error should be back at its usua
 epochs.
 """
 
-import argparse
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from harness import blank_figure, conclude, save_picture, scenario_parser
 
-from magfusion.fusion.online import Navigator, NavigatorSettings
-from magfusion.fusion.state import State, as_trajectory
-from magfusion.records.samples import FieldSamples, ImuSamples
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.state import State, as_trajectory
+from magfusion.model.samples import FieldSamples, ImuSamples
+from magfusion.model.site import Coil, Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.log import simulate_fields
 from magfusion.simulation.motion import Motion, random_walk_motion
-from magfusion.site import Coil, Site
-from magfusion.trajectory import Trajectory
 from magfusion.units import Array
 
 Estimator = Literal["smoother", "ekf"]
@@ -185,9 +184,7 @@ def report(figures: dict[str, object]) -> str:
 
 def write_picture(drawn: dict[Estimator, tuple[Trajectory, Array]], output: Path) -> None:
     """Write the way through the hall, and the errors over time."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(13.0, 5.0), layout="constrained")
+    figure = blank_figure(13.0, 5.0)
     plan, over_time = figure.subplots(1, 2)
     for estimator, (found, error) in drawn.items():
         plan.plot(*found.position_world[:, :2].T, linewidth=0.8, label=estimator)
@@ -200,19 +197,14 @@ def write_picture(drawn: dict[Estimator, tuple[Trajectory, Array]], output: Path
         over_time.text(begin, 0.12, name, rotation=90, fontsize=8, va="bottom")
     over_time.set(xlabel="time (s)", ylabel="position error (cm)", title="what it costs")
     over_time.legend()
-    output.mkdir(parents=True, exist_ok=True)
-    figure.savefig(output / "online_warehouse.png", dpi=100)
+    save_picture(figure, output / "online_warehouse.png", dpi=100)
 
 
 def main() -> None:
     """Print the table and one JSON line; draw where a directory is given."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
-    parser.add_argument("-o", "--output", type=Path)
-    options = parser.parse_args()
+    options = scenario_parser(__doc__, Config.seed).parse_args()
     figures = run(Config(seed=options.seed), options.output)
-    print(report(figures))
-    print(json.dumps(figures))
+    conclude(report(figures), figures)
 
 
 if __name__ == "__main__":

@@ -14,17 +14,21 @@ The axis is vertical, as in the paper, roll zero at magnetic north; and, for com
 northwards, where more of the field lies across it.
 """
 
-import argparse
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from harness import blank_figure, conclude, rms, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation
 
-from magfusion.fixes.matching import Matches, match_roll, predict_field, wrap
-from magfusion.fixes.matching_database import match_interpolated, match_nearest, prepare
-from magfusion.records.attitude_table import AttitudeDatabase
+from magfusion.files.attitude_table import AttitudeDatabase
+from magfusion.papers.p001_magnetometer.matching import Matches, match_roll, predict_field, wrap
+from magfusion.papers.p001_magnetometer.matching_database import (
+    match_interpolated,
+    match_nearest,
+    prepare,
+)
+from magfusion.papers.p001_magnetometer.twelve_positions import least_squares, positions
 from magfusion.units import DEGREE, Array
 
 MILLIGAUSS = 1e-7  # T
@@ -37,15 +41,6 @@ NORTH = 0.5 * np.pi
 
 METHODS = ("nearest", "interpolated", "closed form")
 PAPER_DEG = 3.0
-
-# Each group of four: a base and its half turns about each of its axes.  Columns: sensor axes,
-# as signed north, east, down (1, 2, 3).  Table 1 of the paper is a picture; 1 to 4 follow from
-# Eq 4 to 15, the others are cyclic permutations.
-_POSITIONS = (
-    *((1, 2, 3), (-1, -2, 3), (1, -2, -3), (-1, 2, -3)),
-    *((2, 3, 1), (-2, 3, -1), (-2, -3, 1), (2, -3, -1)),
-    *((3, 1, 2), (3, -1, -2), (-3, 1, -2), (-3, -1, 2)),
-)
 
 
 @dataclass(frozen=True)
@@ -91,16 +86,13 @@ def calibrated_error(config: Config, rng: np.random.Generator) -> tuple[Array, A
         np.eye(3) + rng.normal(0.0, config.cross_sigma, (3, 3)) * (1.0 - np.eye(3))
     )
     true_offset = rng.normal(0.0, config.offset_mg * MILLIGAUSS, 3)
-    axes = np.array(_POSITIONS)
-    declared = np.sign(axes) * FIELD_NED[np.abs(axes) - 1]
+    declared = positions(0.0) @ FIELD_NED
     tilt = Rotation.from_rotvec(rng.normal(0.0, config.position_tilt_deg * DEGREE, (12, 3)))
     reading = tilt.apply(declared) @ true_matrix.T + true_offset
     reading += rng.normal(0.0, config.position_noise_mg * MILLIGAUSS, (12, 3))
-    scale = np.linalg.norm(FIELD_NED)
-    design = np.column_stack([declared / scale, np.ones(12)])
-    found = np.linalg.lstsq(design, reading, rcond=None)[0]
-    inverse = np.linalg.inv(found[:3].T / scale)
-    return inverse @ true_matrix, inverse @ (true_offset - found[3])
+    found = least_squares(reading, declared)
+    inverse = np.linalg.inv(found.matrix)
+    return inverse @ true_matrix, inverse @ (true_offset - found.offset)
 
 
 def measure(
@@ -158,7 +150,7 @@ def _row(config: Config, axis: str, step_deg: float, noise_mg: float) -> Row:
         axis=axis,
         step_deg=step_deg,
         noise_mg=noise_mg,
-        rms={name: float(np.sqrt(np.mean(e**2))) for name, e in error.items()},
+        rms={name: rms(e) for name, e in error.items()},
         median_max={name: float(np.median(e.max(axis=1))) for name, e in error.items()},
         worst_max={name: float(e.max()) for name, e in error.items()},
     )
@@ -178,8 +170,6 @@ def report(rows: tuple[Row, ...]) -> str:
 
 def draw(config: Config, path: Path) -> None:
     """Write a picture like the paper's figure 4: fields, roll found, and its error."""
-    from matplotlib.figure import Figure
-
     rng = np.random.default_rng(config.seed)
     left_over = calibrated_error(config, rng)
     entries = on_axis(np.arange(-180.0, 180.0) * DEGREE, "vertical")
@@ -187,7 +177,7 @@ def draw(config: Config, path: Path) -> None:
     index = prepare(AttitudeDatabase(field_body, entries, "roll", "MTi"))
     true_deg = np.linspace(-180.0, 180.0, 1001)[:-1]
     measured = measure(on_axis(true_deg * DEGREE, "vertical"), left_over, 3.0, rng)
-    figure = Figure(figsize=(8.0, 8.0), layout="constrained")
+    figure = blank_figure(8.0, 8.0)
     fields, rolls, errors = figure.subplots(3, 1, sharex=True)
     for k, name in enumerate("xyz"):
         fields.plot(true_deg, measured[:, k] / MILLIGAUSS, label=f"field {name}")
@@ -202,22 +192,17 @@ def draw(config: Config, path: Path) -> None:
     errors.set(xlabel="true roll (deg)", ylabel="error (deg); red: the paper's claim")
     for axes in (fields, rolls, errors):
         axes.legend(loc="upper right")
-    figure.savefig(path, dpi=110)
+    save_picture(figure, path)
 
 
 def main() -> None:
     """Print the table and one JSON line; draw where an output directory is given."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
-    parser.add_argument("-o", "--output", type=Path, help="directory of the picture")
-    given = parser.parse_args()
+    given = scenario_parser(__doc__, Config.seed).parse_args()
     config = Config(seed=given.seed)
     rows = run(config)
-    print(report(rows))
     if given.output is not None:
-        given.output.mkdir(parents=True, exist_ok=True)
         draw(config, given.output / "roll_matching.png")
-    print(json.dumps({"paper_max_deg": PAPER_DEG, "rows": [asdict(row) for row in rows]}))
+    conclude(report(rows), {"paper_max_deg": PAPER_DEG, "rows": rows})
 
 
 if __name__ == "__main__":

@@ -11,24 +11,22 @@ degrees on average, as the posterior claims (0.5 cm in all three axes together).
 ever explained its field, and the trajectory stays what it is with four surveyed beacons (0.2 cm).
 """
 
-import argparse
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scale import add_scale_options, chosen_scale, show_progress
+from harness import blank_figure, chosen_scale, conclude, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation
 
-from magfusion.evaluation.errors import trajectory_errors
-from magfusion.fusion.batch import SmootherSettings
-from magfusion.fusion.self_survey import smooth_and_place
-from magfusion.monte_carlo import run_many
-from magfusion.parameters import Block
-from magfusion.pipeline import quiet
+from magfusion.estimation.batch import SmootherSettings
+from magfusion.estimation.self_survey import smooth_and_place
+from magfusion.model.parameters import Block
+from magfusion.model.progress import quiet
+from magfusion.model.site import Beacon, Site, Unknown
+from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
-from magfusion.site import Beacon, Site, Unknown
+from magfusion.simulation.monte_carlo import run_many
 from magfusion.units import Array
 
 
@@ -111,11 +109,7 @@ def _claimed(cov: Array, blocks: tuple[Block, ...], name: str) -> float:
 
 def draw(rows: list[Row], path: Path) -> None:
     """Write a PNG of all errors, and the bounds to keep."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.5, 5.0), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(6.5, 5.0)
     axes = figure.subplots()
     for name in dict.fromkeys(row.beacon for row in rows):
         own = [row for row in rows if row.beacon == name]
@@ -128,53 +122,50 @@ def draw(rows: list[Row], path: Path) -> None:
     axes.plot([0.0, 3.0, 3.0], [1.0, 1.0, 0.0], c="0.5", lw=0.8)
     axes.set(xlabel="error of the place (cm)", ylabel="error of the attitude (deg)")
     axes.legend(title="unknown beacon")
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save_picture(figure, path)
+
+
+def report(config: Config, rows: list[Row]) -> str:
+    """Return the table that a reader sees."""
+    lines = [
+        f"{config.walks} walks of {config.duration:g} s,"
+        f" the {config.unknown} of one beacon unknown",
+        "beacon  position (cm): mean  worst  estimated standard deviation"
+        "   attitude (deg): mean  worst   trajectory (cm)",
+    ]
+    for name in dict.fromkeys(row.beacon for row in rows):
+        own = [row for row in rows if row.beacon == name]
+        place, turn, sigma, track = np.array(
+            [(r.position_m, r.rotation_deg, r.claimed_sigma_m, r.aligned_ate_m) for r in own]
+        ).T
+        lines.append(
+            f"{name:6}{100 * np.mean(place):21.2f} {100 * np.max(place):6.2f}"
+            f" {100 * np.mean(sigma):29.2f}{np.mean(turn):23.2f} {np.max(turn):6.2f}"
+            f" {100 * np.mean(track):17.2f}"
+        )
+    return "\n".join(lines)
 
 
 def main() -> None:
-    """Run the walks, print the table, and the figures as the last line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--quick", action="store_true", help="one walk of half a minute")
-    parser.add_argument("-o", "--output", type=Path, help="directory of the picture")
-    add_scale_options(parser)
-    options = parser.parse_args()
+    """Print the table and one JSON line; draw it where a directory is given."""
+    quick = "one walk of half a minute"
+    options = scenario_parser(__doc__, Config.seed, quick, parallel=True).parse_args()
     config = Config(seed=options.seed)
     if options.quick:
         config = replace(config, walks=1, duration=30.0)
     walks = [config] * config.walks
-    scale = chosen_scale(options)
-    found = run_many(run_walk, walks, seed=config.seed, report=show_progress, **scale)
+    found = run_many(run_walk, walks, seed=config.seed, **chosen_scale(options))
     rows = [row for walk in found for row in walk]
-    print(
-        f"{config.walks} walks of {config.duration:g} s, the {config.unknown} of one beacon unknown"
-    )
-    print(
-        "beacon  place (cm): mean  worst  claimed   attitude (deg): mean  worst   trajectory (cm)"
-    )
-    for name in dict.fromkeys(row.beacon for row in rows):
-        own = [row for row in rows if row.beacon == name]
-        place, turn = (
-            np.array([getattr(r, k) for r in own]) for k in ("position_m", "rotation_deg")
-        )
-        claimed = np.mean([r.claimed_sigma_m for r in own])
-        track = np.mean([r.aligned_ate_m for r in own])
-        centimetres = (
-            f"{100 * np.mean(place):16.2f} {100 * np.max(place):6.2f} {100 * claimed:8.2f}"
-        )
-        degrees = f"{np.mean(turn):20.2f} {np.max(turn):6.2f}"
-        print(f"{name:6}  {centimetres}  {degrees} {100 * track:15.2f}")
     if options.output is not None:
-        options.output.mkdir(parents=True, exist_ok=True)
         draw(rows, options.output / "self_survey.png")
-    figures = asdict(config) | {
+    figures = vars(config) | {
         "position_mean_m": float(np.mean([row.position_m for row in rows])),
         "position_worst_m": max(row.position_m for row in rows),
         "rotation_mean_deg": float(np.mean([row.rotation_deg for row in rows])),
         "rotation_worst_deg": max(row.rotation_deg for row in rows),
         "places_most": max(row.places for row in rows),
     }
-    print(json.dumps(figures))
+    conclude(report(config, rows), figures)
 
 
 if __name__ == "__main__":

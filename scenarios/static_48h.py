@@ -18,24 +18,24 @@ say), surveyed cold.  It asks, of the slope of the error after the first twelve 
 3. And with the phase of each beacon free?  It is gone.
 """
 
-import argparse
-import json
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from scale import add_scale_options, chosen_scale, show_progress
+from harness import blank_figure, chosen_scale, conclude, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.fieldmap import MapPoints, learn_field_map
-from magfusion.fixes.fingerprint import amplitude_of, fingerprint_database
-from magfusion.fixes.published import RotatingFields, fix_as_published
-from magfusion.fixes.refine import refine
-from magfusion.monte_carlo import run_many
-from magfusion.parameters import initial_calibration
+from magfusion.estimation.snapshot.refine import refine
+from magfusion.files.survey import Survey
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.papers.p004_fingerprints.algorithms import RotatingFields, fix_as_published
+from magfusion.papers.p004_fingerprints.equations import eq_25_fingerprint
+from magfusion.papers.p004_fingerprints.fingerprint import fingerprint_database
 from magfusion.receiver.ellipse import plane_normal
-from magfusion.records.samples import FieldSamples
-from magfusion.records.survey import Survey
 from magfusion.simulation.disturbance import DayNight
 from magfusion.simulation.drift import (
     COPPER_PER_KELVIN,
@@ -46,10 +46,9 @@ from magfusion.simulation.drift import (
     WarmUp,
     draw_drift,
 )
+from magfusion.simulation.monte_carlo import run_many
 from magfusion.simulation.waveform import Mains
 from magfusion.simulation.worlds import F1, Receiver, World, draw_world
-from magfusion.site import Site
-from magfusion.trajectory import Trajectory
 from magfusion.units import DEGREE, NANOTESLA, Array, ComplexArray
 
 HOUR = 3600.0  # s
@@ -205,7 +204,7 @@ def locate(
     """Return the fixes of each method."""
     fields = RotatingFields(
         axis_world=np.tile([0.0, 0.0, 1.0], (len(world.true_beacons), 1)),
-        amplitude=amplitude_of(samples.phasor_sensor[:, :, None]),
+        amplitude=eq_25_fingerprint(samples.phasor_sensor[:, :, None]),
         normal_body=plane_normal(samples.phasor_sensor),
     )
     database = fingerprint_database(survey, world.site)
@@ -285,8 +284,8 @@ def report(config: Config, rows: tuple[Row, ...]) -> str:
     for row in rows:
         name = row.case if row.case != before else ""
         before = row.case
-        told = ANALYSED.get((row.case, row.method), ("", "", ""))
-        by_position, by_attitude, mean = (f"({cell})" if cell else "" for cell in told)
+        printed = ANALYSED.get((row.case, row.method), ("", "", ""))
+        by_position, by_attitude, mean = (f"({cell})" if cell else "" for cell in printed)
         position = f"{row.position_slope:+.5f} +-{row.position_slope_se:.5f}"
         attitude = f"{row.attitude_slope:+.4f} +-{row.attitude_slope_se:.4f}"
         lines.append(
@@ -306,11 +305,7 @@ def hourly(config: Config, error: Array) -> tuple[Array, Array]:
 
 def draw(path: Path, config: Config, worlds: list[dict[tuple[str, str], Errors]]) -> None:
     """Write a PNG: position and attitude error over time in each case."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(4.8 * len(CASES), 7.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(4.8 * len(CASES), 7.5)
     panels = figure.subplots(2, len(CASES), sharex=True, sharey="row")
     colours = ("tab:red", "tab:blue", "tab:green", "tab:orange")
     for column, case in enumerate(CASES):
@@ -326,30 +321,22 @@ def draw(path: Path, config: Config, worlds: list[dict[tuple[str, str], Errors]]
     panels[1, 0].set_ylabel("attitude error (deg)")
     panels[0, 0].legend(fontsize=8)
     figure.suptitle("A platform at rest; thin: each fix in one world, thick: hourly mean of all")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save_picture(figure, path)
 
 
 def main() -> None:
     """Print the table and one JSON line; draw it where a directory is given."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
-    parser.add_argument("--quick", action="store_true", help="a fix each half hour, 2 worlds")
-    parser.add_argument("-o", "--output", type=Path, help="directory for static_48h.png")
-    add_scale_options(parser)
-    given = parser.parse_args()
+    quick = "a fix each half hour, 2 worlds"
+    given = scenario_parser(__doc__, Config.seed, quick, parallel=True).parse_args()
     config = Config(seed=given.seed)
     if given.quick:
         config = replace(config, worlds=2, interval=1800.0)
-    scale = chosen_scale(given)
-    worlds = run_many(
-        run_world, [config] * config.worlds, seed=config.seed, report=show_progress, **scale
-    )
+    tasks = [config] * config.worlds
+    worlds = run_many(run_world, tasks, seed=config.seed, **chosen_scale(given))
     rows = summarise(config, worlds)
-    print(report(config, rows))
     if given.output is not None:
         draw(given.output / "static_48h.png", config, worlds)
-    print(json.dumps({"rows": [asdict(row) for row in rows]}))
+    conclude(report(config, rows), {"rows": rows})
 
 
 if __name__ == "__main__":

@@ -13,24 +13,23 @@ reads it back, and asks four questions of it:
    places, reach 0.113 m with two parameters.
 """
 
-import argparse
-import json
 import tempfile
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from harness import conclude, rms, scenario_parser
 from scipy.optimize import least_squares
 
-from magfusion.fixes.rssi import (
+from magfusion.files.survey import Survey, read_survey, write_survey
+from magfusion.papers.p004_fingerprints.equations import distances
+from magfusion.papers.p004_fingerprints.rssi import (
     RssiLines,
-    distances,
     fit_lines,
     ranges_from_lines,
     trilaterate,
 )
-from magfusion.records.survey import Survey, read_survey, write_survey
 from magfusion.units import MU0_OVER_4PI, NANOTESLA, Array
 
 BEACONS_WORLD = np.array([[0.0, 0.0, 0.0], [6.20, 0.54, 0.0], [3.20, 4.28, 0.0]])  # m
@@ -174,10 +173,10 @@ def run(config: Config) -> Result:
         printed_rows_position=_mean_distance(TABLE[:, 6:9], position_world),
         printed_rows_attitude_deg=(psi, gamma, lam),
         printed_lines_position=_mean_distance(by_printed, position_world),
-        refit_lines_log_rms=_rms(refit_log - np.log(amplitude)),
+        refit_lines_log_rms=rms(refit_log - np.log(amplitude)),
         refit_lines_position=float(lines_loo.mean()),
         refit_lines_position_max=float(lines_loo.max()),
-        dipole_log_rms=_rms(dipole.log_amplitude(position_world) - np.log(amplitude)),
+        dipole_log_rms=rms(dipole.log_amplitude(position_world) - np.log(amplitude)),
         dipole_position=float(dipole_loo.mean()),
         dipole_position_max=float(dipole_loo.max()),
         dipole_moment=float(np.exp(dipole.log_moment)),
@@ -187,10 +186,6 @@ def run(config: Config) -> Result:
 
 def _mean_distance(found: Array, true: Array) -> float:
     return float(np.linalg.norm(found - true, axis=1).mean())
-
-
-def _rms(value: Array) -> float:
-    return float(np.sqrt(np.mean(value**2)))
 
 
 def report(result: Result) -> str:
@@ -225,7 +220,7 @@ def report(result: Result) -> str:
 
 def main() -> None:
     """Print the table and one JSON line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = scenario_parser(__doc__, output=None)
     parser.add_argument("--out", type=Path, help="directory that keeps the survey")
     parser.add_argument("--csv", action="store_true", help="write the survey as CSV")
     arguments = parser.parse_args()
@@ -234,8 +229,7 @@ def main() -> None:
         directory = arguments.out or Path(scratch)
         directory.mkdir(parents=True, exist_ok=True)
         result = run(Config(directory, file_name))
-    print(report(result))
-    print(json.dumps(asdict(result)))
+    conclude(report(result), result)
 
 
 if __name__ == "__main__":

@@ -15,28 +15,27 @@ and asks:
    The maximum of the likelihood errs by the same few hundredths of a degree at every tilt.
 """
 
-import argparse
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from harness import between_deg, conclude, scenario_parser
 from scipy.spatial.transform import Rotation
 from table1_real_fields import BEACONS_WORLD, FREQUENCIES_HZ, TABLE
 
-from magfusion.fixes.direction import (
-    angles_as_printed,
-    attitude_as_printed,
-    attitude_from_vectors,
-    direction_from_normal,
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Beacon, BeaconSigma, Coil, Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.papers.p004_fingerprints.direction import attitude_from_vectors
+from magfusion.papers.p004_fingerprints.equations import (
+    eq_07_direction,
+    eq_21_attitude_as_printed,
+    eq_23_angles,
 )
-from magfusion.fixes.likelihood import fix_epochs
-from magfusion.parameters import initial_calibration
 from magfusion.receiver.ellipse import plane_normal
-from magfusion.records.samples import FieldSamples
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.log import simulate_fields
-from magfusion.site import Beacon, BeaconSigma, Coil, Site
-from magfusion.trajectory import Trajectory
 from magfusion.units import DEGREE, NANOTESLA, Array, ComplexArray
 
 POINTS_WORLD = TABLE[:, :3]  # m
@@ -90,11 +89,6 @@ def turns(angle: float, axis: Array) -> Array:
     return np.asarray(Rotation.from_rotvec(angle * unit).as_matrix())
 
 
-def between_deg(found: Array, true: Array) -> Array:
-    """Return the angle of the rotation between two (deg)."""
-    return np.asarray(Rotation.from_matrix(np.swapaxes(true, -1, -2) @ found).magnitude() / DEGREE)
-
-
 def observe(
     site: Site, position_world: Array, sensor_from_world: Array, sigma: float, seed: int
 ) -> FieldSamples:
@@ -111,9 +105,9 @@ def by_paper(
     """Return the mean error of the three printed angles, and of the nearest rotation (deg)."""
     offset = position_world[:, None] - BEACONS_WORLD
     direction_world = offset / np.linalg.norm(offset, axis=-1, keepdims=True)
-    pseudo = direction_from_normal(plane_normal(phasor_sensor))
-    printed = angles_as_printed(attitude_as_printed(pseudo, direction_world))
-    difference = printed - angles_as_printed(sensor_from_world)
+    pseudo = eq_07_direction(plane_normal(phasor_sensor))
+    printed = eq_23_angles(eq_21_attitude_as_printed(pseudo, direction_world))
+    difference = printed - eq_23_angles(sensor_from_world)
     wrapped = np.angle(np.exp(1j * difference))
     nearest = np.swapaxes(attitude_from_vectors(pseudo, direction_world), -1, -2)
     error_deg = between_deg(nearest, sensor_from_world)
@@ -183,11 +177,9 @@ def report(rows: tuple[Row, ...]) -> str:
 
 def main() -> None:
     """Print the table and one JSON line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
-    rows = run(Config(seed=parser.parse_args().seed))
-    print(report(rows))
-    print(json.dumps({"rows": [asdict(row) for row in rows]}))
+    given = scenario_parser(__doc__, Config.seed, output=None).parse_args()
+    rows = run(Config(seed=given.seed))
+    conclude(report(rows), {"rows": rows})
 
 
 if __name__ == "__main__":

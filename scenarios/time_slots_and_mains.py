@@ -14,26 +14,16 @@ demodulates it in every way that `magfusion.receiver` knows:
 5. Where there is no hum each way costs noise: least of all the state over many cycles.
 """
 
-import argparse
-import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from harness import blank_figure, conclude, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation
 
-from magfusion.fixes.tracker import locate_by_svd, unit_coupling
-from magfusion.receiver.ambient import Removal, subtraction_gain
-from magfusion.receiver.cycles import whole_cycles
-from magfusion.receiver.lockin import demodulate, window_operator
-from magfusion.receiver.slots import SlotSettings, demodulate_slots
-from magfusion.receiver.windows import choose_windows, default_settings
-from magfusion.records.samples import FieldSamples, ImuSamples, Waveform
-from magfusion.simulation.field import phasors_world, synchronised_drives
-from magfusion.simulation.motion import static_motion
-from magfusion.simulation.waveform import Mains, simulate_waveform
-from magfusion.site import (
+from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
+from magfusion.model.site import (
     Beacon,
     BeaconSigma,
     Coil,
@@ -44,6 +34,15 @@ from magfusion.site import (
     Site,
     Slots,
 )
+from magfusion.papers.p000_tracker.pose import locate_by_svd, unit_coupling
+from magfusion.receiver.ambient import Removal, subtraction_gain
+from magfusion.receiver.cycles import whole_cycles
+from magfusion.receiver.receiver import received
+from magfusion.receiver.slots import SlotSettings
+from magfusion.receiver.windows import default_settings
+from magfusion.simulation.field import phasors_world, synchronised_drives
+from magfusion.simulation.motion import static_motion
+from magfusion.simulation.waveform import Mains, simulate_waveform
 from magfusion.units import DEGREE, MU0_OVER_4PI, Array, ComplexArray
 
 DISTANCE = 0.5  # m
@@ -217,7 +216,7 @@ def pulsed(
         waveform, imu = recorded(site, room, config.pulsed_rate_hz, length, mains)
         for removal, parts in found.items():
             settings = SlotSettings(removal, "rectangular")
-            slots, _ = demodulate_slots(waveform, imu, site, settings)
+            slots, _ = received(waveform, imu, site, settings)
             samples = whole_cycles(slots, imu, site)
             inner = slice(1, -1)  # the first cycle has no silent slot before it
             residual, attitude = errors(site, room, samples)
@@ -251,7 +250,7 @@ def carrier_row(config: Config, carrier_hz: float, duration: float, taper: str) 
         mains = _mains(config, room, 50.0)
         length = 4 * duration * few.cycles + 1e-3
         waveform, imu = recorded(site, room, config.carrier_rate_hz, length, mains)
-        slots, _ = demodulate_slots(waveform, imu, site, settings)
+        slots, _ = received(waveform, imu, site, settings)
         parts.append(errors(site, room, whole_cycles(slots, imu, site), phase))
     residual, attitude = rms([p[0] for p in parts]), rms([p[1] for p in parts])
     return CarrierRow(carrier_hz, 1e3 * duration, taper, decibel(residual), attitude)
@@ -266,9 +265,7 @@ def frequency_division(config: Config, carrier_hz: float = 1e4) -> CarrierRow:
         mains = _mains(config, room, 50.0)
         length = 3.0 * settings.window
         waveform, imu = recorded(site, room, config.carrier_rate_hz, length, mains)
-        windows = choose_windows(waveform, imu, site, settings)
-        operator = window_operator(waveform, imu, site, settings, windows)
-        parts.append(errors(site, room, demodulate(operator, waveform.measured_sensor)))
+        parts.append(errors(site, room, received(waveform, imu, site, settings)[0]))
     residual, attitude = rms([p[0] for p in parts]), rms([p[1] for p in parts])
     window_ms = 1e3 * settings.window
     return CarrierRow(carrier_hz, window_ms, "three at once", decibel(residual), attitude)
@@ -300,37 +297,33 @@ def report(rows: list[Row], carriers: list[CarrierRow], noise: dict[str, float])
         for row in (r for r in rows if (r.slot_ms, r.mains_hz) == key):
             printed = PRINTED_DEG.get((round(1e-3 * key[0], 9), key[1]), ())
             place = REMOVALS.index(row.removal)  # type: ignore[arg-type]
-            told = f" [{printed[place]:g}]" if place < len(printed) else ""
-            cells += f"{row.residual_db:9.1f}{row.attitude_deg:9.3f}{told:<8}"
+            printed_cell = f" [{printed[place]:g}]" if place < len(printed) else ""
+            cells += f"{row.residual_db:9.1f}{row.attitude_deg:9.3f}{printed_cell:<8}"
         lines.append(f"{key[0]:5g}ms{key[1]:7g}{cells}")
     lines.append("worst phase by the formula, slots 1/2/3, silent slot subtracted (dB):")
     for row in rows:
         if row.removal == "subtract" and row.formula_db is not None:
-            told = "/".join(f"{db:+.1f}" for db in row.formula_db)
-            lines.append(f"{row.slot_ms:5g}ms{row.mains_hz:7g}  {told}")
+            printed_cell = "/".join(f"{db:+.1f}" for db in row.formula_db)
+            lines.append(f"{row.slot_ms:5g}ms{row.mains_hz:7g}  {printed_cell}")
     lines.append("carriers, no silent slot, hum of 50 Hz: RMS residual (dB) [analysis], attitude")
     for carrier in carriers:
         key = (carrier.carrier_hz, round(1e-3 * carrier.slot_ms, 9), carrier.taper)
-        told = f" [{PRINTED_DB[key]:g}]" if key in PRINTED_DB else ""
+        printed_cell = f" [{PRINTED_DB[key]:g}]" if key in PRINTED_DB else ""
         lines.append(
             f"{carrier.carrier_hz:7g} Hz{carrier.slot_ms:5g}ms {carrier.taper:>13}"
-            f"{carrier.residual_db:9.1f}{told:<9}{carrier.attitude_deg:9.5f} deg"
+            f"{carrier.residual_db:9.1f}{printed_cell:<9}{carrier.attitude_deg:9.5f} deg"
         )
-    told = ", ".join(
+    printed_cell = ", ".join(
         f"{k} {v:.3f}" + (f" [{PRINTED_NOISE_DEG[k]:g}]" if k in PRINTED_NOISE_DEG else "")
         for k, v in noise.items()
     )
-    lines.append(f"price in noise of 60 dB, no hum, attitude RMS (deg): {told}")
+    lines.append(f"price in noise of 60 dB, no hum, attitude RMS (deg): {printed_cell}")
     return "\n".join(lines)
 
 
 def draw(path: Path, config: Config, rows: list[Row]) -> None:
     """Write a PNG of the formula over the slot's length, and of the simulated attitude errors."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.0, 4.0), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(9.0, 4.0)
     left, right = figure.subplots(1, 2)
     length = np.linspace(0.1e-3, 22e-3, 600)
     for k in range(3):
@@ -347,29 +340,19 @@ def draw(path: Path, config: Config, rows: list[Row]) -> None:
     right.set(xlabel="slot (ms)", ylabel="attitude RMS (deg)")
     right.set_title(f"hum of {1e6 * config.mains:g} uT at {config.mains_hz[-1]:g} Hz, 0.5 m")
     right.legend(fontsize="small")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save_picture(figure, path)
 
 
 def main() -> None:
     """Print the tables and one JSON line; draw them where a directory is given."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
-    parser.add_argument("--quick", action="store_true", help="a sixth of the poses")
-    parser.add_argument("-o", "--output", type=Path, help="directory for time_slots_and_mains.png")
-    given = parser.parse_args()
+    given = scenario_parser(__doc__, Config.seed, "a sixth of the poses").parse_args()
     config = Config(seed=given.seed, runs=10 if given.quick else Config.runs)
     rows, carriers = list(pulsed_rows(config)), list(carrier_rows(config))
     noise = noise_deg(config)
-    print(report(rows, carriers, noise))
     if given.output is not None:
         draw(given.output / "time_slots_and_mains.png", config, rows)
-    figures = {
-        "pulsed": [asdict(row) for row in rows],
-        "carriers": [asdict(row) for row in carriers],
-        "noise_deg": noise,
-    }
-    print(json.dumps(figures))
+    figures = {"pulsed": rows, "carriers": carriers, "noise_deg": noise}
+    conclude(report(rows, carriers, noise), figures)
 
 
 if __name__ == "__main__":

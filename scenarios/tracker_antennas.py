@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.antenna import Antenna
 from magfusion.calibration.antenna import AntennaSurvey, prior_sigma
-from magfusion.calibration.antenna_bench import bench_points
-from magfusion.fixes.tracker import locate_by_svd, refine_poses, whitened
-from magfusion.physics.dipole import dipole_field
+from magfusion.model.antenna import Antenna
+from magfusion.model.physics.dipole import dipole_field
+from magfusion.papers.p000_tracker.bench import bench_points
+from magfusion.papers.p000_tracker.equations import eq_09_whitened
+from magfusion.papers.p000_tracker.pose import locate_by_svd, refine_poses
 from magfusion.units import DEGREE, MU0_OVER_4PI, Array
 
 
@@ -136,19 +137,7 @@ def locate(antenna: Antenna, seen: Array, guess_beacon: Array) -> tuple[Array, A
     """Return poses by closed form and maximum likelihood with an antenna (n,), couplings (n, m)."""
     wide = antenna.at(np.s_[:, None])
     transmitter = np.swapaxes(wide.moments_beacon, -1, -2)
-    free = whitened(seen, np.linalg.inv(wide.sensitivities_sensor), transmitter)
+    free = eq_09_whitened(seen, np.linalg.inv(wide.sensitivities_sensor), transmitter)
     start = locate_by_svd(free).nearest(guess_beacon)
     attitude = np.swapaxes(start.sensor_from_beacon, -1, -2)
     return refine_poses(wide, seen, attitude, start.position_beacon[..., 0, :])
-
-
-def rms(error: Array) -> float:
-    """Return the root mean square of all."""
-    return float(np.sqrt(np.mean(error**2)))
-
-
-def between_deg(found: Array, true: Array) -> Array:
-    """Return the angle of the rotation between attitudes (..., 3, 3) (deg)."""
-    turn = np.swapaxes(true, -1, -2) @ found
-    angle = Rotation.from_matrix(turn.reshape(-1, 3, 3)).magnitude() / DEGREE
-    return np.asarray(angle.reshape(turn.shape[:-2]))

@@ -11,28 +11,27 @@ A tracker in time slots sees each coil at another time.  The scenario turns it a
    with an IMU of 200 Hz as with one of 1 kHz.
 """
 
-import argparse
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from harness import blank_figure, conclude, rms, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation, RotationSpline
 from time_slots_and_mains import DISTANCE, UNIT, tracker
 
-from magfusion.fixes.tracker import locate_by_svd, unit_coupling, world_poses
-from magfusion.fusion.batch import smooth
-from magfusion.fusion.online import Navigator, NavigatorSettings
-from magfusion.fusion.state import as_trajectory
-from magfusion.observation import observe_from
-from magfusion.receiver.slots import default_slot_settings, demodulate_slots
-from magfusion.records.samples import FieldSamples, ImuSamples, Log
+from magfusion.estimation.batch import smooth
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.state import as_trajectory
+from magfusion.model.field import observe_from
+from magfusion.model.samples import FieldSamples, ImuSamples, Log
+from magfusion.model.site import Site, Slots
+from magfusion.model.trajectory import Trajectory
+from magfusion.papers.p000_tracker.pose import locate_by_svd, unit_coupling, world_poses
+from magfusion.receiver.receiver import received
 from magfusion.simulation.field import phasors_world, synchronised_drives
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.motion import ATTITUDE_KNOT, Motion, Rests, turning_motion
 from magfusion.simulation.waveform import Mains, simulate_waveform
-from magfusion.site import Site, Slots
-from magfusion.trajectory import Trajectory
 from magfusion.units import DEGREE, Array
 
 CARRIER_HZ = 10e3
@@ -114,7 +113,7 @@ def skew(config: Config, slot_ms: float) -> Skew:
     together = np.swapaxes(fix.sensor_from_beacon, 1, 2)
     start = fix.nearest(position).position_beacon[:, 0]
     apart = slots_apart(site, seen, turns, together, start)
-    return Skew(slot_ms, *(_rms(_between_deg(found, middle)) for found in (together, apart)))
+    return Skew(slot_ms, *(rms(_between_deg(found, middle)) for found in (together, apart)))
 
 
 def slots_apart(
@@ -193,7 +192,7 @@ def fuse(config: Config, imu_rate_hz: float) -> Fused:
         rng,
         Mains(0.15e-6, 49.8),
     )
-    slots, _ = demodulate_slots(waveform, imu, site, default_slot_settings(site))
+    slots, _ = received(waveform, imu, site)
     log = Log("head", 0, "simulation", imu, waveform)
     smoothed = smooth(log, site).states
     filtered = navigate(site, imu, slots)
@@ -203,7 +202,7 @@ def fuse(config: Config, imu_rate_hz: float) -> Fused:
     errors = [_errors(found, motion, begin) for found in (snapshot, smoothed, filtered)]
     time = snapshot.time[snapshot.time >= begin]
     rate = np.linalg.norm(motion.rate_body(time), axis=1) / DEGREE
-    return Fused(imu_rate_hz, _rms(rate), *(e[0] for e in errors), *(e[1] for e in errors))
+    return Fused(imu_rate_hz, rms(rate), *(e[0] for e in errors), *(e[1] for e in errors))
 
 
 def snapshots(site: Site, slots: FieldSamples, motion: Motion) -> Trajectory:
@@ -248,16 +247,12 @@ def _errors(found: Trajectory, motion: Motion, begin: float) -> tuple[float, flo
     time = found.time[used]
     attitude = _between_deg(found.world_from_body[used], motion.world_from_body(time))
     position = found.position_world[used] - motion.position_world(time)
-    return _rms(attitude), 1e3 * _rms(np.linalg.norm(position, axis=1))
+    return rms(attitude), 1e3 * rms(np.linalg.norm(position, axis=1))
 
 
 def _between_deg(found: Array, true: Rotation) -> Array:
     turn = true.inv() * Rotation.from_matrix(found)
     return np.asarray(turn.magnitude() / DEGREE)
-
-
-def _rms(value: Array) -> float:
-    return float(np.sqrt(np.mean(value**2)))
 
 
 def report(skews: list[Skew], fused: list[Fused]) -> str:
@@ -285,11 +280,7 @@ def report(skews: list[Skew], fused: list[Fused]) -> str:
 
 def draw(path: Path, fused: list[Fused]) -> None:
     """Write a PNG of the attitude errors."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.0, 4.0), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(6.0, 4.0)
     axes = figure.subplots()
     names = ("closed form", "filter", "smoother")
     for i, run in enumerate(fused):
@@ -300,26 +291,20 @@ def draw(path: Path, fused: list[Fused]) -> None:
     axes.set(yscale="log", ylabel="attitude RMS (deg)")
     axes.set_title("Turning at 100 deg/s, slots of 2.5 ms, 60 dB")
     axes.legend()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save_picture(figure, path)
 
 
 def main() -> None:
     """Print the tables and one JSON line; draw them where a directory is given."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
-    parser.add_argument("--quick", action="store_true", help="five seconds, one IMU")
-    parser.add_argument("-o", "--output", type=Path, help="directory for tracker_motion_skew.png")
-    given = parser.parse_args()
+    given = scenario_parser(__doc__, Config.seed, quick="five seconds, one IMU").parse_args()
     config = Config(seed=given.seed)
     if given.quick:
         config = replace(config, duration=5.0, imu_rates_hz=(500.0,))
     skews = [skew(config, slot_ms) for slot_ms in config.slots_ms]
     fused = [fuse(config, rate_hz) for rate_hz in config.imu_rates_hz]
-    print(report(skews, fused))
     if given.output is not None:
         draw(given.output / "tracker_motion_skew.png", fused)
-    print(json.dumps({"skew": [asdict(s) for s in skews], "fused": [asdict(f) for f in fused]}))
+    conclude(report(skews, fused), {"skew": skews, "fused": fused})
 
 
 if __name__ == "__main__":

@@ -12,20 +12,19 @@ pose with dipoles, and again with one term for the coils' size, ``1 - kappa d^2/
    (`magfusion.calibration.antenna`).
 """
 
-import argparse
-import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from harness import between_deg, blank_figure, conclude, rms, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation
 
-from magfusion.antenna import KAPPAS, Antenna
 from magfusion.calibration.antenna import AntennaSurvey, fit_at_known_poses, prior_sigma
-from magfusion.fixes.tracker import locate_by_svd, refine_poses
-from magfusion.physics.finite_size import disc_kappa, square_kappa
-from magfusion.units import DEGREE, MU0_OVER_4PI, Array
+from magfusion.model.antenna import KAPPAS, Antenna
+from magfusion.model.physics.finite_size import disc_kappa, square_kappa
+from magfusion.papers.p000_tracker.pose import locate_by_svd, refine_poses
+from magfusion.units import MU0_OVER_4PI, Array
 
 SIZE = 0.06  # m; of the transmitting coil, diameter or side
 PRINTED_DEG = {  # attitude RMS of the independent analysis, circles of equal size
@@ -127,12 +126,6 @@ def ideal(shape: str, receiver: float) -> Antenna:
     return Antenna(eye, zero, eye, zero, np.array(kappa(SIZE)), np.array(kappa(receiver * SIZE)))
 
 
-def between_deg(found: Array, true: Array) -> Array:
-    """Return the angle of the rotation between two (deg)."""
-    turn = np.swapaxes(true, -1, -2) @ found
-    return np.asarray(Rotation.from_matrix(turn).magnitude() / DEGREE)
-
-
 def run_row(config: Config, shape: str, receiver: float, ratio: float) -> Row:
     """Solve at one distance with dipoles and with the coils' size."""
     attitude, position = random_poses(config, ratio)
@@ -142,18 +135,17 @@ def run_row(config: Config, shape: str, receiver: float, ratio: float) -> Row:
     error = between_deg(found, attitude)
     sized = None
     if ratio >= 3.0:
-        refined, _ = refine_poses(
-            ideal(shape, receiver), seen, found, start.position_beacon[:, 0], iterations=10
-        )
-        sized = float(np.sqrt(np.mean(between_deg(refined, attitude) ** 2)))
+        antenna = ideal(shape, receiver)
+        refined, _ = refine_poses(antenna, seen, found, start.position_beacon[:, 0])
+        sized = rms(between_deg(refined, attitude))
     return Row(
         shape=shape,
         receiver=receiver,
         ratio=ratio,
-        dipole_deg=float(np.sqrt(np.mean(error**2))),
+        dipole_deg=rms(error),
         dipole_max_deg=float(np.max(error)),
         sized_deg=sized,
-        range_error=float(np.sqrt(np.mean((start.distance / (ratio * SIZE) - 1.0) ** 2))),
+        range_error=rms(start.distance / (ratio * SIZE) - 1.0),
     )
 
 
@@ -213,11 +205,7 @@ def _columns(rows: tuple[Row, ...]) -> list[tuple[str, float]]:
 
 def draw(path: Path, rows: tuple[Row, ...]) -> None:
     """Write a PNG of the errors over the distance."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 4.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(7.0, 4.5)
     axes = figure.subplots()
     for number, (shape, receiver) in enumerate(_columns(rows)):
         own = [r for r in rows if (r.shape, r.receiver) == (shape, receiver)]
@@ -230,26 +218,21 @@ def draw(path: Path, rows: tuple[Row, ...]) -> None:
     axes.set(xlabel="distance / coil size", ylabel="attitude error, RMS (deg)")
     axes.set_title("Dipole (full lines), with the coils' size (dashed); dotted: the paper's rule")
     axes.legend()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save_picture(figure, path)
 
 
 def main() -> None:
     """Print the table and one JSON line; draw it where a directory is given."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
-    parser.add_argument("-o", "--output", type=Path, help="directory for tracker_near_field.png")
-    given = parser.parse_args()
+    given = scenario_parser(__doc__, Config.seed).parse_args()
     config = Config(seed=given.seed)
-    rows = run(config)
-    learnt = learn_sizes(config)
-    print(report(rows))
-    print(f"slope from 5 to 30 sizes: {slope(rows):.2f}")
-    print(f"kappa that a calibration at 5 sizes finds, relative: {learnt[0]:.3f}, {learnt[1]:.3f}")
+    rows, learnt = run(config), learn_sizes(config)
     if given.output is not None:
         draw(given.output / "tracker_near_field.png", rows)
-    figures = {"rows": [asdict(row) for row in rows], "slope": slope(rows), "kappa": learnt}
-    print(json.dumps(figures))
+    text = (
+        f"{report(rows)}\nslope from 5 to 30 sizes: {slope(rows):.2f}\n"
+        f"kappa that a calibration at 5 sizes finds, relative: {learnt[0]:.3f}, {learnt[1]:.3f}"
+    )
+    conclude(text, {"rows": rows, "slope": slope(rows), "kappa": learnt})
 
 
 if __name__ == "__main__":

@@ -15,17 +15,15 @@ angles of the rotation between estimate and truth; the paper's row 4 (pitch 90 d
 out of its own Eq 13, and its rows 8 to 10 repeat uncalibrated values.
 """
 
-import argparse
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from harness import between_deg, blank_figure, conclude, rms, save_picture, scenario_parser
 from tracker_antennas import (
     Config,
     Errors,
     bench_readings,
-    between_deg,
     couplings,
     draw_antennas,
     draw_survey,
@@ -33,15 +31,14 @@ from tracker_antennas import (
     noise_sigma,
     nominal,
     random_poses,
-    rms,
     usual_prior,
 )
 
-from magfusion.antenna import Antenna, antenna_from_vector
 from magfusion.calibration.antenna import AntennaFit, AntennaSurvey, fit_at_known_poses
-from magfusion.calibration.antenna_bench import general_antenna, measure, rigid_antenna
 from magfusion.calibration.antenna_graph import fit_at_uncertain_poses
-from magfusion.fixes.tracker import attitude_from_angles, euler_angles
+from magfusion.model.antenna import Antenna, antenna_from_vector
+from magfusion.papers.p000_tracker.bench import general_antenna, measure, rigid_antenna
+from magfusion.papers.p000_tracker.equations import attitude_from_angles, euler_angles
 from magfusion.units import DEGREE, Array
 
 # Yaw, pitch, roll (deg): target, antenna not calibrated, antenna calibrated.
@@ -300,11 +297,7 @@ def report_uncertain(found: Uncertain, config: Config) -> str:
 
 def draw(path: Path, tables: dict[str, tuple[Row, ...]]) -> None:
     """Write a PNG of the attitude errors of every level, with the printed ones."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(5.0 * len(tables), 4.0), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = blank_figure(5.0 * len(tables), 4.0)
     before, after, _ = printed_ratios()["geodesic RMS"]
     panels = figure.subplots(1, len(tables), squeeze=False, sharey=True)[0]
     for axes, (title, rows) in zip(panels, tables.items(), strict=True):
@@ -317,17 +310,12 @@ def draw(path: Path, tables: dict[str, tuple[Row, ...]]) -> None:
         axes.set(title=title, yscale="log")
     panels[0].set_ylabel("attitude error, RMS (deg)")
     panels[0].legend()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save_picture(figure, path)
 
 
 def main() -> None:
     """Print the tables and one JSON line; draw them where a directory is given."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
-    parser.add_argument("--quick", action="store_true", help="20 antennas instead of 200")
-    parser.add_argument("-o", "--output", type=Path, help="directory for tracker_table1.png")
-    given = parser.parse_args()
+    given = scenario_parser(__doc__, Config.seed, "20 antennas instead of 200").parse_args()
     change = {"seed": given.seed, "antennas": 20 if given.quick else Config.antennas}
     titles = {
         "A: independent errors of the coils, 60 dB": replace(SCENARIO_A, **change),
@@ -337,19 +325,15 @@ def main() -> None:
     tables = {title: run_levels(config) for title, config in titles.items()}
     uncertain = [replace(SCENARIO_E, snr_db=db, **change) for db in (60.0, 65.0)]
     found = [run_uncertain(config) for config in uncertain]
-    print(report_printed())
-    for title, rows in tables.items():
-        print(report_levels(title, rows))
-    for outcome, config in zip(found, uncertain, strict=True):
-        print(report_uncertain(outcome, config))
     if given.output is not None:
         draw(given.output / "tracker_table1.png", tables)
-    names = ("A", "F2", "common")
     figures: dict[str, object] = {"printed": printed_ratios()}
-    for name, rows in zip(names, tables.values(), strict=True):
-        figures[name] = {row.level: asdict(row) for row in rows}
-    figures["E"] = [asdict(outcome) for outcome in found]
-    print(json.dumps(figures))
+    for name, rows in zip(("A", "F2", "common"), tables.values(), strict=True):
+        figures[name] = {row.level: row for row in rows}
+    figures["E"] = found
+    parts = [report_printed(), *(report_levels(title, rows) for title, rows in tables.items())]
+    parts += [report_uncertain(one, config) for one, config in zip(found, uncertain, strict=True)]
+    conclude("\n".join(parts), figures)
 
 
 if __name__ == "__main__":

@@ -10,12 +10,11 @@
    the centre and a circle.
 """
 
-import argparse
-import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from harness import blank_figure, conclude, save_picture, scenario_parser
 from magnetometer_calibrations_compared import (
     FIELD_LEVEL,
     FIELD_NED,
@@ -36,15 +35,15 @@ from magfusion.calibration.magnetometer import (
     to_paper,
 )
 from magfusion.calibration.magnetometer_log import calibrate_log
-from magfusion.calibration.twelve_positions import closed_form, positions
-from magfusion.records.samples import Log
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.papers.p001_magnetometer.twelve_positions import closed_form, positions
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.field import synchronised_drives
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.log import EPOCH_NS
 from magfusion.simulation.motion import Motion
 from magfusion.simulation.waveform import simulate_waveform
-from magfusion.site import Site
 from magfusion.units import DEGREE, Array
 
 HEADINGS_DEG = (0.0, 10.0, 45.0, 133.0)
@@ -187,10 +186,8 @@ def turned_about_vertical(rng: np.random.Generator) -> tuple[Array, Array]:
 
 def draw(path: Path, seed: int) -> None:
     """Write the paper's figure 2 as a PNG."""
-    from matplotlib.figure import Figure
-
     pair = turned_about_vertical(np.random.default_rng(seed))
-    figure = Figure(figsize=(10.0, 5.0), layout="constrained")
+    figure = blank_figure(10.0, 5.0)
     titles = ("before: the readings", "after: the fields")
     for panel, title, field in zip(figure.subplots(1, 2), titles, pair, strict=True):
         panel.plot(*(1e6 * field[:, :2]).T, ".")
@@ -198,7 +195,7 @@ def draw(path: Path, seed: int) -> None:
         panel.axvline(0.0, c="0.7", lw=0.8)
         panel.set(title=title, xlabel="x (µT)", ylabel="y (µT)", aspect="equal")
         panel.set(xlim=(-45.0, 45.0), ylim=(-45.0, 45.0))
-    figure.savefig(path, dpi=110, metadata={"Software": None})
+    save_picture(figure, path)
 
 
 def report(found: dict[str, object], config: Config) -> str:
@@ -221,18 +218,12 @@ def report(found: dict[str, object], config: Config) -> str:
 
 def main() -> None:
     """Print the table and one JSON line."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--seed", type=int, default=Config.seed)
-    parser.add_argument("--quick", action="store_true", help="two sessions")
-    parser.add_argument("-o", "--output", type=Path, help="directory of the picture")
-    given = parser.parse_args()
+    given = scenario_parser(__doc__, Config.seed, quick="two sessions").parse_args()
     config = Config(seed=given.seed, sessions=2 if given.quick else Config.sessions)
     found = run(config)
-    print(report(found, config))
     if given.output is not None:
-        given.output.mkdir(parents=True, exist_ok=True)
         draw(given.output / "twelve_positions.png", config.seed)
-    print(json.dumps({"config": asdict(config), **found}))
+    conclude(report(found, config), {"config": asdict(config), **found})
 
 
 if __name__ == "__main__":

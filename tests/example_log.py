@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.records.samples import FieldSamples, ImuSamples, Log, Waveform
-from magfusion.trajectory import Trajectory
+from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
+from magfusion.model.trajectory import Trajectory
 
 EPOCH_NS = 1_700_000_000_123_456_789
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.model.site import BeaconSigma, Coil, MagnetometerSigma, Site
 from magfusion.simulation.demo_site import demo_site
-from magfusion.site import BeaconSigma, Coil, MagnetometerSigma, Site
 
 UNEVEN = np.array([1.0, 2.0, 3.0])
 

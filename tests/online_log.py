@@ -6,15 +6,15 @@ from itertools import pairwise
 
 import numpy as np
 
-from magfusion.evaluation.errors import TrajectoryErrors, trajectory_errors
-from magfusion.fusion.online import Navigator, NavigatorSettings
-from magfusion.fusion.state import State, as_trajectory
-from magfusion.records.samples import FieldSamples, ImuSamples
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.state import State, as_trajectory
+from magfusion.model.samples import FieldSamples, ImuSamples
+from magfusion.model.site import BeaconSigma, MagnetometerSigma, Site
+from magfusion.results.errors import TrajectoryErrors, trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.log import simulate_fields
 from magfusion.simulation.motion import Motion, Rests, random_walk_motion
-from magfusion.site import BeaconSigma, MagnetometerSigma, Site
 
 SIGMA = 1e-9  # T
 WINDOW = 0.4  # s
@@ -94,8 +94,8 @@ def spoiled(
     hit = (rng.random(phasor.shape[:2]) < share) & during[:, None]
     noise = rng.standard_normal((2, int(hit.sum()), 3))
     phasor[hit] += 1e-6 * (noise[0] + 1j * noise[1])
-    heard = hit & np.isfinite(fields.phasor_sensor).all(axis=2)
-    return replace(fields, phasor_sensor=phasor), int(heard.sum())
+    detected = hit & np.isfinite(fields.phasor_sensor).all(axis=2)
+    return replace(fields, phasor_sensor=phasor), int(detected.sum())
 
 
 def without_imu(imu: ImuSamples, begin: float, end: float) -> ImuSamples:

@@ -4,18 +4,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.fusion.factors import FieldFactors, FieldMeasurements
-from magfusion.fusion.inertial import cut_at_epochs, preintegrate
-from magfusion.fusion.smoother import Estimate, Problem, inertial_graph, initial_estimate
-from magfusion.parameters import Block, initial_calibration
-from magfusion.records.samples import FieldSamples, ImuSamples, Log
+from magfusion.estimation.graph import Estimate, Graph, initial_estimate
+from magfusion.estimation.inertial import inertial_graph
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.preintegration import cut_at_epochs, preintegrate
+from magfusion.model.noise import measurement_cov, paired_whitening, stacked
+from magfusion.model.parameters import Block, initial_calibration
+from magfusion.model.samples import FieldSamples, ImuSamples, Log
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.log import EPOCH_NS, perturb_site, simulate_fields
 from magfusion.simulation.motion import Rests, random_walk_motion
-from magfusion.site import Site
-from magfusion.trajectory import Trajectory
-from magfusion.weights import measurement_cov, paired_whitening, stacked
 
 SIGMA = 1e-9  # T
 
@@ -60,23 +61,25 @@ def small_problem(
     blocks: tuple[Block, ...],
     start: Trajectory | None = None,
     loss: str | None = None,
-) -> tuple[Problem, Estimate]:
+) -> tuple[Graph, Estimate]:
     """Return the problem and a start: the truth where no other is given."""
     site, fields = small.site, small.fields
     time, n = fields.time, len(fields)
     increments = cut_at_epochs(small.imu, 0.0, time)
     zero = np.zeros((n, 3))
-    imu = site.platform.imu
-    graph = inertial_graph(preintegrate(increments, imu, site.gravity, zero, zero), imu)
+    measured = preintegrate(increments, site.platform.imu, site.gravity, zero, zero)
+    graph = inertial_graph(measured, site.platform)
     rate = [np.interp(time, small.imu.time, axis) for axis in small.imu.gyro_body.T]
-    measurements = FieldMeasurements(
+    measurements = FieldPhasors(
+        epoch=np.arange(n),
         time=time,
         measured=stacked(fields.phasor_sensor),
-        root=paired_whitening(measurement_cov(site, fields), fields.valid),
+        sqrt_information=paired_whitening(measurement_cov(site, fields), fields.valid),
         rate_body=np.stack(rate, axis=1),
         applied_offset=0.0,
         by_time_offset=np.zeros((n, len(fields.channels), 6)),
+        robust=loss,
     )
     declared = initial_calibration(site, float(np.mean(time)))
-    problem = Problem(graph, FieldFactors(measurements, blocks, loss), declared, n)
+    problem = Graph(graph, (measurements,), declared, blocks, n)
     return problem, initial_estimate(small.truth if start is None else start, declared)

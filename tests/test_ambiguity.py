@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.fixes.ambiguity import OPEN, Kind, ambiguity_figures, relations
-from magfusion.fixes.fix import Gravity
-from magfusion.fixes.likelihood import fix_epochs
-from magfusion.parameters import initial_calibration
+from magfusion.estimation.snapshot.ambiguity import OPEN, Kind, ambiguities, relations
+from magfusion.estimation.snapshot.fix import Gravity
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.field import Drives
 from magfusion.simulation.log import simulate_fields
-from magfusion.trajectory import Trajectory
 
 SIGMA = 3e-10  # T, of a phasor's component
 COUNT = 150
@@ -78,29 +78,29 @@ def test_one_beacon_and_the_tilt_leave_the_opposite_side(knows):
     _, told = told_of(floor(1), **{knows: True})
     assert np.all(np.sum(told.is_open, axis=1) == 1)
     assert share(told, "best", "mirror A") == 1.0
-    figures = ambiguity_figures(told)
-    assert figures["ambiguity_mirror_epochs"] == COUNT
-    (sentence,) = figures["ambiguity"]
+    found = ambiguities(told)
+    assert found.epochs[Kind.MIRROR] == COUNT
+    (sentence,) = found.open
     assert sentence.startswith(f"In {COUNT} of {COUNT} epochs the pose on the opposite side of")
 
 
 def test_one_beacon_alone_leaves_four_poses():
     _, told = told_of(floor(1))
     assert share(told, "best", "mirror A", "half_turn A", "plane A") == 1.0
-    figures = ambiguity_figures(told)
+    found = ambiguities(told)
     for kind in ("mirror", "half_turn", "plane"):
-        assert figures[f"ambiguity_{kind}_epochs"] == COUNT
-    assert len(figures["ambiguity"]) == 3
-    assert figures["ambiguity_settled"] == []
+        assert found.epochs[Kind(kind)] == COUNT
+    assert len(found.open) == 3
+    assert found.settled == []
 
 
 def test_one_beacon_of_unknown_phase_leaves_the_azimuth_open():
     _, told = told_of(floor(1, synchronised=False))
     assert np.all(told.azimuth == "A")
     assert set(told.label[told.is_open]) <= {"azimuth A", "mirror A"}
-    figures = ambiguity_figures(told)
-    assert figures["ambiguity_azimuth_epochs"] == COUNT
-    assert any("any azimuth about beacon A" in sentence for sentence in figures["ambiguity"])
+    found = ambiguities(told)
+    assert found.epochs[Kind.AZIMUTH] == COUNT
+    assert any("any azimuth about beacon A" in sentence for sentence in found.open)
 
 
 def test_one_beacon_of_unknown_phase_and_known_attitude_leave_the_opposite_side():
@@ -115,9 +115,9 @@ def test_one_beacon_of_unknown_phase_and_known_attitude_leave_the_opposite_side(
 def test_two_beacons_and_the_attitude_leave_one_pose(count, synchronised):
     _, told = told_of(floor(count, synchronised), attitude=True)
     assert not np.any(told.is_open)
-    figures = ambiguity_figures(told)
-    assert figures["ambiguity"] == []
-    assert not any(key.endswith("_epochs") for key in figures)
+    found = ambiguities(told)
+    assert found.open == []
+    assert found.epochs == {}
 
 
 @pytest.mark.parametrize("count", [2, 3])
@@ -127,7 +127,7 @@ def test_two_beacons_of_known_phase_leave_one_pose_and_say_what_ruled_the_others
     lost = np.isfinite(fixes.cost) & (fixes.cost - fixes.cost[:, :1] > OPEN)
     assert np.array_equal(told.settled != "", lost)
     assert set(told.settled[lost]) == {"the other beacons"}
-    (sentence,) = ambiguity_figures(told)["ambiguity_settled"]
+    (sentence,) = ambiguities(told).settled
     assert "the other beacons ruled out" in sentence
     assert "mirrored in the plane of the beacons" in sentence
 
@@ -138,7 +138,7 @@ def test_coplanar_beacons_of_unknown_polarity_leave_two_poses(count, tilt):
     _, told = told_of(floor(count, synchronised=False), tilt=tilt)
     assert share(told, "best", "polarity") == 1.0
     assert np.all(np.sum(told.is_open, axis=1) == 1)
-    (sentence,) = ambiguity_figures(told)["ambiguity"]
+    (sentence,) = ambiguities(told).open
     assert "with the opposite heading explains the measurements as well" in sentence
 
 
@@ -162,7 +162,7 @@ def test_gravity_is_named_where_it_ruled_a_mirror_out():
     ruled_out = told.label[told.settled == "gravity"]
     assert {"plane A", "half_turn A"} <= set(ruled_out)
     assert np.mean(np.isin(ruled_out, ["plane A", "half_turn A"])) > 0.95
-    (sentence,) = ambiguity_figures(told)["ambiguity_settled"]
+    (sentence,) = ambiguities(told).settled
     assert "gravity ruled out the pose mirrored in the plane of beacon A" in sentence
 
 

@@ -20,13 +20,6 @@ from tracker_antennas import (
 from tracker_site import body_poses, in_beacon, tracker_site
 from tracker_table1 import POSITION_BEACON, TABLE, one_of
 
-from magfusion.antenna import (
-    KAPPAS,
-    Antenna,
-    antenna_from_vector,
-    antenna_of,
-    observe_antenna,
-)
 from magfusion.calibration.antenna import (
     AntennaFit,
     AntennaSurvey,
@@ -34,21 +27,26 @@ from magfusion.calibration.antenna import (
     prior_sigma,
     with_receiver_gain,
 )
-from magfusion.calibration.antenna_bench import (
-    bench_points,
-    bursa_wolf_matrix,
-    helmert,
-    mean_shift,
-    measure,
-    shift_as_printed,
-)
 from magfusion.calibration.antenna_graph import fit_at_uncertain_poses
 from magfusion.calibration.antenna_observability import Observability, observability
 from magfusion.errors import EstimationError, InputError
-from magfusion.fixes.tracker import attitude_from_angles
-from magfusion.observation import Observation, observe, observe_from, predict
-from magfusion.physics.dipole import dipole_field
-from magfusion.site import Magnetometer
+from magfusion.model.antenna import (
+    KAPPAS,
+    Antenna,
+    antenna_from_vector,
+    antenna_of,
+    observe_antenna,
+)
+from magfusion.model.field import Observation, observe, observe_from, predict
+from magfusion.model.physics.dipole import dipole_field
+from magfusion.model.site import Magnetometer
+from magfusion.papers.p000_tracker.bench import bench_points, helmert, measure
+from magfusion.papers.p000_tracker.equations import (
+    attitude_from_angles,
+    bursa_wolf_matrix,
+    mean_shift,
+    shift_as_printed,
+)
 from magfusion.units import DEGREE
 
 

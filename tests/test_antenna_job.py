@@ -11,10 +11,10 @@ from conftest import Refuse, run_command
 from scipy.spatial.transform import Rotation
 from tracker_site import body_poses, in_beacon, tracker_site
 
-from magfusion.observation import predict
-from magfusion.records.survey import Survey, write_survey
-from magfusion.site import Site
-from magfusion.site_file import load_site, save_site
+from magfusion.files.site import load_site, save_site
+from magfusion.files.survey import Survey, write_survey
+from magfusion.model.field import predict
+from magfusion.model.site import Site
 from magfusion.units import DEGREE, MU0_OVER_4PI
 
 POSE_SIGMA = 0.1 * DEGREE, 0.5e-3  # rad, m

@@ -11,7 +11,7 @@ import pytest
 from example_log import EPOCH_NS, example_log
 
 from magfusion.errors import InputError
-from magfusion.records.log import read_log, write_log
+from magfusion.files.log import read_log, write_log
 
 
 def _rewrite(path: Path, change: Callable[[dict[str, Any]], object]) -> None:

@@ -12,17 +12,19 @@ from beacon_calibration import MOMENT, PLACES_WORLD, Block, Config, Errors, run_
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.beacon import BeaconMeasurements, calibrate_beacon
-from magfusion.calibration.beacon_paper import (
-    angle_variances,
-    calibrate_as_printed,
-    geometric_centre,
-)
 from magfusion.calibration.beacon_refined import attitudes, calibrate_one, open_axes, refine
 from magfusion.errors import InputError
-from magfusion.evaluation.consistency import average_nees_bounds
-from magfusion.observation import predict
+from magfusion.model.field import predict
+from magfusion.model.site import Beacon, BeaconSigma, Coil
+from magfusion.papers.p002_beacon.calibration import calibrate_as_printed
+from magfusion.papers.p002_beacon.equations import (
+    eq_30_variance_of_psi,
+    eq_31_variance_of_lambda,
+    eq_32_variance_of_gamma,
+    eq_33_geometric_centre,
+)
+from magfusion.results.consistency import average_nees_bounds
 from magfusion.simulation.field import phasors_world
-from magfusion.site import Beacon, BeaconSigma, Coil
 from magfusion.units import Array
 
 
@@ -123,16 +125,17 @@ def test_the_printed_variances_are_those_of_their_angles() -> None:
     true = Rotation.from_euler("ZYX", [gamma, psi, lamda]).as_matrix()
     sigma = 1e-4 * (1.0 + rng.random((3, 3)))
     drawn = true + sigma * rng.standard_normal((20_000, 3, 3))
-    # psi, gamma and lambda each from its own element, the rest known.
+    # psi, lambda and gamma each from its own element, the rest known.
     upright = np.cos(psi)
     angles = np.stack(
         [
             np.arcsin(-drawn[:, 2, 0]),
-            np.arccos(drawn[:, 0, 0] / upright),
             np.arccos(drawn[:, 2, 2] / upright),
+            np.arccos(drawn[:, 0, 0] / upright),
         ]
     )
-    expected = angle_variances(true, sigma**2)
+    printed = (eq_30_variance_of_psi, eq_31_variance_of_lambda, eq_32_variance_of_gamma)
+    expected = [variance(true, sigma**2) for variance in printed]
     np.testing.assert_allclose(np.var(angles, axis=1), expected, rtol=0.05, atol=0.0)
 
 
@@ -150,7 +153,7 @@ def test_the_printed_method_is_exact_without_noise_in_beacon_axes() -> None:
 def test_the_geometric_centre_is_that_of_the_box() -> None:
     corners = np.array([[x, y, z] for x in (0, 0.35) for y in (0, 0.35) for z in (0, 0.15)])
     np.testing.assert_allclose(
-        geometric_centre(corners + 1.0), [1.175, 1.175, 1.075], rtol=1e-12, atol=0.0
+        eq_33_geometric_centre(corners + 1.0), [1.175, 1.175, 1.075], rtol=1e-12, atol=0.0
     )
 
 

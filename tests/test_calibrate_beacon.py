@@ -9,12 +9,12 @@ import pytest
 from conftest import Refuse, run_command
 from scipy.spatial.transform import Rotation
 
-from magfusion.records.survey import Survey, write_survey
+from magfusion.files.site import load_site, save_site
+from magfusion.files.survey import Survey, write_survey
+from magfusion.model.site import Beacon, BeaconSigma, Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.log import draw_drives, perturb_site, simulate_fields
-from magfusion.site import Beacon, BeaconSigma, Site
-from magfusion.site_file import load_site, save_site
-from magfusion.trajectory import Trajectory
 from magfusion.units import DEGREE, Array
 
 NOISE = 2e-10  # T

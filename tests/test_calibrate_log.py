@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from conftest import Refuse, run_command
 
-from magfusion.records.log import write_log
+from magfusion.files.log import write_log
+from magfusion.files.site import load_site, save_site
+from magfusion.model.site import BeaconSigma, Site
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
 from magfusion.simulation.motion import Rests
-from magfusion.site import BeaconSigma, Site
-from magfusion.site_file import load_site, save_site
 from magfusion.units import DEGREE
 
 RESTLESS = Rests(start=0.0, move=1e3, pause=0.0)
@@ -76,8 +76,10 @@ def test_the_refined_site_is_nearer_the_truth(
 
 def test_the_report_is_flat_and_tells_every_parameter(report: dict[str, Any]) -> None:
     plain = (bool, int, float, str, type(None))
-    for value in report.values():
-        assert isinstance(value, plain) or all(isinstance(one, str) for one in value)
+    assert report["verdict"] == "trustworthy"
+    for key, value in report.items():
+        if key not in ("reasons", "remarks", "unverified"):
+            assert isinstance(value, plain) or all(isinstance(one, str) for one in value)
     assert report["job"] == "calibrate log"
     named = [key.removesuffix("_prior_sigma") for key in report if key.endswith("_prior_sigma")]
     assert len(named) == report["directions"]

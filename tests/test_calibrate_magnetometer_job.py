@@ -16,16 +16,16 @@ from magfusion.calibration.magnetometer import field_from_measured, spread
 from magfusion.calibration.steady_field import steady_field, window_length
 from magfusion.calibration.stops import find_stops
 from magfusion.errors import InputError
-from magfusion.job import Job
+from magfusion.files.log import write_log
+from magfusion.files.open import open_log
+from magfusion.files.site import load_site, save_site
 from magfusion.jobs.calibrate_magnetometer import run_calibrate_magnetometer
-from magfusion.records.log import write_log
-from magfusion.records.open import open_log
-from magfusion.records.samples import ImuSamples, Log, Waveform
+from magfusion.jobs.inputs import Job
+from magfusion.model.samples import ImuSamples, Log, Waveform
+from magfusion.model.site import Magnetometer, MotionModel, Site
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
 from magfusion.simulation.motion import Rests
-from magfusion.site import Magnetometer, Site
-from magfusion.site_file import load_site, save_site
 
 FILES = {"site.yaml", "report.json", "magnetometer.png"}
 DURATION = 60.0  # s
@@ -158,7 +158,7 @@ def test_a_site_that_declares_no_sigma_gets_a_wide_prior(
 
 def test_twelve_stops_are_found_in_the_stream(tmp_path: Path) -> None:
     session = twelve_positions.record(twelve_positions.Config(), 12, np.random.default_rng(2))
-    assert len(find_stops(session.log.imu)) == 12
+    assert len(find_stops(session.log.imu, MotionModel())) == 12
     log = write(session.log, session.site, tmp_path / "log")
     run_command("calibrate", "magnetometer", log, "--positions", "-o", tmp_path / "out")
     assert report_of(tmp_path / "out")["readings"] == 12

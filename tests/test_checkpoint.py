@@ -17,21 +17,20 @@ from online_log import WINDOW, OnlineLog, epoch, navigate, online_log
 from test_navigate_stream import EKF, answered, records
 
 from magfusion.errors import InputError
-from magfusion.fusion.online import NavigatorSettings, restored
-from magfusion.fusion.state import State
-from magfusion.jobs.checkpoint import (
-    Checkpoint,
-    RowFile,
-    read_checkpoint,
-    write_checkpoint,
-)
+from magfusion.estimation.navigator import Navigator, NavigatorSettings, restored
+from magfusion.estimation.state import State
+from magfusion.files.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from magfusion.files.log import write_log
+from magfusion.files.open import open_log
+from magfusion.files.row_file import RowFile
+from magfusion.files.site import load_site, save_site
+from magfusion.jobs.replay import Replay, feed
 from magfusion.jobs.stream import StreamSettings
-from magfusion.records.log import write_log
-from magfusion.records.samples import Log
-from magfusion.site_file import save_site
+from magfusion.model.samples import Log
 
 SCRIPT = Path(sys.executable).parent / "magfusion"
 TIMING = {"elapsed_s", "memory_mb", "update_p50_ms", "update_p99_ms", "update_max_ms"}
+KEY = "ab" * 32
 RESULTS = ("trajectory.tum", "trajectory.parquet", "lagged.parquet", "site.yaml")
 
 
@@ -49,7 +48,7 @@ def test_a_restored_navigator_goes_on_to_the_last_bit(estimator: str) -> None:
 
     def watch(navigator, now: float) -> None:  # type: ignore[no-untyped-def]
         if now in (4.0, 10.0, 13.25):  # before the start, and in a full window
-            twins[now] = restored(navigator.checkpoint())
+            twins[now] = restored(log.site, settings, navigator.checkpoint())
 
     settings = NavigatorSettings(estimator, delay=0.1)  # type: ignore[arg-type]
     navigator, states = navigate(log, settings, watch=watch)
@@ -61,12 +60,32 @@ def test_a_restored_navigator_goes_on_to_the_last_bit(estimator: str) -> None:
         assert twin.losses == navigator.losses
 
 
+@pytest.mark.parametrize("earth", [False, True])
+def test_a_navigator_of_raw_samples_goes_on_to_the_last_bit(worked: Worked, earth: bool) -> None:
+    """What its receiver has admitted, and the calibration so far, are in the checkpoint."""
+    log, site = open_log(worked.log), load_site(worked.log / "site.yaml")
+    settings, replay = NavigatorSettings(lag=1.0, earth=earth), Replay(log)
+    navigators, states = [Navigator(site, settings)], {0: [], 1: []}  # type: ignore[var-annotated]
+    for k in range(len(replay)):
+        if k == 200:
+            states[0].clear()
+            assert navigators[0].started
+            navigators.append(restored(site, settings, navigators[0].checkpoint()))
+        for i, navigator in enumerate(navigators):
+            feed(navigator, replay.piece(k))
+            states[i] += navigator.take()
+    assert len(states[1]) > 5
+    assert all(same(a, b) for a, b in zip(*states.values(), strict=True))
+    assert navigators[0].losses == navigators[1].losses
+
+
 @pytest.mark.parametrize(
-    "foreign", [pickle.dumps((0, None)), pickle.dumps("navigator"), b"", b"cmagfusion.gone\nIt\n."]
+    "foreign",
+    [pickle.dumps((0, None)), b"", "navigator", None, {}, {"parts": {}, "estimator": None}],
 )
-def test_a_checkpoint_of_another_version_is_refused(foreign: bytes) -> None:
-    with pytest.raises(InputError, match="another version of magfusion; run without --resume"):
-        restored(foreign)
+def test_what_is_no_state_of_a_navigator_is_refused(foreign: object) -> None:
+    with pytest.raises(InputError, match="run without --resume"):
+        restored(online_log(8, 10.0).site, NavigatorSettings(), foreign)
 
 
 def _rest(log: OnlineLog, navigator, begin: float) -> list[State]:  # type: ignore[no-untyped-def]
@@ -162,7 +181,10 @@ def test_killed_before_the_first_checkpoint_it_begins_again(
 ) -> None:
     output = tmp_path / "run"
     output.mkdir()
-    (output / "checkpoint.rows").write_bytes(b"\0" * 1000)  # a row file that was begun
+    begun = RowFile(output / "checkpoint.rows", {"time": 1})
+    begun.append({"time": 1.0})
+    begun.settle()
+    begun.close()
     (output / ".checkpoint.bin.123").write_bytes(b"\0")  # and the first checkpoint
     run_command("navigate", phasors, "-o", output, "--resume")
     assert (output / "trajectory.tum").read_bytes() == (
@@ -181,44 +203,54 @@ def test_the_checkpoint_may_lie_elsewhere_and_goes_when_all_is_done(
 def test_the_checkpoint_of_another_run_is_refused(
     refuse: Refuse, worked: Worked, tmp_path: Path
 ) -> None:
-    write_checkpoint(Checkpoint("another", 5, 0, b""), tmp_path / "checkpoint.bin")
+    write_checkpoint(Checkpoint("ab" * 32, 5, {}), tmp_path / "checkpoint.bin")
     command = ("navigate", worked.log, "-o", tmp_path / "run", "--resume", "--checkpoint")
     told = refuse(*command, tmp_path / "checkpoint.bin")
     assert "is the checkpoint of another log, site or setting" in told
     (tmp_path / "checkpoint.bin").write_bytes(b"nonsense")
-    assert "is no checkpoint" in refuse(*command, tmp_path / "checkpoint.bin")
+    assert "is no checkpoint of magfusion" in refuse(*command, tmp_path / "checkpoint.bin")
 
 
 def test_rows_made_after_the_checkpoint_are_forgotten(tmp_path: Path) -> None:
-    file = RowFile(tmp_path / "rows", 3)
+    columns = {"time": 1, "position": 3}
+
+    def row(k: float) -> dict[str, np.ndarray | float]:
+        return {"time": k, "position": np.full(3, k)}
+
+    file = RowFile(tmp_path / "rows", columns)
     for k in range(4):
-        file.append(np.full(3, float(k)))
-    assert file.settle() == 4
-    file.append(np.full(3, 9.0))
+        file.append(row(k))
+    mark = file.settle()
+    assert mark.rows == 4
+    file.append(row(9.0))
     file.close()
-    again = RowFile(tmp_path / "rows", 3, rows=4)
-    again.append(np.full(3, 4.0))
-    assert again.rows()[:, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    again = RowFile(tmp_path / "rows", columns, mark)
+    again.append(row(4.0))
+    assert again.rows()["position"][:, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    further = again.settle()
     again.close()
-    with pytest.raises(InputError, match="shorter than its checkpoint says"):
-        RowFile(tmp_path / "rows", 3, rows=7)
+    shorter = RowFile(tmp_path / "rows", columns, mark)
+    assert len(shorter.rows()["time"]) == 4
+    shorter.close()
+    with pytest.raises(InputError, match="is not as its checkpoint says"):
+        RowFile(tmp_path / "rows", columns, further)
 
 
 def test_a_checkpoint_that_cannot_be_written_leaves_the_former(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "checkpoint.bin"
-    write_checkpoint(Checkpoint("key", 1, 2, b"first"), path)
+    write_checkpoint(Checkpoint(KEY, 1, {"state": "first"}), path)
 
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("magfusion.jobs.checkpoint.os.fsync", full)
+    monkeypatch.setattr("magfusion.files.checkpoint.os.fsync", full)
     with pytest.raises(OSError, match="No space left"):
-        write_checkpoint(Checkpoint("key", 2, 4, b"second"), path)
-    found = read_checkpoint(path, "key")
+        write_checkpoint(Checkpoint(KEY, 2, {"state": "second"}), path)
+    found = read_checkpoint(path, KEY)
     assert found is not None
-    assert found.navigator == b"first"
+    assert found.content == {"state": "first"}
     assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.bin"]
 
 
@@ -229,15 +261,10 @@ def test_a_stream_goes_on_from_its_checkpoint(tmp_path: Path) -> None:
     whole, _ = answered(site, b"".join(lines))
     settings = StreamSettings(EKF.navigator, checkpoint=place, every=1.0)
     answered(site, b"".join(lines[:230]), settings)
-    found = read_checkpoint(place, _key_of(place))
+    found = read_checkpoint(place)
     assert found is not None
     assert 200 < found.position <= 230
     resumed = StreamSettings(EKF.navigator, checkpoint=place, every=1.0, resume=True)
     later, _ = answered(site, b"".join(lines[found.position :]), resumed)
     assert later[-1] == whole[-1]
     assert later == whole[len(whole) - len(later) :]
-
-
-def _key_of(place: Path) -> str:
-    key: str = pickle.loads(place.read_bytes()).key
-    return key

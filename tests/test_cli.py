@@ -16,11 +16,10 @@ from evo.tools import file_interface
 from rerun.chunk import RrdReader
 
 from magfusion.cli import main
-from magfusion.job import read_estimate
-from magfusion.options import topics_option
-from magfusion.records.log import read_log
-from magfusion.records.rosbag import Topics
-from magfusion.site_file import load_site
+from magfusion.files.bag import Topics
+from magfusion.files.log import read_log
+from magfusion.files.site import load_site
+from magfusion.jobs.inputs import read_estimate, topics_option
 
 CONSOLE_SCRIPT = Path(sys.executable).parent / "magfusion"
 
@@ -63,7 +62,7 @@ def test_what_one_coil_leaves_open_is_told_and_not_smoothed_over(
 ) -> None:
     site = _site_of_one_beacon(worked.log, tmp_path / "site.yaml", 1, True)
     log = tmp_path / "log"
-    run_command("simulate", "--site", site, "-o", log, "--duration", 8)
+    run_command("simulate", "--site", site, "-o", log, "--duration", 8, "--motion", "static")
     run_command("fix", log, "-o", tmp_path / "fixes", "--json")
     out = capfd.readouterr().out
     figures = json.loads(out.splitlines()[-1])
@@ -77,7 +76,8 @@ def test_what_one_coil_leaves_open_is_told_and_not_smoothed_over(
     assert "add a beacon or a coil" in err
     assert "single-epoch fixes were saved" in err
     assert json.loads((tmp_path / "run" / "report.json").read_text())["failed"] in err
-    assert (tmp_path / "run" / "fixes.parquet").is_file()
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"report.json", "failed"}
+    assert (tmp_path / "run" / "failed" / "fixes.parquet").is_file()
 
 
 # The good ways --------------------------------------------------------------------------------
@@ -122,8 +122,11 @@ def test_the_screen_tells_the_errors_first_and_the_calibration_as_a_table(
     run_command("smooth", worked.log, "-o", tmp_path / "run")
     lines = capfd.readouterr().out.splitlines()
     assert lines[0] == "smooth of simulated_walk"
-    assert lines[2].split()[:3] == ["position", "(m)", f"{_report(tmp_path / 'run')['ate_m']:.3g}"]
-    row = next(line for line in lines if "imu.time_offset_s" in line).split()
+    assert lines[1] == "TRUSTWORTHY"
+    table = next(k for k, line in enumerate(lines) if line.split()[:1] == ["rms"])
+    shown = lines[table + 1].split()[:3]
+    assert shown == ["position", "(m)", f"{_report(tmp_path / 'run')['ate_m']:.3g}"]
+    row = next(line for line in lines if "imu.time_offset (s)" in line).split()
     assert row[-2:] == ["0.01", "yes"]
     assert lines[-1] == f"results in {tmp_path / 'run'}"
 
@@ -253,7 +256,7 @@ def test_topics_are_given_by_their_role() -> None:
 
 def test_view_opens_the_recording(worked: Worked, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[Path] = []
-    monkeypatch.setattr("magfusion.cli.result_commands.open_viewer", opened.append)
+    monkeypatch.setattr("magfusion.results.recording.open_viewer", opened.append)
     run_command("view", worked.smoothed)
     run_command("view", worked.smoothed / "run.rrd")
     assert opened == [worked.smoothed / "run.rrd"] * 2

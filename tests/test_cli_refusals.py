@@ -186,7 +186,7 @@ BAD_OPTIONS = [
     ("smooth LOG -o OUT --window -1", "--window.*between 0.2 s.* and 60 s; got -1"),
     ("smooth LOG -o OUT --window nan", "--window.*got nan"),
     ("smooth LOG -o OUT --window x", "--window.*number.*see magfusion smooth --help"),
-    ("fix LOG -o OUT --window 0.02", "--window.*tones cannot be told apart"),
+    ("fix LOG -o OUT --window 0.02", "--window.*tones cannot be separated"),
     ("fix LOG -o OUT --step 0", "--step.*got 0"),
     ("fix LOG -o OUT --step 0.0001", "--step.*twentieth of the window, 0.02 s.*got 0.0001"),
     ("fix LOG -o OUT --window 30", "no window of 30 s is usable"),
@@ -281,7 +281,7 @@ def test_a_full_disk_is_told_in_one_sentence(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "x"))
 
-    monkeypatch.setattr("magfusion.pipeline.write_tum", full)
+    monkeypatch.setattr("magfusion.files.tum.write_tum", full)
     sentence = refuse("fix", worked.log, "-o", tmp_path / "deep" / "run")
     assert "No space left on device" in sentence
     assert "free some space" in sentence
@@ -296,7 +296,7 @@ def test_an_interrupt_ends_with_130_and_no_word(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("magfusion.cli.log_commands.run_fix", interrupted)
+    monkeypatch.setattr("magfusion.jobs.fix.run_fix", interrupted)
     with pytest.raises(SystemExit) as ended:
         main(["fix", str(worked.log), "-o", str(tmp_path / "run")])
     assert ended.value.code == 130

@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from magfusion.evaluation.consistency import average_nees_bounds
-from magfusion.evaluation.errors import trajectory_errors
-from magfusion.fusion.batch import SmootherSettings, smooth
-from magfusion.parameters import difference, initial_calibration
+from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.model.parameters import difference, initial_calibration
+from magfusion.model.site import BeaconSigma, MagnetometerSigma, Site
 from magfusion.receiver.windows import LockinSettings
-from magfusion.refinement import findings
+from magfusion.results.consistency import average_nees_bounds
+from magfusion.results.errors import trajectory_errors
+from magfusion.results.refinement import parameter_estimates
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import (
     SimulatedLog,
@@ -26,7 +27,6 @@ from magfusion.simulation.log import (
     simulate_fields,
     simulate_log,
 )
-from magfusion.site import BeaconSigma, MagnetometerSigma, Site
 
 pytestmark = pytest.mark.slow
 
@@ -35,6 +35,8 @@ INSTANTS = 5
 DURATION = 20.0  # s
 CONFIDENCE = 0.99
 ALL_GROUPS = ("beacons", "moments", "magnetometer", "extrinsics", "time-offset")
+# Noise that tunes itself would take a wrong declaration back.
+AS_DECLARED = SmootherSettings(loss=None, tune=False)
 APART = LockinSettings(window=0.4, step=0.4)  # windows that share no sample
 
 
@@ -93,7 +95,9 @@ def outcome(made: SimulatedLog, site: Site, settings: SmootherSettings) -> Outco
     for block in result.blocks:
         if block.kind == "phase":
             error[block.columns] = np.angle(np.exp(1j * error[block.columns]))
-    told = findings(result.declared, result.calibration, result.blocks, result.calibration_cov)
+    told = parameter_estimates(
+        result.declared, result.calibration, result.blocks, result.calibration_cov
+    )
     return Outcome(
         nees[np.linspace(3, len(nees) - 4, INSTANTS).astype(int)],
         error / np.sqrt(np.diagonal(result.calibration_cov)),
@@ -115,7 +119,7 @@ def from_phasors(seed: int, *, field_noise: float = 1.0, imu_noise: float = 1.0)
     fields = simulate_fields(made.true_site, epochs, field_noise * sigma, rng)
     fields = replace(fields, phasor_cov=fields.phasor_cov / field_noise**2)
     bare = replace(made.log, waveform=None, fields=fields)
-    return outcome(replace(made, log=bare), site, SmootherSettings())
+    return outcome(replace(made, log=bare), site, AS_DECLARED)
 
 
 def over_runs(one: Callable[[int], Outcome]) -> list[Outcome]:
@@ -156,7 +160,7 @@ def test_sigmas_are_honest_where_the_survey_is_uncertain(
     scale: float, synchronised: bool, groups: tuple[str, ...] | None
 ) -> None:
     site = surveyed(scale, synchronised=synchronised)
-    settings = SmootherSettings(estimate=groups)
+    settings = replace(AS_DECLARED, estimate=groups)
     outcomes = over_runs(lambda seed: from_waveform(seed, site, settings))
     nees = pose_nees(outcomes)
     assert between_instants(nees) > 0.3  # which is why only runs count
@@ -168,7 +172,7 @@ def test_sigmas_are_honest_where_the_survey_is_uncertain(
 
 
 def test_sigmas_are_honest_where_only_noise_is_left() -> None:
-    settings = SmootherSettings(lockin=APART)
+    settings = replace(AS_DECLARED, lockin=APART)
     site = surveyed(0.0)
     outcomes = over_runs(lambda seed: from_waveform(seed, site, settings))
     nees = pose_nees(outcomes)
@@ -179,7 +183,7 @@ def test_sigmas_are_honest_where_only_noise_is_left() -> None:
 
 def test_overlapping_windows_cost_a_little_honesty_on_the_safe_side() -> None:
     site = surveyed(0.0)
-    outcomes = over_runs(lambda seed: from_waveform(seed, site, SmootherSettings()))
+    outcomes = over_runs(lambda seed: from_waveform(seed, site, AS_DECLARED))
     # Each window weighs half; fast errors, which average over fewer, are then overstated.
     average = float(np.mean(pose_nees(outcomes)))
     low, high = average_nees_bounds(6, RUNS * INSTANTS, CONFIDENCE)
@@ -213,7 +217,7 @@ def test_white_noise_that_the_receiver_measures_need_not_be_declared() -> None:
 
     def one(seed: int) -> Outcome:
         made = recorded(site, np.random.default_rng(seed))
-        return outcome(made, declared, SmootherSettings(lockin=APART))
+        return outcome(made, declared, replace(AS_DECLARED, lockin=APART))
 
     nees = pose_nees(over_runs(one))
     assert honest(nees, RUNS * INSTANTS), np.mean(nees)

@@ -10,22 +10,24 @@ import pytest
 import yaml
 from example_site import mixed_site
 
-from magfusion.correlation import Correlation, Parameter, joined
 from magfusion.errors import InputError
-from magfusion.evaluation.consistency import average_nees_bounds
-from magfusion.evaluation.coverage import coverage
-from magfusion.evaluation.errors import trajectory_errors
-from magfusion.fixes.likelihood import fix_epochs
-from magfusion.fusion.batch import Smoothed, SmootherSettings, smooth
-from magfusion.parameters import (
+from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.files.site import load_site, save_site
+from magfusion.model.correlation import Component, Correlation, joined
+from magfusion.model.parameters import (
     GROUPS,
     choose_blocks,
     dimension,
     initial_calibration,
     prior_sigma,
 )
-from magfusion.prior import parameters_of, prior_root, prior_spread
-from magfusion.refinement import findings, refined_site
+from magfusion.model.prior import parameters_of, prior_sqrt_covariance, prior_sqrt_information
+from magfusion.model.site import BeaconSigma, MagnetometerSigma, Site
+from magfusion.results.consistency import average_nees_bounds
+from magfusion.results.coverage import coverage
+from magfusion.results.errors import trajectory_errors
+from magfusion.results.refinement import parameter_estimates, refined_site, result_site
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import (
     SimulationConfig,
@@ -35,8 +37,6 @@ from magfusion.simulation.log import (
     simulate_log,
 )
 from magfusion.simulation.motion import random_walk_motion
-from magfusion.site import BeaconSigma, MagnetometerSigma, Site
-from magfusion.site_file import load_site, save_site
 from magfusion.units import DEGREE
 
 RUNS = 40
@@ -53,7 +53,7 @@ def moved_together(site: Site) -> Site:
     share = COMMON**2 / (COMMON**2 + OWN**2)
     between = np.where(np.eye(len(names), dtype=bool), 1.0, share)
     correlation = Correlation(
-        tuple(Parameter("beacons", name, "position", i) for name in names for i in range(3)),
+        tuple(Component("beacons", name, "position", i) for name in names for i in range(3)),
         np.kron(between, np.eye(3)),
     )
     sensor = site.platform.magnetometer
@@ -78,7 +78,7 @@ def some_cov(site: Site, seed: int = 3) -> tuple[tuple, np.ndarray]:
 def refined(site: Site) -> tuple[Site, tuple, np.ndarray]:
     declared = initial_calibration(site, 0.0)
     blocks, cov = some_cov(site)
-    told = findings(declared, declared, blocks, cov)
+    told = parameter_estimates(declared, declared, blocks, cov)
     return refined_site(declared, blocks, cov, told, "a log"), blocks, cov
 
 
@@ -87,7 +87,7 @@ def test_a_refined_site_remembers_the_whole_covariance(tmp_path: Path) -> None:
     save_site(site, tmp_path / "site.yaml")
     again = load_site(tmp_path / "site.yaml")
     rows = [p.group != "phase" for p in parameters_of(blocks)]
-    spread = prior_spread(again, choose_blocks(again, GROUPS))[rows]
+    spread = prior_sqrt_covariance(again, choose_blocks(again, GROUPS))[rows]
     sigma = np.sqrt(np.diagonal(cov))[rows]
     found, expected = (spread @ spread.T) / sigma / sigma[:, None], cov[np.ix_(rows, rows)]
     np.testing.assert_allclose(found, expected / sigma / sigma[:, None], rtol=0.0, atol=1e-9)
@@ -96,7 +96,7 @@ def test_a_refined_site_remembers_the_whole_covariance(tmp_path: Path) -> None:
 def test_the_root_whitens_what_the_spread_draws() -> None:
     site, _, _ = refined(mixed_site())
     blocks = choose_blocks(site, GROUPS)
-    both = prior_root(site, blocks) @ prior_spread(site, blocks)
+    both = prior_sqrt_information(site, blocks) @ prior_sqrt_covariance(site, blocks)
     np.testing.assert_allclose(both, np.eye(len(both)), rtol=0.0, atol=1e-9)
 
 
@@ -107,7 +107,7 @@ def test_what_is_not_estimated_again_keeps_its_correlation() -> None:
     second = refined_site(initial_calibration(first, 0.0), blocks, cov, [], "another log")
     for groups, same in ((("beacons", "magnetometer"), True), (("beacons", "moments"), False)):
         own = choose_blocks(first, groups)
-        spread = [prior_spread(site, own) for site in (first, second)]
+        spread = [prior_sqrt_covariance(site, own) for site in (first, second)]
         assert np.allclose(spread[0], spread[1], rtol=1e-12, atol=0.0) == same
 
 
@@ -167,7 +167,7 @@ def test_a_spoilt_file_is_refused_with_its_name_and_a_remedy(tmp_path, spoil, sa
 
 
 def test_correlations_of_two_calibrations_stand_side_by_side() -> None:
-    names = tuple(Parameter("beacons", "A", "position", i) for i in range(3))
+    names = tuple(Component("beacons", "A", "position", i) for i in range(3))
     one = Correlation(names[:2], np.array([[1.0, 0.5], [0.5, 1.0]]))
     two = Correlation(names[2:], np.eye(1))
     both = joined([one, None, two])
@@ -229,7 +229,7 @@ def test_the_smoother_is_as_unsure_of_the_world_as_its_beacons_are_together() ->
     log = simulate_log(site, config, np.random.default_rng(1)).log
     for estimate in (None, ("time-offset",)):  # estimated, and considered
         for told, sigma in ((site, COMMON), (replace(site, correlation=None), 0.5 * COMMON)):
-            result = smooth(log, told, SmootherSettings(estimate=estimate))
+            result = smooth(log, told, SmootherSettings(estimate=estimate, loss=None, tune=False))
             assert result.states.pose_cov is not None
             middle = result.states.pose_cov[len(result.states) // 2]
             horizontal = np.sqrt(0.5 * np.trace(middle[3:5, 3:5]))
@@ -267,8 +267,7 @@ def exactly(site: Site) -> Site:
 
 def again(result: Smoothed) -> Site:
     """Return the site that a log refined, as the next log is smoothed with."""
-    told = findings(result.declared, result.calibration, result.blocks, result.calibration_cov)
-    return refined_site(result.calibration, result.blocks, result.calibration_cov, told, "first")
+    return result_site(result, "first")
 
 
 @pytest.mark.slow

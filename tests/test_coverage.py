@@ -8,7 +8,11 @@ from example_site import mixed_site
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from magfusion.evaluation.coverage import (
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.results.coverage import (
     best_extra_beacon,
     boundary_places,
     coverage,
@@ -16,12 +20,8 @@ from magfusion.evaluation.coverage import (
     usual_box,
     volume,
 )
-from magfusion.fixes.likelihood import fix_epochs
-from magfusion.parameters import initial_calibration
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import simulate_fields
-from magfusion.site import Site
-from magfusion.trajectory import Trajectory
 from magfusion.units import Array
 
 WINDOW = 0.4  # s

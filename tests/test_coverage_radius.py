@@ -49,7 +49,7 @@ def test_the_error_follows_the_sixth_power_without_a_knee(outcome: Outcome) -> N
 
 def test_far_away_the_direction_comes_near_a_random_one(outcome: Outcome) -> None:
     rng, true = np.random.default_rng(2), coverage_radius.direction(45.0)
-    found = coverage_radius.direction_from_normal(rng.standard_normal((100_000, 3)))
+    found = coverage_radius.eq_07_direction(rng.standard_normal((100_000, 3)))
     random = float(np.mean(coverage_radius.between_deg(found, true) ** 2))
     assert 0.85 * random < outcome.curves[0].eq7[-1] < random
 

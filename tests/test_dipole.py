@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.physics.dipole import dipole_field, dipole_gradient
+from magfusion.model.physics.dipole import dipole_field, dipole_gradient
 from magfusion.units import MU0_OVER_4PI
 
 EXACT = 1e-13  # relative; rounding of a few dozen operations

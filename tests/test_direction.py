@@ -7,20 +7,19 @@ import pytest
 import tilted_attitude
 from scipy.spatial.transform import Rotation
 
-from magfusion.fixes.candidates import beacon_directions
-from magfusion.fixes.direction import (
-    angles_as_printed,
-    attitude_as_printed,
-    attitude_from_vectors,
-    direction_from_normal,
-    locate_by_tensor,
-    normal_from_direction,
+from magfusion.estimation.snapshot.candidates import beacon_directions
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.physics.dipole import dipole_field
+from magfusion.model.site import Coil
+from magfusion.papers.p004_fingerprints.direction import attitude_from_vectors, locate_by_tensor
+from magfusion.papers.p004_fingerprints.equations import (
+    eq_05_normal,
+    eq_07_direction,
+    eq_21_attitude_as_printed,
+    eq_23_angles,
 )
-from magfusion.fixes.likelihood import fix_epochs
-from magfusion.parameters import initial_calibration
-from magfusion.physics.dipole import dipole_field
 from magfusion.receiver.ellipse import plane_normal
-from magfusion.site import Coil
 from magfusion.units import DEGREE, MU0_OVER_4PI
 
 MOMENT = 65.0  # A m^2
@@ -51,21 +50,21 @@ def test_a_direction_survives_its_normal() -> None:
     polar, azimuth = np.meshgrid(np.linspace(0.0, 89.99, 200), np.arange(-175.0, 180.0, 10.0))
     turned = Rotation.from_euler("ZY", np.stack([azimuth, polar], -1).reshape(-1, 2), degrees=True)
     direction = turned.apply([0.0, 0.0, 1.0])
-    found = direction_from_normal(1e-16 * normal_from_direction(direction))
+    found = eq_07_direction(1e-16 * eq_05_normal(direction))
     np.testing.assert_allclose(found, direction, atol=1e-12)
 
 
 def test_the_printed_angle_belongs_to_a_level_normal() -> None:
-    found = direction_from_normal(np.array([2.0, 0.0, 0.0]))
+    found = eq_07_direction(np.array([2.0, 0.0, 0.0]))
     assert np.arccos(found[2]) / DEGREE == pytest.approx(35.2644, abs=5e-5)
 
 
 def test_opposite_directions_share_a_normal_and_the_upper_one_is_returned() -> None:
     direction = directions()
-    normal = normal_from_direction(direction)
-    np.testing.assert_allclose(normal_from_direction(-direction), normal, atol=1e-15)
+    normal = eq_05_normal(direction)
+    np.testing.assert_allclose(eq_05_normal(-direction), normal, atol=1e-15)
     np.testing.assert_allclose(np.sum(normal**2, -1), 4.0 - 3.0 * direction[:, 2] ** 2, rtol=1e-12)
-    np.testing.assert_allclose(direction_from_normal(normal), upper(direction), atol=1e-11)
+    np.testing.assert_allclose(eq_07_direction(normal), upper(direction), atol=1e-11)
 
 
 def test_the_tensor_locates_any_beacon_of_two_axes_exactly_in_all_directions() -> None:
@@ -145,22 +144,18 @@ def test_noise_turns_the_directions_as_far_as_the_independent_analysis_found(
     tensor = direction_variance(
         source, direction, lambda y: locate_by_tensor(source, y).direction_beacon
     )
-    normal = direction_variance(
-        source, direction, lambda y: direction_from_normal(plane_normal(y[:, 0]))
-    )
+    normal = direction_variance(source, direction, lambda y: eq_07_direction(plane_normal(y[:, 0])))
     assert tensor == pytest.approx(by_tensor, rel=0.05)
     assert normal == pytest.approx(by_normal, rel=0.05)
 
 
 def test_equation_18_holds_for_turns_about_the_beacons_axis_only() -> None:
-    normal = normal_from_direction(directions())
+    normal = eq_05_normal(directions())
     yaw, tilt = (Rotation.from_euler(axis, 10.0, degrees=True) for axis in "zx")
-    direction = direction_from_normal(normal)
-    turned = direction_from_normal(yaw.apply(normal))
+    direction = eq_07_direction(normal)
+    turned = eq_07_direction(yaw.apply(normal))
     np.testing.assert_allclose(turned, yaw.apply(direction), atol=1e-12)
-    apart = np.linalg.norm(
-        direction_from_normal(tilt.apply(normal)) - tilt.apply(direction), axis=-1
-    )
+    apart = np.linalg.norm(eq_07_direction(tilt.apply(normal)) - tilt.apply(direction), axis=-1)
     assert np.median(apart) > 0.05
 
 
@@ -168,10 +163,10 @@ def test_least_squares_as_printed_returns_the_rotation_of_true_pseudo_directions
     world = directions(40).reshape(10, 4, 3)
     attitude = Rotation.random(10, random_state=4).as_matrix()  # sensor_from_world
     sensor = world @ np.swapaxes(attitude, -1, -2)
-    found = attitude_as_printed(sensor, world)
+    found = eq_21_attitude_as_printed(sensor, world)
     np.testing.assert_allclose(found, attitude, atol=1e-9)
     gamma, psi, lam = Rotation.from_matrix(found).as_euler("ZYX").T
-    np.testing.assert_allclose(angles_as_printed(found), np.stack([psi, gamma, lam], -1), atol=1e-7)
+    np.testing.assert_allclose(eq_23_angles(found), np.stack([psi, gamma, lam], -1), atol=1e-7)
 
 
 def test_the_phasors_of_a_single_beacon_give_the_attitude_exactly() -> None:

@@ -15,8 +15,9 @@ from scipy.special import spherical_jn
 from scipy.stats import chi2
 
 from magfusion.errors import InputError
-from magfusion.physics.disturbance import MU0, induced_field, sphere_polarizability
-from magfusion.records.log import read_log
+from magfusion.files.log import read_log
+from magfusion.model.physics.disturbance import MU0, induced_field, sphere_polarizability
+from magfusion.model.site import Site
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.disturbance import (
     CLEARANCE,
@@ -32,7 +33,6 @@ from magfusion.simulation.field import synchronised_drives
 from magfusion.simulation.log import SimulationConfig, simulate_fields, simulate_log
 from magfusion.simulation.motion import Motion, static_motion
 from magfusion.simulation.waveform import simulate_waveform
-from magfusion.site import Site
 from magfusion.units import NANOTESLA, Array
 
 TWO_PI = 2.0 * np.pi
@@ -273,11 +273,11 @@ def test_simulate_draws_iron_and_counts_it(
 @pytest.mark.parametrize(
     ("iron", "told"),
     [
-        ("-1", "--iron.*greater than or equal to 0"),
+        ("-1", "--iron must lie between 0 and 200"),
         ("2.5", "--iron.*integer"),
         ("many", "--iron.*integer"),
         ("nan", "--iron.*integer"),
-        ("5000", "--iron.*less than or equal to 200"),
+        ("5000", "--iron must lie between 0 and 200"),
     ],
 )
 def test_iron_that_cannot_be_is_refused(

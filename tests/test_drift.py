@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from scipy.stats import t as student
 
-from magfusion.evaluation.drift import (
+from magfusion.results.drift import (
     DAY,
     THREE_SIGMA,
     ErrorSeries,
@@ -36,21 +37,42 @@ def test_a_straight_line_has_its_slope_and_no_error():
     assert slope.standard_error < 1e-9
 
 
-@pytest.mark.parametrize("time_constant", [60.0, 600.0, 3600.0])
-def test_the_standard_error_of_one_world_is_that_of_many(time_constant):
-    rng = np.random.default_rng(4)
-    told = [slope_of_one(MINUTES, correlated(rng, time_constant)) for _ in range(300)]
-    scatter = np.std([s.per_day for s in told])
-    claimed = np.sqrt(np.mean([s.standard_error**2 for s in told]))
-    assert 0.75 < claimed / scatter < 1.25
+def outside(draws, draw, confidence):
+    """Return how often the interval of one world's slope leaves out the true one, none."""
+    left_out = 0
+    for _ in range(draws):
+        slope = slope_of_one(MINUTES[:180], draw())
+        reach = student.ppf(0.5 + 0.5 * confidence, slope.freedom) * slope.standard_error
+        left_out += abs(slope.per_day) > reach
+    return left_out / draws
 
 
-def test_neighbours_taken_for_independent_would_claim_too_little():
-    """Why blocks: with one for four values each the error of a slow series is far too small."""
+@pytest.mark.parametrize("hours", [1 / 60, 0.2, 1.0, 5.0])
+def test_the_interval_of_one_world_holds_however_long_its_errors_are_alike(hours):
+    """Of three hours: some may be left out by chance, 5 % and three deviations of 40 draws."""
     rng = np.random.default_rng(4)
-    told = [slope_of_one(MINUTES, correlated(rng, 3600.0), len(MINUTES) // 4) for _ in range(40)]
-    scatter = np.std([s.per_day for s in told])
-    assert np.sqrt(np.mean([s.standard_error**2 for s in told])) < 0.3 * scatter
+    assert outside(40, lambda: correlated(rng, 3600.0 * hours)[:180], 0.95) <= 0.154
+
+
+def test_a_line_through_a_walk_is_no_drift():
+    """As a bias walks: with blocks taken for independent one in two such walks drifts."""
+    rng = np.random.default_rng(5)
+
+    def walk():
+        return np.cumsum(rng.standard_normal(180)) + 3.0 * rng.standard_normal(180)
+
+    assert outside(80, walk, 0.999) <= 0.03
+    blocks = np.stack([np.mean(walk().reshape(12, 15), axis=1) for _ in range(60)], axis=1)
+    line, left, *_ = np.polyfit(np.arange(12.0), blocks, 1, full=True)
+    standard_error = np.sqrt(left / 10.0 / 143.0)  # the sum of the squared distances of 12 blocks
+    assert np.mean(np.abs(line[0]) > 2.23 * standard_error) > 0.4
+
+
+def test_a_line_through_errors_that_forget_soon_is_found_at_once():
+    rng = np.random.default_rng(6)
+    slope = slope_of_one(MINUTES[:180], 80.0 * MINUTES[:180] / DAY + correlated(rng, 60.0)[:180])
+    assert slope.verdict(5.0) == "fail"
+    assert abs(slope.per_day - 80.0) < slope.margin
 
 
 def test_the_interval_of_eight_worlds_holds_the_slope_as_often_as_it_says():

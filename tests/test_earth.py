@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magfusion.errors import InputError
-from magfusion.physics.earth import earth_field_world, gravity
+from magfusion.model.physics.earth import earth_field_world, gravity
 from magfusion.units import NANOTESLA
 
 # World Magnetic Model 2020, technical report, table of test values: north, east, down in nT.  It

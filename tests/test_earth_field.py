@@ -12,23 +12,29 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.cli import main
 from magfusion.errors import InputError
-from magfusion.evaluation.errors import trajectory_errors
-from magfusion.fusion.batch import SmootherSettings, smooth
-from magfusion.fusion.earth import check_earth, earth_cov
-from magfusion.fusion.hearing import HEARD, heard
-from magfusion.fusion.online import Navigator, NavigatorSettings
-from magfusion.fusion.source import open_source
-from magfusion.fusion.state import as_trajectory
-from magfusion.observation import observe_earth
-from magfusion.parameters import choose_blocks, difference, initial_calibration, retract
-from magfusion.records.log import write_log
-from magfusion.records.open import open_log
-from magfusion.records.samples import FieldSamples, SteadyFields, Waveform
+from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.estimation.demodulation import demodulated
+from magfusion.estimation.integrity.detection import DETECTION_CHI_SQUARE, detected
+from magfusion.estimation.measurements.earth import check_earth, earth_cov
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.state import as_trajectory
+from magfusion.files.log import write_log
+from magfusion.files.open import open_log
+from magfusion.files.site import load_site, save_site
+from magfusion.model.field import observe_earth
+from magfusion.model.parameters import (
+    PARAMETERS,
+    choose_blocks,
+    difference,
+    initial_calibration,
+    retract,
+)
+from magfusion.model.samples import FieldSamples, SteadyFields, Waveform
+from magfusion.model.site import Magnetometer, MagnetometerSigma
+from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.simulation.motion import Rests
-from magfusion.site import Magnetometer, MagnetometerSigma
-from magfusion.site_file import load_site, save_site
 
 REAL = Path(__file__).parents[1].parent / "shared" / "logs" / "turn_miscalibrated"
 STEP_WORLD = np.array([5e-6, 0.0, 0.0])  # T; turns the field by 15 degrees, its size by 0.5 %
@@ -92,14 +98,14 @@ def test_the_size_of_a_perfect_sensors_reading_knows_no_attitude():
 
 def test_offset_and_field_are_calibration_only_where_the_field_is_measured():
     site = demo_site()
-    names = {b.name for b in choose_blocks(site, earth=True)}
+    names = {b.name for b in choose_blocks(site, parameters=PARAMETERS)}
     extra = {"magnetometer.offset", "earth.declination", "earth.strength"}
     assert names - {b.name for b in choose_blocks(site)} == extra
 
 
 def test_a_step_of_the_earth_field_is_found_again():
     site = demo_site()
-    blocks = choose_blocks(site, ["earth", "magnetometer"], earth=True)
+    blocks = choose_blocks(site, ["earth", "magnetometer"], parameters=PARAMETERS)
     declared = initial_calibration(site, 0.0)
     sigma = np.concatenate([b.sigma for b in blocks])
     step = 3.0 * sigma * np.random.default_rng(1).normal(size=len(sigma))
@@ -133,15 +139,15 @@ def test_noise_is_no_beacon_and_a_window_at_the_edge_of_silence_neither():
         phasor_sensor=phasor[0] + 1j * phasor[1],
         phasor_cov=np.broadcast_to(cov * np.eye(3), (n, 1, 3, 3)),
     )
-    assert HEARD < (0.1**2 / 0.001**2)
-    np.testing.assert_array_equal(heard(samples)[:, 0], np.arange(n) < 18)
+    assert DETECTION_CHI_SQUARE < (0.1**2 / 0.001**2)
+    np.testing.assert_array_equal(detected(samples)[:, 0], np.arange(n) < 18)
 
 
 def test_a_site_without_the_field_is_refused_in_one_sentence():
     site = demo_site()
     with pytest.raises(InputError, match="no Earth field"):
         check_earth(replace(site, earth_field_world=None))
-    with pytest.raises(InputError, match="too little to tell a heading"):
+    with pytest.raises(InputError, match="too little to determine a heading"):
         Navigator(
             replace(site, earth_field_world=np.array([0.0, 5e-7, 6e-5])),
             NavigatorSettings(earth=True),
@@ -211,7 +217,7 @@ def gap():
 def test_the_steady_field_of_a_turning_window_is_that_of_its_centre(gap):
     site, simulated, _ = gap
     true = replace(simulated.true_site, beacons=site.beacons)
-    steady = open_source(simulated.log, true, None).steady(initial_calibration(true, 0.0))
+    steady = demodulated(simulated.log, true, None).steady(initial_calibration(true, 0.0))
     poses = simulated.motion.trajectory(steady.time)
     sensor = true.platform.magnetometer
     expected = observe_earth(sensor, poses.world_from_body, site.earth_field_world)
@@ -246,8 +252,8 @@ def test_no_beacon_at_all_leaves_an_attitude_and_says_that_the_heading_is_the_fi
 
 def test_phasors_alone_are_refused(gap):
     site, simulated, _ = gap
-    source = open_source(simulated.log, site, None)
-    phasors = source.first(initial_calibration(site, 0.0))
+    source = demodulated(simulated.log, site, None)
+    phasors = source.fields
     with pytest.raises(InputError, match="only phasors"):
         smooth(
             replace(simulated.log, waveform=None, fields=phasors),
@@ -333,7 +339,7 @@ def test_the_scenario_prints_a_table_and_one_object(monkeypatch, capsys):
 @pytest.mark.parametrize("command", ["smooth", "navigate"])
 def test_the_commands_refuse_phasors_with_the_earth_field(gap, tmp_path, capsys, command):
     site, simulated, _ = gap
-    phasors = open_source(simulated.log, site, None).first(initial_calibration(site, 0.0))
+    phasors = demodulated(simulated.log, site, None).fields
     write_log(replace(simulated.log, waveform=None, fields=phasors), tmp_path / "log")
     save_site(site, tmp_path / "site.yaml")
     given = [command, str(tmp_path / "log"), "--site", str(tmp_path / "site.yaml"), "--earth"]

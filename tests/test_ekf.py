@@ -6,21 +6,28 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.fusion.earth import earth_cov, with_earth
-from magfusion.fusion.ekf import ErrorStateFilter
-from magfusion.fusion.epoch import field_rows, single
-from magfusion.fusion.factors import FieldMeasurements
-from magfusion.fusion.navigator import SlidingWindow
-from magfusion.fusion.propagation import propagate
-from magfusion.fusion.state import MOTION, State, between, moved
-from magfusion.fusion.walk import Walk, calibration_walk
-from magfusion.observation import observe_earth
-from magfusion.parameters import GROUPS, choose_blocks, dimension, initial_calibration, prior_sigma
-from magfusion.records.samples import ImuSamples, SteadyFields
+from magfusion.estimation.ekf import ErrorStateFilter, measured_rows
+from magfusion.estimation.fixed_lag import SlidingWindow
+from magfusion.estimation.measurements.earth import earth_measurement
+from magfusion.estimation.measurements.phasors import field_phasors
+from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
+from magfusion.estimation.process_noise import ProcessNoise, calibration_process_noise
+from magfusion.estimation.propagation import propagate
+from magfusion.estimation.state import MOTION, State, between, moved
+from magfusion.model.field import observe_earth
+from magfusion.model.parameters import (
+    GROUPS,
+    PARAMETERS,
+    PHASOR_PARAMETERS,
+    choose_blocks,
+    dimension,
+    initial_calibration,
+    prior_sigma,
+)
+from magfusion.model.samples import ImuSamples, SteadyFields
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.log import simulate_fields
-from magfusion.trajectory import Trajectory
-from magfusion.weights import measurement_cov, paired_whitening, stacked
 
 SEED = 11
 
@@ -58,34 +65,30 @@ def an_imu(begin, end, rng):
 
 
 def an_epoch(site, state, blocks, rng, earth=False):
-    """Return the factors of an epoch measured somewhat beside the state."""
+    """Return the measurements of an epoch somewhat beside the state."""
     true = moved(state, blocks, 0.3 * np.sqrt(np.diag(state.cov)) * rng.normal(size=len(state.cov)))
     pose = Trajectory(np.array([state.time]), true.world_from_body[None], true.position_world[None])
     samples = simulate_fields(site, pose, 1e-9, rng)
-    cov = measurement_cov(site, samples)
-    measurements = FieldMeasurements(
-        time=samples.time,
-        measured=stacked(samples.phasor_sensor),
-        root=paired_whitening(cov, samples.valid),
-        rate_body=np.array([[0.3, -0.2, 0.5]]),
-        applied_offset=site.platform.imu.time_offset,
-        by_time_offset=1e-7 * rng.normal(size=(1, len(site.channels), 6)),
-    )
+    rate, offset = np.array([[0.3, -0.2, 0.5]]), site.platform.imu.time_offset
+    real, imaginary = 1e-7 * rng.normal(size=(2, 1, len(site.channels), 3))
+    by_offset, now = real + 1j * imaginary, np.zeros(1, dtype=np.int64)
+    out = [field_phasors(site, samples, now, pose, rate, offset, 1.0, by_offset)]
     if earth:
         there = true.calibration.site
         seen = observe_earth(
             there.platform.magnetometer, true.world_from_body, there.earth_field_world
         )
         steady = SteadyFields(samples.time, seen.measured_sensor[None], 1e-18 * np.eye(3)[None])
-        measurements = with_earth(measurements, steady, earth_cov(site, steady), 0.4)
-    return single(measurements, blocks)
+        field = earth_measurement(site, steady, now, rate, offset, 0.4)
+        out.append(replace(field, robust=False))
+    return out
 
 
 def one_interval(groups, synchronised=True, seed=SEED, earth=False):
     """Return a start, where the IMU leads from it, and an epoch measured there."""
     rng = np.random.default_rng(seed)
     site = a_site(synchronised)
-    blocks = choose_blocks(site, groups, earth=earth)
+    blocks = choose_blocks(site, groups, parameters=PARAMETERS if earth else PHASOR_PARAMETERS)
     start = a_state(site, blocks, rng)
     later = start.time + 0.4
     predicted = propagate(
@@ -116,14 +119,14 @@ def test_one_update_of_the_filter_is_one_gauss_newton_step_of_the_graph(
     groups, synchronised, with_fields, rest, earth
 ):
     start, blocks, predicted, epoch = one_interval(groups, synchronised, earth=earth)
-    fields = epoch if with_fields else None
+    measurements = epoch if with_fields else []
+    if rest is not None:
+        measurements = [*measurements, ZeroVelocity(np.zeros(1, dtype=int), np.array([rest]))]
     light = ErrorStateFilter(start, blocks)
-    light.absorb(predicted, fields, rest)
-    still = Walk(blocks, np.zeros(dimension(blocks)))
-    window = SlidingWindow(
-        start, blocks, 10.0, still, epoch.measurements.applied_offset, earth=earth
-    )
-    window.absorb(predicted, fields, rest)
+    light.absorb(predicted, measurements)
+    still = ProcessNoise(blocks, np.zeros(dimension(blocks)))
+    window = SlidingWindow(start, blocks, 10.0, still)
+    window.absorb(predicted, measurements)
     sigma = np.sqrt(np.diag(light.state.cov))
     apart = between(light.state, window.state, blocks) / sigma
     went = between(predicted.state, light.state, blocks) / sigma
@@ -135,7 +138,7 @@ def test_one_update_of_the_filter_is_one_gauss_newton_step_of_the_graph(
 def test_the_step_of_the_test_is_a_long_one():
     start, blocks, predicted, epoch = one_interval(GROUPS)
     light = ErrorStateFilter(start, blocks)
-    light.absorb(predicted, epoch, None)
+    light.absorb(predicted, epoch)
     went = between(predicted.state, light.state, blocks)
     assert np.max(np.abs(went) / np.sqrt(np.diag(light.state.cov))) > 1.0
 
@@ -150,7 +153,7 @@ def test_moving_there_and_asking_the_way_are_inverse():
 def test_the_rows_of_an_epoch_are_its_derivative(earth):
     _, blocks, predicted, epoch = one_interval(GROUPS, earth=earth)
     state = predicted.state
-    rows = field_rows(epoch, state)
+    _, jacobian = measured_rows(epoch, state, blocks)
     scale = 1e-6 * np.sqrt(np.diag(state.cov))
     for k in range(len(state.cov)):
         if 6 <= k < MOTION:
@@ -158,17 +161,17 @@ def test_the_rows_of_an_epoch_are_its_derivative(earth):
         step = np.zeros(len(state.cov))
         step[k] = scale[k]
         ahead, behind = (
-            field_rows(epoch, moved(state, blocks, sign * step)).error for sign in (1.0, -1.0)
+            measured_rows(epoch, moved(state, blocks, sign * step), blocks)[0] for sign in (1, -1)
         )
         found = (ahead - behind) / (2.0 * scale[k])
-        size = np.max(np.abs(rows.jacobian[:, k]))
-        assert np.max(np.abs(found - rows.jacobian[:, k])) < 1e-5 * size
+        size = np.max(np.abs(jacobian[:, k]))
+        assert np.max(np.abs(found - jacobian[:, k])) < 1e-5 * size
 
 
 def test_the_calibration_gains_variance_only_where_things_drift():
     site = a_site(synchronised=False)
-    blocks = choose_blocks(site, GROUPS, earth=True)
-    walk = calibration_walk(blocks).variance
+    blocks = choose_blocks(site, GROUPS, parameters=PARAMETERS)
+    walk = calibration_process_noise(site, blocks).variance
     drifting = ("log_moment", "phase", "drift", "offset", "declination", "strength")
     for block in blocks:
         drifts = block.kind in drifting
@@ -205,7 +208,7 @@ def test_a_frequency_that_changes_now_has_not_turned_the_phase_before():
     """The variance of the phase now is that of its own walk, however long the clock has run."""
     site = a_site(synchronised=False)
     blocks = choose_blocks(site, ("phase",))
-    walk = calibration_walk(blocks)
+    walk = calibration_process_noise(site, blocks)
     calibration = initial_calibration(site, 0.0)
     for time in (0.0, 1e5):
         gained = walk.cov(calibration, time, 2.0)

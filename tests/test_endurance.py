@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from magfusion.errors import InputError
-from magfusion.fixes.likelihood import fix_epochs
-from magfusion.parameters import initial_calibration
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.parameters import initial_calibration
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.drift import COPPER_PER_KELVIN, Drift
 from magfusion.simulation.endurance import (

@@ -8,9 +8,9 @@ from evo.core.trajectory import PosePath3D
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.evaluation.consistency import average_nees_bounds, pooled_nees
-from magfusion.evaluation.errors import relative_errors, time_pairs, trajectory_errors
-from magfusion.trajectory import Trajectory
+from magfusion.model.trajectory import Trajectory
+from magfusion.results.consistency import average_nees_bounds, pooled_nees
+from magfusion.results.errors import relative_errors, time_pairs, trajectory_errors
 
 POSES = 80
 

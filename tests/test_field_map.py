@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from derivatives import central_difference, relative_to_group
 
-from magfusion.field_map import FieldMap
-from magfusion.observation import model_error_cov
-from magfusion.records.samples import FieldSamples
+from magfusion.model.field import model_error_cov
+from magfusion.model.field_map import FieldMap
+from magfusion.model.noise import measurement_cov, model_error
+from magfusion.model.samples import FieldSamples
 from magfusion.simulation.demo_site import demo_site
-from magfusion.weights import measurement_cov, model_error
 
 LENGTH, GAIN, TURN, RESIDUAL = 0.9, 0.2, 0.15, 0.01
 PRIOR = np.diag([GAIN, TURN, TURN, TURN]) ** 2

@@ -13,11 +13,11 @@ import yaml
 from conftest import change_table
 
 from magfusion.errors import InputError
-from magfusion.field_map import FieldMap
-from magfusion.field_map_file import read_field_maps, write_field_maps
+from magfusion.files.field_map import read_field_maps, write_field_maps
+from magfusion.files.site import load_site, save_site
+from magfusion.model.field_map import FieldMap
+from magfusion.model.site import Site
 from magfusion.simulation.demo_site import demo_site
-from magfusion.site import Site
-from magfusion.site_file import load_site, save_site
 
 ASKED = np.array([[1.0, 2.0, 0.5], [3.0, 1.0, 1.5]])
 

@@ -8,13 +8,9 @@ import tilted_attitude
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.fixes.fingerprint import (
-    FingerprintDatabase,
-    fingerprint_database,
-    locate_by_differential_range,
-    locate_by_neighbours,
-)
-from magfusion.fixes.published import (
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.papers.p004_fingerprints.algorithms import (
     TOO_FEW_BEACONS,
     TOO_FEW_POINTS,
     Method,
@@ -23,13 +19,18 @@ from magfusion.fixes.published import (
     fix_as_published,
     locate_by_lines,
 )
-from magfusion.fixes.rssi import RssiLines, distances
-from magfusion.jobs.published import rotating_fields, rotation_axis_world
+from magfusion.papers.p004_fingerprints.equations import distances
+from magfusion.papers.p004_fingerprints.fingerprint import (
+    FingerprintDatabase,
+    fingerprint_database,
+    locate_by_differential_range,
+    locate_by_neighbours,
+)
+from magfusion.papers.p004_fingerprints.rotating import rotating_fields, rotation_axis_world
+from magfusion.papers.p004_fingerprints.rssi import RssiLines
 from magfusion.receiver.ellipse import plane_normal
-from magfusion.records.samples import FieldSamples
 from magfusion.simulation.field import phasors_world
 from magfusion.simulation.worlds import S0, draw_world, ring
-from magfusion.site import Site
 from magfusion.units import DEGREE, Array
 
 METHODS: tuple[Method, ...] = ("paper-lines", "paper-knn", "paper-knn-nt", "paper-fingerprint")

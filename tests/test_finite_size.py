@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from derivatives import central_difference
 
-from magfusion.physics.dipole import dipole_field
-from magfusion.physics.finite_size import coil_coupling, disc_kappa, square_kappa
-from magfusion.physics.solenoid import loop_field
+from magfusion.model.physics.dipole import dipole_field
+from magfusion.model.physics.finite_size import coil_coupling, disc_kappa, square_kappa
+from magfusion.model.physics.solenoid import loop_field
 
 OFFSET = np.array([0.31, -0.22, 0.4])  # m
 MOMENT = np.array([0.4, 1.1, -0.7])  # A m^2

@@ -10,15 +10,15 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from magfusion.errors import EstimationError
-from magfusion.fixes.fix import Gravity
-from magfusion.fixes.likelihood import HYPOTHESES, fix_epochs
-from magfusion.fixes.problem import CHUNK
-from magfusion.parameters import initial_calibration, predict_channels
+from magfusion.estimation.snapshot.fix import Gravity
+from magfusion.estimation.snapshot.likelihood import HYPOTHESES, fix_epochs
+from magfusion.estimation.snapshot.problem import CHUNK
+from magfusion.model.noise import measurement_cov
+from magfusion.model.parameters import initial_calibration, predict_channels
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.field import Drives
 from magfusion.simulation.log import simulate_fields
-from magfusion.trajectory import Trajectory
-from magfusion.weights import measurement_cov
 
 SIGMA = 3e-10  # T, of a phasor's component
 # Where candidates must agree to count as one solution without noise, and costs as zero.

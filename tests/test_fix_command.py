@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import Refuse, Worked, run_command
 
-from magfusion.site_file import load_site, save_site
+from magfusion.files.site import load_site, save_site
 
 
 def report_of(run: Path) -> dict[str, object]:
@@ -60,3 +60,25 @@ def test_rivals_are_told_in_the_report_the_table_and_on_the_screen(
     best = [r for r, h in zip(table["relation"], table["hypothesis"], strict=True) if h == 0]
     assert set(best) == {"best"}
     assert f"mirror {name}" in table["relation"]
+
+
+def test_every_fix_has_a_verdict_a_level_and_what_was_left_out(
+    worked: Worked, tmp_path: Path, refuse: Refuse
+) -> None:
+    rows = pq.read_table(worked.fixes / "trajectory.parquet").to_pydict()
+    report = report_of(worked.fixes)
+    assert report["verdict"] == "trustworthy"
+    assert set(rows["verdict"]) <= {"trustworthy", "doubtful"}
+    levels = [level for level in rows["protection_level_m"] if level is not None]
+    assert len(levels) >= 0.9 * len(rows["time_ns"])
+    run_command("fix", worked.log, "-o", tmp_path / "run", "--risk", 1e-2)
+    wider = pq.read_table(tmp_path / "run" / "trajectory.parquet").to_pydict()
+    both = zip(rows["protection_level_m"], wider["protection_level_m"], strict=True)
+    assert all(a > b for a, b in both if a is not None and b is not None)
+    table = pq.read_table(worked.fixes / "fixes.parquet").to_pydict()
+    assert {"protection_level_m", "protection_level_deg", "excluded", "verdict"} <= table.keys()
+    assert "--risk must lie between" in refuse(
+        "fix", worked.log, "-o", tmp_path / "no", "--risk", 0.0
+    )
+    options = ("--method", "paper-lines", "--survey", "x", "--risk", 1e-3)
+    assert "no protection level" in refuse("fix", worked.log, "-o", tmp_path / "no", *options)

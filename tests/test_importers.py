@@ -34,10 +34,10 @@ from example_bag import (
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from magfusion.errors import InputError
-from magfusion.records.log import read_log, write_log
-from magfusion.records.open import open_log
-from magfusion.records.rosbag import Topics
-from magfusion.records.samples import Log
+from magfusion.files.bag import Topics
+from magfusion.files.log import read_log, write_log
+from magfusion.files.open import open_log
+from magfusion.model.samples import Log
 
 
 def _assert_samples(log: Log) -> None:

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.fusion.inertial import (
+from magfusion.estimation.preintegration import (
     cut_at_epochs,
     low_passed,
     low_passed_rate_at,
     motion_at,
     preintegrate,
 )
-from magfusion.records.samples import ImuSamples
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import ImuModel
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.motion import Motion, Rests, turning_motion
-from magfusion.site import ImuModel
-from magfusion.trajectory import Trajectory
 
 GRAVITY = 9.81
 DURATION = 40.0  # s

@@ -12,13 +12,13 @@ import pytest
 from example_log import EPOCH_NS, example_fields, example_log, example_trajectory
 
 from magfusion.errors import InputError
-from magfusion.records.fields import order_channels
-from magfusion.records.log import read_log, write_log
-from magfusion.records.samples import ImuSamples, Log
-from magfusion.records.table import ROWS_PER_GROUP
-from magfusion.records.trajectory_table import read_trajectory, write_trajectory
+from magfusion.files.fields import order_channels
+from magfusion.files.log import read_log, write_log
+from magfusion.files.table import ROWS_PER_GROUP
+from magfusion.files.trajectory_table import read_trajectory, write_trajectory
+from magfusion.model.samples import ImuSamples, Log
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import demo_site
-from magfusion.trajectory import Trajectory
 
 SHARED = Path(__file__).parents[1].parent / "shared"
 
@@ -204,7 +204,7 @@ def test_a_failed_write_leaves_the_former_log_and_nothing_else(
 
     log = example_log()
     write_log(log, tmp_path / "walk")
-    monkeypatch.setattr("magfusion.records.log.write_trajectory", fail)
+    monkeypatch.setattr("magfusion.files.log.write_trajectory", fail)
     with pytest.raises(OSError, match="disk is full"):
         write_log(example_log(seed=2), tmp_path / "walk")
     _assert_same(read_log(tmp_path / "walk"), log)

@@ -22,8 +22,8 @@ from magnetometer_calibrations_compared import (
 )
 from scipy.spatial.transform import Rotation
 
-from magfusion.calibration import magnetometer_graph as graph
 from magfusion.calibration.ellipsoid import fit_ellipsoid, fit_ellipsoid_gravity
+from magfusion.calibration.graph import Estimate
 from magfusion.calibration.magnetometer import (
     MagnetometerFit,
     field_from_measured,
@@ -33,14 +33,14 @@ from magfusion.calibration.magnetometer import (
     refined,
     to_paper,
 )
-from magfusion.calibration.magnetometer_graph import Epochs, Prior, fit_graph
-from magfusion.calibration.twelve_positions import (
-    SENSOR_FROM_NED,
+from magfusion.calibration.magnetometer_graph import Epochs, Prior, Readings, fit_graph
+from magfusion.errors import EstimationError
+from magfusion.papers.p001_magnetometer.equations import SENSOR_FROM_NED
+from magfusion.papers.p001_magnetometer.twelve_positions import (
     closed_form,
     least_squares,
     positions,
 )
-from magfusion.errors import EstimationError
 from magfusion.simulation.demo_site import demo_site
 
 SIZE = float(np.linalg.norm(FIELD_NED))
@@ -182,12 +182,45 @@ def test_what_the_ellipsoid_leaves_is_a_rotation_and_gravity_takes_it_off() -> N
     assert nees(with_gravity, sensors) == pytest.approx(12.0, abs=1.2)
 
 
+def _cap(half_angle: float, noise: float, seed: int) -> np.ndarray:
+    """Return readings of a unit field on a cap of the sphere."""
+    rng = np.random.default_rng(seed)
+    height = rng.uniform(np.cos(half_angle), 1.0, 60)
+    turn = rng.uniform(0.0, 2.0 * np.pi, 60)
+    flat = np.sqrt(1.0 - height**2)
+    points = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=-1)
+    return points + noise * rng.standard_normal(points.shape)
+
+
 def test_readings_on_one_side_are_no_ellipsoid() -> None:
     readings = np.array([[1.0, 0.0, 0.0]]) + 1e-3 * np.random.default_rng(1).normal(size=(20, 3))
     with pytest.raises(EstimationError, match="ellipsoid"):
         fit_ellipsoid(readings, 1.0)
     with pytest.raises(EstimationError, match="determine"):
         fit_ellipsoid(readings[:5], 1.0)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_what_is_no_ellipsoid_is_recognised_by_a_margin(seed: int) -> None:
+    """Whichever way the processor rounds: no singular matrix has to come about for it."""
+    blob = np.array([1.0, 0.0, 0.0]) + 1e-3 * np.random.default_rng(seed).normal(size=(20, 3))
+    for readings in (blob, _cap(np.radians(20.0), 1e-3, seed), _cap(np.radians(40.0), 1e-2, seed)):
+        with pytest.raises(EstimationError, match="ellipsoid"):
+            fit_ellipsoid(readings, 1.0)
+    half = fit_ellipsoid(_cap(np.radians(90.0), 1e-3, seed), 1.0)
+    np.testing.assert_allclose(half.matrix, np.eye(3), rtol=0.0, atol=0.02)
+
+
+def test_readings_in_planes_leave_the_ellipsoid_open() -> None:
+    angle = np.linspace(0.0, 6.2, 40)
+    zero, circle = np.zeros(40), (np.cos(angle), np.sin(angle))
+    level = np.stack([*circle, zero], axis=-1)
+    two = np.concatenate([level, np.stack([circle[0], zero, circle[1]], axis=-1)])
+    for readings in (level, two):
+        with pytest.raises(EstimationError, match="ellipsoid"):
+            fit_ellipsoid(readings, 1.0)
+    three = np.concatenate([two, np.stack([zero, *circle], axis=-1)])
+    np.testing.assert_allclose(fit_ellipsoid(three, 1.0).matrix, np.eye(3), rtol=0.0, atol=1e-9)
 
 
 def hand_graph(
@@ -247,15 +280,15 @@ def test_the_rows_of_the_graph_are_the_derivatives_of_their_residuals() -> None:
     matrix = np.eye(3) + 0.1 * rng.standard_normal((3, 3))
     offset = 1e-6 * rng.standard_normal(3)
     prior = Prior(mounting, matrix, offset, PRIOR_COV, FIELD_LEVEL, 0.1, 9.8, 0.1)
-    problem = graph._Problem(epochs, prior)
+    problem = Readings(epochs, prior)
     calibration = problem.declared + 0.1 * rng.standard_normal(16)
 
-    def state(turn: np.ndarray, step: np.ndarray) -> graph._State:
+    def state(turn: np.ndarray, step: np.ndarray) -> Estimate:
         values = gtsam.Values()
         for i, attitude in enumerate(attitudes):
             moved = gtsam.Rot3(attitude).retract(turn)
             values.insert(gtsam.symbol("x", i), moved)
-        return graph._State(values, calibration + step)
+        return Estimate(values, calibration + step)
 
     still, no_step = np.zeros(3), np.zeros(16)
     _, by_attitude, by_calibration = problem.rows(state(still, no_step))

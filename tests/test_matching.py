@@ -9,7 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.fixes.matching import (
+from magfusion.files.attitude_table import AttitudeDatabase, read_database, write_database
+from magfusion.papers.p001_magnetometer.matching import (
     attitude_with_gravity,
     fold_side,
     match_roll,
@@ -17,13 +18,12 @@ from magfusion.fixes.matching import (
     predict_field,
     wrap,
 )
-from magfusion.fixes.matching_database import (
+from magfusion.papers.p001_magnetometer.matching_database import (
     build_database,
     match_interpolated,
     match_nearest,
     prepare,
 )
-from magfusion.records.attitude_table import AttitudeDatabase, read_database, write_database
 from magfusion.units import DEGREE
 
 FIELD_WORLD = np.array([-4e-6, 2.7e-5, -4.7e-5])  # T

@@ -3,6 +3,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet
@@ -11,11 +12,11 @@ import yaml
 from conftest import Refuse, change_table, run_command
 from scipy.spatial.transform import Rotation
 
-from magfusion.records.log import write_log
-from magfusion.records.samples import ImuSamples, Log, Waveform
+from magfusion.files.log import write_log
+from magfusion.files.site import save_site
+from magfusion.model.samples import ImuSamples, Log, Waveform
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import demo_site
-from magfusion.site_file import save_site
-from magfusion.trajectory import Trajectory
 
 RATE = 200.0  # Hz
 YAW = 1.0  # rad
@@ -40,7 +41,9 @@ def write_turning(
     measured = field_body @ sensor.body_from_sensor @ sensor.matrix.T + sensor.offset
     measured += rng.normal(0.0, NOISE, measured.shape)
     force = turn.apply([0.0, 0.0, site.gravity], inverse=True)
-    imu = ImuSamples(time, np.concatenate([rate, rate[-1:]]), force)
+    model, root = site.platform.imu, np.sqrt(RATE)
+    rate = np.concatenate([rate, rate[-1:]]) + rng.normal(0.0, model.gyro_noise * root, force.shape)
+    imu = ImuSamples(time, rate, force + rng.normal(0.0, model.accel_noise * root, force.shape))
     truth = Trajectory(time, turn.as_matrix(), np.zeros((len(time), 3)))
     write_log(Log("turning", 0, "test", imu, Waveform(time, measured), None, truth), path)
     save_site(site, path / "site.yaml")
@@ -66,8 +69,8 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def report(path: Path) -> dict[str, float]:
-    told: dict[str, float] = json.loads((path / "report.json").read_text())
+def report(path: Path) -> dict[str, Any]:
+    told: dict[str, Any] = json.loads((path / "report.json").read_text())
     return told
 
 
@@ -122,12 +125,14 @@ def test_gravity_adds_the_third_angle(logs: Path, tmp_path: Path) -> None:
     assert told["angles"] == "roll-pitch-yaw"
     assert told["attitude_rmse_deg"] < 0.1
     assert 0 < told["epochs_not_determined"] < 0.2 * told["epochs"]
+    assert told["reasons"][0]["code"] == "geometry"
 
 
 def test_gravity_is_not_believed_in_motion(logs: Path, tmp_path: Path) -> None:
     run_command("match", logs / "wander", "--gravity", "-o", tmp_path / "out")
     told = report(tmp_path / "out")
     assert told["epochs_not_determined"] == told["epochs"]
+    assert told["verdict"] == "doubtful"
     assert "not_compared" in told
 
 
@@ -152,7 +157,7 @@ def test_a_platform_whose_yaw_wanders_makes_no_database(logs: Path, refuse: Refu
         ((), "give the yaw"),
         (("--angles", "roll-pitch-yaw"), "two of three angles"),
         (("--angles", "roll-pitch-yaw", "--database", "nod_table"), "two of three angles"),
-        (("--angles", "roll", "--database", "nod_table"), "tells roll-pitch"),
+        (("--angles", "roll", "--database", "nod_table"), "holds roll-pitch"),
         (("--angles", "roll", "--yaw-deg", "3"), "needs --pitch-deg"),
         (("--yaw-deg", "nan"), "--yaw-deg"),
         (("--yaw-deg", "3", "--database", "nod_table"), "those of the database"),
@@ -180,7 +185,7 @@ def test_the_earth_field_is_the_sites_or_that_of_its_place(
     arguments = ["match", logs / "nod_again", "--site", tmp_path / "site.yaml", "--yaw-deg", 3]
     if place is None:
         (tmp_path / "site.yaml").write_text(yaml.safe_dump(site))
-        assert "tells no Earth field" in refuse(*arguments, "-o", tmp_path / "out")
+        assert "gives no Earth field" in refuse(*arguments, "-o", tmp_path / "out")
         return
     where = {"latitude_deg": 41.8, "longitude_deg": 123.4, "height_m": 50.0, "date": "2013-07-01"}
     site["world"]["location"] = where

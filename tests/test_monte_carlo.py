@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from magfusion.errors import InputError
-from magfusion.monte_carlo import run_many
+from magfusion.simulation.monte_carlo import run_many
 
 
 def draw(scale: float, rng: np.random.Generator) -> tuple[float, int, str | None]:
@@ -83,14 +83,14 @@ def test_a_task_that_fails_is_told_as_it_failed(cluster: str) -> None:
 def test_a_cluster_that_does_not_answer_is_named(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("magfusion.monte_carlo.CONNECT_S", 0.5)
+    monkeypatch.setattr("magfusion.simulation.monte_carlo.CONNECT_S", 0.5)
     with pytest.raises(InputError, match=f"--cluster {address}"):
         run_many(same, INPUTS, cluster=address)
 
 
 def test_a_cluster_without_workers_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
     distributed = pytest.importorskip("distributed")
-    monkeypatch.setattr("magfusion.monte_carlo.CONNECT_S", 0.5)
+    monkeypatch.setattr("magfusion.simulation.monte_carlo.CONNECT_S", 0.5)
     with (
         distributed.LocalCluster(n_workers=0, processes=False, dashboard_address=ANY) as empty,
         pytest.raises(InputError, match="has no workers"),

@@ -13,14 +13,15 @@ from evo.tools import file_interface
 from online_log import online_log
 from rerun.chunk import RrdReader
 
-from magfusion.fusion.online import Navigator, NavigatorSettings
-from magfusion.job import read_estimate
+from magfusion.cli import main
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.files.log import read_log, write_log
+from magfusion.files.site import load_site, save_site
+from magfusion.files.trajectory_table import read_trajectory
+from magfusion.jobs.inputs import read_estimate
 from magfusion.jobs.replay import PIECE, Replay, feed, paced
-from magfusion.records.log import read_log, write_log
-from magfusion.records.samples import Log
-from magfusion.records.trajectory_table import read_trajectory
-from magfusion.site_file import load_site, save_site
-from magfusion.view_live import LiveView
+from magfusion.model.samples import Log
+from magfusion.results.recording_live import LiveView
 
 
 @pytest.fixture(scope="module")
@@ -194,11 +195,17 @@ def test_options_that_cannot_be_are_refused(
     assert sentence in refuse("navigate", worked.log, "-o", tmp_path / "run", *options)
 
 
-def test_a_log_too_short_for_a_state_fails_and_leaves_nothing(
-    refuse: Refuse, worked: Worked, tmp_path: Path
+def test_a_log_too_short_for_a_state_fails_and_leaves_no_result(
+    worked: Worked, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    told = refuse("navigate", worked.log, "-o", tmp_path / "run", "--end", 3, status=1)
-    assert "lead to no state; add a beacon, or record longer" in told
+    with pytest.raises(SystemExit) as ended:
+        main(["navigate", str(worked.log), "-o", str(tmp_path / "run"), "--end", "3"])
+    assert ended.value.code == 1
+    assert "lead to no state: Record longer." in capfd.readouterr().err
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"report.json", "failed"}
+    figures = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert figures["verdict"] == "failed"
+    assert [reason["code"] for reason in figures["reasons"]] == ["no_start"]
 
 
 def test_a_clock_that_jumped_is_refused_and_leaves_nothing(

@@ -15,12 +15,10 @@ from conftest import run_command
 from online_log import OnlineLog, online_log
 
 from magfusion.errors import InputError
-from magfusion.fusion.online import Navigator, NavigatorSettings
-from magfusion.jobs.replay import Replay, feed
-from magfusion.jobs.stream import StreamSettings, run_replay, run_stream, state_content
-from magfusion.records.log import write_log
-from magfusion.records.samples import FieldSamples, Log
-from magfusion.records.stream_record import (
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.files.log import write_log
+from magfusion.files.site import save_site
+from magfusion.files.stream import (
     FieldsRecord,
     Format,
     field_samples,
@@ -28,7 +26,9 @@ from magfusion.records.stream_record import (
     json_line,
     read_records,
 )
-from magfusion.site_file import save_site
+from magfusion.jobs.replay import Replay, feed, run_replay
+from magfusion.jobs.stream import StreamSettings, run_stream, state_content
+from magfusion.model.samples import FieldSamples, Log
 
 SCRIPT = Path(sys.executable).parent / "magfusion"
 EKF = StreamSettings(NavigatorSettings("ekf"))
@@ -113,8 +113,8 @@ def test_phasors_are_the_same_on_the_other_side_of_the_pipe(walk: OnlineLog) -> 
     assert found.record.fields is not None
     back = field_samples(found.record.fields, fields.channels)
     assert np.array_equal(back.phasor_sensor, phasor, equal_nan=True)
-    heard = [0, 1, 3]
-    assert np.array_equal(back.phasor_cov[:, heard], cov[:, heard])
+    detected = [0, 1, 3]
+    assert np.array_equal(back.phasor_cov[:, detected], cov[:, detected])
 
 
 def test_a_sigma_is_that_of_every_component() -> None:

@@ -7,11 +7,7 @@ import pytest
 from example_site import mixed_site
 from scipy.spatial.transform import Rotation
 
-from magfusion.evaluation.gauge import Gauge, gauges
-from magfusion.evaluation.motion_coverage import missing_motion, motion_coverage
-from magfusion.evaluation.observability import Observability, gauge_basis, observability
-from magfusion.evaluation.transfer import Estimated, agreement
-from magfusion.parameters import (
+from magfusion.model.parameters import (
     Block,
     Calibration,
     choose_blocks,
@@ -22,10 +18,14 @@ from magfusion.parameters import (
     prior_sigma,
     retract,
 )
-from magfusion.records.samples import ImuSamples
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import BeaconSigma, MagnetometerSigma, Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.results.gauge import Gauge, gauges
+from magfusion.results.motion_coverage import missing_motion, motion_coverage
+from magfusion.results.observability import Observability, gauge_basis, observability
+from magfusion.results.transfer import Estimated, agreement
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
-from magfusion.site import BeaconSigma, MagnetometerSigma, Site
-from magfusion.trajectory import Trajectory
 
 GROUPS = ("beacons", "moments", "phase", "magnetometer", "extrinsics")
 
@@ -163,7 +163,7 @@ def test_the_gauge_is_named_with_what_it_leaves(
     words = [one.words for one in found.gauge]
     # Four beacons of 5 cm each: their mean is known to 2.5 cm.
     assert "all beacons shifted together along x by 2.5 cm" in words[0]
-    assert "no log can tell" in words[0]
+    assert "no log can determine it" in words[0]
     assert any("turned together about the vertical" in text for text in words)
     assert any("moments larger together" in text for text in words)
     assert [one.ratio for one in found.gauge] == pytest.approx([1.0] * len(words), abs=1e-6)

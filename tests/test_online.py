@@ -19,12 +19,12 @@ from online_log import (
 )
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.evaluation.errors import trajectory_errors
-from magfusion.fusion.ekf import ErrorStateFilter
-from magfusion.fusion.navigator import SlidingWindow
-from magfusion.fusion.online import Navigator, NavigatorSettings
-from magfusion.fusion.state import State, as_trajectory
-from magfusion.records.samples import FieldSamples, ImuSamples
+from magfusion.estimation.ekf import ErrorStateFilter
+from magfusion.estimation.fixed_lag import SlidingWindow
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.state import State, as_trajectory
+from magfusion.model.samples import FieldSamples, ImuSamples
+from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD
 from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
 from magfusion.simulation.motion import Rests
@@ -341,7 +341,7 @@ def test_a_singular_update_of_the_filter_is_an_estimation_error(
     def singular(*_: object) -> None:
         raise np.linalg.LinAlgError("singular matrix")
 
-    monkeypatch.setattr("magfusion.fusion.ekf._step", singular)
+    monkeypatch.setattr("magfusion.estimation.ekf._step", singular)
     short = replace(walk, imu=without_imu(walk.imu, 9.0, 1e9))
     navigator, _ = navigate(short, NavigatorSettings("ekf"))
     assert navigator.counts["update failed"] > 0

@@ -8,26 +8,37 @@ from derivatives import central_difference, relative_to_group
 from example_site import UNEVEN, mixed_site
 from scipy.spatial.transform import Rotation
 
-from magfusion.parameters import (
-    DRIFT_SIGMA,
+from magfusion.files.site import load_site, save_site
+from magfusion.model.parameters import (
+    BEACON_POSITION,
+    BEACON_ROTATION,
+    GAIN,
     GROUPS,
-    NEGLIGIBLE,
+    LOG_MOMENT,
+    PHASE,
     PHASE_SIGMA,
+    PHASOR_PARAMETERS,
     Block,
+    Parameter,
+    Unit,
     choose_blocks,
+    considered_blocks,
+    corrected_imu,
     difference,
     dimension,
-    held_blocks,
+    inertial_blocks,
     initial_calibration,
     linearize_channels,
     predict_channels,
     prior_sigma,
     retract,
 )
-from magfusion.refinement import DETERMINED_RATIO, findings, refined_site
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import ClockModel, MagnetometerSigma
+from magfusion.results.figures import DETERMINED_RATIO
+from magfusion.results.observability import observability, parameter_names
+from magfusion.results.refinement import parameter_estimates, refined_site
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
-from magfusion.site import MagnetometerSigma
-from magfusion.site_file import load_site, save_site
 from magfusion.units import DEGREE
 
 REFERENCE_TIME = 40.0  # s
@@ -35,9 +46,7 @@ REFERENCE_TIME = 40.0  # s
 STEPS = {"drift": 1e-8}
 
 ALL = choose_blocks(mixed_site(), GROUPS)
-GAINS = tuple(
-    Block("gain", name, "gain", slice(i, i + 1), np.array([0.2])) for i, name in enumerate("ABC")
-)
+GAINS = tuple(Block(GAIN, name, slice(i, i + 1), np.array([0.2])) for i, name in enumerate("ABC"))
 
 
 def moved_calibration(seed=1):
@@ -213,13 +222,13 @@ def test_of_its_own_accord_it_estimates_what_the_survey_left_open():
     np.testing.assert_allclose(block.sigma, [3e-9, 3e-3, 3e-9], rtol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["position", "rotation", "log_moment"])
+@pytest.mark.parametrize("kind", [BEACON_POSITION, BEACON_ROTATION, LOG_MOMENT])
 def test_a_sigma_at_the_negligible_is_held_and_one_above_it_is_estimated(kind):
-    name = {"position": "position_world", "rotation": "rotation_beacon"}.get(kind, kind)
+    name = kind.sigma_attribute
     site = well_surveyed()
     first = site.beacons[0]
-    for factor, expected in ((1.0, ()), (1.01, (f"A.{kind}",))):
-        sigma = np.full_like(getattr(first.sigma, name), factor * NEGLIGIBLE[kind])
+    for factor, expected in ((1.0, ()), (1.01, (f"A.{kind.kind}",))):
+        sigma = np.full_like(getattr(first.sigma, name), factor * kind.negligible)
         changed = replace(first, sigma=replace(first.sigma, **{name: sigma}))
         worse = replace(site, beacons=(changed, *site.beacons[1:]))
         assert tuple(b.name for b in choose_blocks(worse)) == expected
@@ -231,7 +240,7 @@ def test_beacons_without_synchronisation_always_have_phase_and_drift():
     assert [b.name for b in drive[:2]] == ["A.phase", "A.drift"]
     assert len(drive) == 8
     assert drive[0].sigma == PHASE_SIGMA
-    assert drive[1].sigma == DRIFT_SIGMA
+    assert drive[1].sigma == ClockModel().drift_sigma
 
 
 @pytest.mark.parametrize("group", sorted(set(GROUPS) - {"earth"}))
@@ -273,7 +282,7 @@ def test_columns_follow_each_other_and_carry_the_sites_sigmas():
 def test_held_and_estimated_are_together_all_that_is_uncertain(groups):
     site = mixed_site()
     estimated = choose_blocks(site, groups)
-    held = held_blocks(site, estimated)
+    held = considered_blocks(site, estimated)
     names = [{b.name for b in blocks} for blocks in (estimated, held)]
     assert names[0] | names[1] == {b.name for b in ALL}
     assert not names[0] & names[1]
@@ -293,29 +302,29 @@ def test_a_beacon_may_be_called_sensor_or_magnetometer():
     start = initial_calibration(odd, 0.0)
     np.testing.assert_allclose(difference(start, odd_moved, blocks), step, rtol=1e-9, atol=1e-15)
     own = choose_blocks(odd, ["beacons", "moments"])
-    assert dimension(own) + dimension(held_blocks(odd, own)) == dimension(blocks)
+    assert dimension(own) + dimension(considered_blocks(odd, own)) == dimension(blocks)
 
 
 def refined(shrink=0.1):
     declared = initial_calibration(mixed_site(), REFERENCE_TIME)
     fitted = retract(declared, ALL, small_step(13))
     cov = np.diag((shrink * prior_sigma(ALL)) ** 2)
-    told = findings(declared, fitted, ALL, cov)
+    told = parameter_estimates(declared, fitted, ALL, cov)
     return fitted, told, refined_site(fitted, ALL, cov, told, "walk")
 
 
 def test_a_parameter_is_determined_where_the_data_halved_its_sigma():
     declared = initial_calibration(mixed_site(), REFERENCE_TIME)
     shrink = np.tile([0.9, 1.1], dimension(ALL))[: dimension(ALL)] * DETERMINED_RATIO
-    told = findings(declared, declared, ALL, np.diag((shrink * prior_sigma(ALL)) ** 2))
+    told = parameter_estimates(declared, declared, ALL, np.diag((shrink * prior_sigma(ALL)) ** 2))
     assert [f.determined for f in told] == list(shrink < DETERMINED_RATIO)
     assert {f.change for f in told} == {0.0}
 
 
-def test_findings_are_named_with_the_unit_of_their_figures():
-    told = {f.name: f for f in refined()[1]}
+def test_estimates_are_named_with_the_unit_of_their_figures():
+    told = {f.key: f for f in refined()[1]}
     assert len(told) == dimension(ALL)
-    step = dict(zip([f.name for f in refined()[1]], small_step(13), strict=True))
+    step = dict(zip([f.key for f in refined()[1]], small_step(13), strict=True))
     units = {
         "A.rotation_y_deg": DEGREE,
         "B.position_z_m": 1.0,
@@ -360,7 +369,9 @@ def test_a_refined_site_keeps_the_sigmas_of_what_was_not_estimated():
     blocks = choose_blocks(mixed_site(), ["moments"])
     declared = initial_calibration(mixed_site(), 0.0)
     cov = np.diag((0.2 * prior_sigma(blocks)) ** 2)
-    site = refined_site(declared, blocks, cov, findings(declared, declared, blocks, cov), "walk")
+    site = refined_site(
+        declared, blocks, cov, parameter_estimates(declared, declared, blocks, cov), "walk"
+    )
     np.testing.assert_array_equal(site.beacons[0].sigma.position_world, 0.01 * UNEVEN)
     np.testing.assert_allclose(site.beacons[0].sigma.log_moment, 0.002 * UNEVEN[:2], rtol=1e-12)
     assert site.platform.imu == mixed_site().platform.imu
@@ -382,8 +393,85 @@ def test_a_refined_site_survives_its_file_and_tells_what_was_determined(tmp_path
     assert isinstance(again.platform.magnetometer.sigma, MagnetometerSigma)
     record = again.calibration
     assert record["log"] == "walk"
-    assert record["determined"] == [f.name for f in told]
+    assert record["determined"] == [f.key for f in told]
     assert record["undetermined"] == []
-    drive = {f.name: [f.change, f.sigma] for f in told if "phase" in f.name or "drift" in f.name}
+    drive = {f.key: [f.change, f.sigma] for f in told if "phase" in f.name or "drift" in f.name}
     assert len(drive) == 6
     assert record["drive"] == drive
+
+
+class GyroScale(Parameter):
+    """A parameter that the package does not know."""
+
+    group, owner, kind = "gyro", "imu", "gyro_scale"
+    components, unit = ("x", "y", "z"), Unit("ppm", 1e-6)
+    inertial = of_log = True
+
+    def sigma(self, site, owner):  # noqa: ARG002
+        return np.full(3, 1e-3)
+
+    def corrected_imu(self, calibration, owner, imu):
+        scale = 1.0 + calibration.others.get(f"{owner}.{self.kind}", np.zeros(3))
+        return replace(imu, gyro_body=imu.gyro_body / scale)
+
+
+def test_a_parameter_from_outside_is_one_class():
+    kinds, site = (*PHASOR_PARAMETERS, GyroScale()), mixed_site()
+    blocks = choose_blocks(site, parameters=kinds)
+    own = [b for b in blocks if b.name == "imu.gyro_scale"]
+    assert dimension(blocks) == dimension(choose_blocks(site)) + 3
+    np.testing.assert_array_equal(prior_sigma(blocks)[own[0].columns], 1e-3)
+    (alone,) = choose_blocks(site, ["gyro"], parameters=kinds)
+    assert (alone.key, alone.columns) == (own[0].key, slice(0, 3))
+    held = considered_blocks(site, choose_blocks(site), parameters=kinds)
+    assert "imu.gyro_scale" in [b.name for b in held]
+
+    declared = initial_calibration(site, REFERENCE_TIME)
+    step = np.random.default_rng(14).normal(size=dimension(blocks)) * np.minimum(
+        prior_sigma(blocks), 1.0
+    )
+    fitted = retract(declared, blocks, step)
+    np.testing.assert_allclose(difference(declared, fitted, blocks), step, rtol=1e-9, atol=1e-15)
+    back = difference(fitted, retract(fitted, blocks, -step), own)
+    np.testing.assert_allclose(back[-3:], -step[own[0].columns], rtol=1e-12)
+
+    cov = np.diag((0.1 * prior_sigma(blocks)) ** 2)
+    told = parameter_estimates(declared, fitted, blocks, cov)
+    finding = next(f for f in told if f.key == "imu.gyro_scale_y_ppm")
+    assert finding.change == pytest.approx(step[own[0].columns][1] / 1e-6, rel=1e-12)
+    assert finding.prior_sigma == pytest.approx(1000.0)
+    refined = refined_site(fitted, blocks, cov, told, "walk")
+    assert finding.key in refined.calibration["determined"]
+    assert refined.calibration["drive"][finding.key] == [finding.change, finding.sigma]
+    assert not [c for c in refined.correlation.parameters if c.kind == "gyro_scale"]
+    found = observability(fitted, blocks, cov)
+    assert len(found.ratio) == dimension(blocks)
+    assert parameter_names(tuple(own), fitted)[0][0] == "imu.gyro_scale 0"
+
+
+def test_a_parameter_corrects_the_inertial_stream_where_it_says_so():
+    blocks = choose_blocks(mixed_site(), parameters=(*PHASOR_PARAMETERS, GyroScale()))
+    start = initial_calibration(mixed_site(), 0.0)
+    time, rate = np.arange(4.0), np.random.default_rng(15).normal(size=(4, 3))
+    imu = ImuSamples(time, rate, rate)
+    step = np.where(np.arange(dimension(blocks)) >= dimension(blocks) - 3, 0.5, 0.0)
+    moved = retract(start, blocks, step)
+    assert [b.name for b in inertial_blocks(blocks)] == ["imu.gyro_scale"]
+    np.testing.assert_allclose(corrected_imu(moved, blocks, imu).gyro_body, rate / 1.5, rtol=1e-15)
+    assert corrected_imu(moved, ALL, imu) is imu
+
+
+def test_every_kind_of_parameter_has_its_own_words_and_walks_as_the_site_says():
+    site = mixed_site()
+    for block in ALL:
+        words = {block.parameter.called(site, block.owner, i) for i in range(len(block.sigma))}
+        assert block.kind == "phase" or len(words) == len(block.sigma)
+        assert block.kind not in words
+    walks = {b.kind: b.parameter.walk_per_sqrt_hour(site) for b in ALL}
+    assert {k: v for k, v in walks.items() if v} == {
+        "log_moment": 1e-3,
+        "phase": 0.02,
+        "drift": 1e-8,
+    }
+    faster = replace(site, clock=ClockModel(phase_walk=0.5))
+    assert PHASE.walk_per_sqrt_hour(faster) == 0.5

@@ -9,19 +9,19 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from magfusion.errors import EstimationError
-from magfusion.field_map import FieldMap
-from magfusion.fixes.fix import Gravity
-from magfusion.fixes.likelihood import fix_epochs
-from magfusion.fixes.problem import CHUNK, FREE
-from magfusion.fixes.refine import refine
-from magfusion.parameters import Block, initial_calibration, predict_channels, retract
-from magfusion.records.samples import FieldSamples
+from magfusion.estimation.snapshot.fix import Gravity
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.estimation.snapshot.problem import CHUNK, FREE
+from magfusion.estimation.snapshot.refine import refine
+from magfusion.model.field_map import FieldMap
+from magfusion.model.noise import measurement_cov, paired_whitening, sensor_positions, stacked
+from magfusion.model.parameters import GAIN, Block, initial_calibration, predict_channels, retract
+from magfusion.model.samples import FieldSamples
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import simulate_fields
 from magfusion.simulation.worlds import ROOM, S0, draw_world
-from magfusion.trajectory import Trajectory
 from magfusion.units import DEGREE
-from magfusion.weights import measurement_cov, paired_whitening, sensor_positions, stacked
 
 SIGMA = 3e-10  # T, of a phasor's component
 EXACT = 1e-6  # m, rad
@@ -167,7 +167,7 @@ def test_a_gain_is_held_by_its_prior():
 def test_the_gain_of_a_beacon_with_several_tones_is_one():
     site = replace(mixed_site(), model_error=0.0)
     truth, calibration = poses(30), initial_calibration(site, 0.0)
-    blocks = (Block("gain", "B", "gain", slice(0, 1), np.ones(1)),)
+    blocks = (Block(GAIN, "B", slice(0, 1), np.ones(1)),)
     odd = retract(calibration, blocks, np.array([0.1]))
     phasor = predict_channels(odd, truth.time, truth.world_from_body, truth.position_world)
     channels = phasor.shape[1]

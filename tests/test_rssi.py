@@ -5,8 +5,9 @@ import pytest
 from scipy.optimize import least_squares
 
 from magfusion.errors import EstimationError
-from magfusion.fixes.rssi import (
-    distances,
+from magfusion.model.physics.dipole import dipole_field
+from magfusion.papers.p004_fingerprints.equations import distances
+from magfusion.papers.p004_fingerprints.rssi import (
     fit_block_lines,
     fit_lines,
     ranges_from_lines,
@@ -14,7 +15,6 @@ from magfusion.fixes.rssi import (
     trilaterate,
     trilaterate_from_both_sides,
 )
-from magfusion.physics.dipole import dipole_field
 from magfusion.receiver.ellipse import rms_amplitude, semi_axes
 
 FLAT = np.array([[0.0, 0.0, 0.0], [6.2, 0.54, 0.0], [3.2, 4.28, 0.0]])  # m

@@ -15,18 +15,18 @@ from scipy.spatial.transform import Rotation
 from self_survey import Config, turn_deg, without_survey
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.fusion.batch import SmootherSettings, smooth
-from magfusion.fusion.placing import heard_along, places
-from magfusion.fusion.self_survey import Hypothesis, Placement, decide, smooth_and_place
-from magfusion.parameters import initial_calibration
-from magfusion.pipeline import quiet
-from magfusion.records.log import write_log
+from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.estimation.beacon_placement import detected_along, places
+from magfusion.estimation.self_survey import Hypothesis, Placement, decide, smooth_and_place
+from magfusion.files.log import write_log
+from magfusion.files.site import load_site, save_site
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.progress import quiet
+from magfusion.model.site import Site, Unknown
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.field import Drives
 from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_fields, simulate_log
-from magfusion.site import Site, Unknown
-from magfusion.site_file import load_site, save_site
-from magfusion.trajectory import Trajectory
 
 NOISE = 1e-13  # T; next to nothing
 
@@ -57,8 +57,8 @@ def test_exact_fields_along_a_known_path_place_any_beacon(index: int, unknown: U
     path = path_of(150)
     samples = simulate_fields(site, path, NOISE, np.random.default_rng(1), drives(site))
     lost = without_survey(site.beacons[index], unknown)
-    heard = heard_along(lost, initial_calibration(site, 0.0), samples, path, 1.0)
-    chi_square, found = places(heard)[0]
+    detected = detected_along(lost, initial_calibration(site, 0.0), samples, path, 1.0)
+    chi_square, found = places(detected)[0]
     true = site.beacons[index]
     assert np.linalg.norm(found.position_world - true.position_world) < 1e-4
     if len(true.coils) == 1:  # its attitude is that of its axis, of either sign
@@ -77,10 +77,10 @@ def test_a_platform_at_rest_leaves_more_than_one_place() -> None:
     path = path_of(60, extent=0.0)
     samples = simulate_fields(site, path, NOISE, np.random.default_rng(1))
     lost = without_survey(site.beacons[1], "position")
-    heard = heard_along(lost, initial_calibration(site, 0.0), samples, path, 1.0)
-    found = [(chi, beacon.position_world) for chi, beacon in places(heard) if chi < 1.0]
+    detected = detected_along(lost, initial_calibration(site, 0.0), samples, path, 1.0)
+    found = [(chi, beacon.position_world) for chi, beacon in places(detected) if chi < 1.0]
     true = site.beacons[1].position_world
-    mirror = 2.0 * heard.sensor_world[0] - true
+    mirror = 2.0 * detected.sensor_world[0] - true
     for place in (true, mirror):
         assert min(np.linalg.norm(position - place) for _, position in found) < 1e-3
 
@@ -157,8 +157,8 @@ def test_a_beacon_that_was_not_heard_is_not_placed() -> None:
     silent[3:, 0] = np.nan
     samples = replace(samples, phasor_sensor=silent)
     lost = without_survey(site.beacons[0], "pose")
-    with pytest.raises(EstimationError, match="beacon A was heard at 3 epochs"):
-        heard_along(lost, initial_calibration(site, 0.0), samples, path, 1.0)
+    with pytest.raises(EstimationError, match="beacon A was detected at 3 epochs"):
+        detected_along(lost, initial_calibration(site, 0.0), samples, path, 1.0)
 
 
 @pytest.mark.parametrize("unknown", ["pose", "position", "attitude"])

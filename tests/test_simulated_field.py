@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from magfusion.model.site import Coil
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.field import Drives, coil_field, synchronised_drives
 from magfusion.simulation.log import (
@@ -17,7 +18,6 @@ from magfusion.simulation.log import (
 )
 from magfusion.simulation.motion import random_walk_motion, static_motion
 from magfusion.simulation.waveform import Mains, simulate_waveform
-from magfusion.site import Coil
 
 
 def walk(seed=1, duration=60.0, **options):

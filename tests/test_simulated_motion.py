@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from magfusion.errors import InputError
+from magfusion.model.site import ImuModel
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.inertial import BiasInstability, simulate_imu
 from magfusion.simulation.motion import Rests, random_walk_motion, static_motion, turning_motion
-from magfusion.site import ImuModel
 
 GRAVITY = 9.81
 SILENT = ImuModel(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -11,10 +11,21 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.physics.earth import earth_field_world
+from magfusion.files.site import load_site, save_site
+from magfusion.files.site_schema import ClockEntry, EarthEntry, MotionEntry
+from magfusion.files.yaml_files import StrictModel
+from magfusion.model.physics.earth import earth_field_world
+from magfusion.model.site import (
+    BeaconSigma,
+    ClockModel,
+    Coil,
+    EarthModel,
+    Location,
+    MagnetometerSigma,
+    MotionModel,
+    Site,
+)
 from magfusion.simulation.demo_site import demo_site
-from magfusion.site import BeaconSigma, Coil, Location, MagnetometerSigma, Site
-from magfusion.site_file import load_site, save_site
 from magfusion.units import DEGREE, Array
 
 LOGS = Path(__file__).parents[1].parent / "shared" / "logs"
@@ -54,6 +65,7 @@ BEACON: Key = ("beacons", 0)
 COIL: Key = (*BEACON, "coils", 0)
 IMU: Key = ("platform", "imu")
 MAGNETOMETER: Key = ("platform", "magnetometer")
+MOTION: Key = ("platform", "motion")
 
 
 def _loaded(text: str | bytes, folder: Path) -> Site:
@@ -106,7 +118,7 @@ def _assert_same(found: Any, wanted: Any, place: str = "site") -> None:
             _assert_same(a, b, f"{place}[{i}]")
     elif place.endswith(("_from_beacon", "_from_sensor", ".phase")):
         np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-12, err_msg=place)
-    elif ".rotation_" in place:
+    elif ".rotation_" in place or place.endswith((".phase_walk", ".declination_sigma", "ion_walk")):
         np.testing.assert_allclose(found, wanted, rtol=4e-15, atol=0.0, err_msg=place)
     elif isinstance(wanted, np.ndarray):
         np.testing.assert_array_equal(found, wanted, err_msg=place)
@@ -184,6 +196,13 @@ OUT_OF_RANGE: list[tuple[Key, Any, str]] = [
     ((*IMU, "accel_bias_sigma"), [0.1], "number"),
     ((*IMU, "time_offset_s"), NAN, "finite"),
     ((*IMU, "time_offset_sigma_s"), -0.01, "greater than or equal to 0"),
+    ((*MOTION, "rest_gyro_rad_s"), 0.0, "greater than 0"),
+    ((*MOTION, "rest_span_s"), 0.1, "greater than or equal to 0.2"),
+    ((*MOTION, "speed_sigma_m_s"), "fast", "number"),
+    (("clock", "drift_sigma"), -1e-5, "greater than 0"),
+    (("clock",), 2e-5, "mapping with the keys drift_sigma, "),
+    (("world", "earth", "strength_walk_t"), 1000.0, "in T, not nT"),
+    ((*MAGNETOMETER, "offset_walk_t"), 20.0, "in T, not nT"),
     ((*MAGNETOMETER, "body_from_sensor", "rpy_deg"), [0, 0], "3 numbers"),
     ((*MAGNETOMETER, "body_from_sensor", "position_m"), 0.05, "3 numbers"),
     ((*MAGNETOMETER, "noise_density_t_rthz"), 0.25, "not nT"),
@@ -264,6 +283,9 @@ def test_a_location_is_given_whole(key: str, tmp_path: Path) -> None:
         COIL,
         ("platform",),
         IMU,
+        MOTION,
+        ("clock",),
+        ("world", "earth"),
         MAGNETOMETER,
         (*MAGNETOMETER, "body_from_sensor"),
         (*MAGNETOMETER, "sigma"),
@@ -280,6 +302,9 @@ def test_an_unknown_key_is_answered_by_the_known_ones(owner: Key, tmp_path: Path
         COIL: "moment_a_m2",
         ("platform",): "imu",
         IMU: "time_offset_sigma_s",
+        MOTION: "rest_gyro_rad_s",
+        ("clock",): "drift_sigma",
+        ("world", "earth"): "declination_sigma_deg",
         MAGNETOMETER: "noise_density_t_rthz",
         (*MAGNETOMETER, "sigma"): "offset_t",
     }.get(owner, "position_m")
@@ -478,12 +503,18 @@ def _random_site(rng: np.random.Generator) -> Site:
         ),
     )
     imu = type(demo.platform.imu)(*rng.uniform(1e-6, 1.0, 8))
+    motion = MotionModel(*rng.uniform(0.5, 1.0, len(vars(MotionModel()))))
+    magnetometer = dataclasses.replace(magnetometer, offset_walk=1e-8 * rng.uniform())
     return dataclasses.replace(
         demo,
         gravity=rng.uniform(9.7, 9.9),
         model_error=rng.uniform(),
         beacons=(beacon, *demo.beacons[1:]),
-        platform=dataclasses.replace(demo.platform, imu=imu, magnetometer=magnetometer),
+        platform=dataclasses.replace(
+            demo.platform, imu=imu, magnetometer=magnetometer, motion=motion
+        ),
+        clock=ClockModel(*rng.uniform(size=len(vars(ClockModel())))),
+        earth=EarthModel(*rng.uniform(size=3), 1e-6 * rng.uniform()),
         earth_field_world=1e-5 * rng.normal(size=3),
         calibration={"log": "walk", "determined": ["A.position"], "spread": {"A": [1.5, None]}},
     )
@@ -493,6 +524,48 @@ def _random_site(rng: np.random.Generator) -> Site:
 def test_every_option_survives_its_file_to_the_last_digit(seed: int, tmp_path: Path) -> None:
     site = _random_site(np.random.default_rng(seed))
     _assert_same(_again(site, tmp_path), site)
+
+
+def test_an_earth_field_other_than_the_locations_is_what_is_kept(tmp_path: Path) -> None:
+    site = _loaded(_with((WORLD, {"location": LOCATION})), tmp_path)
+    assert site.earth_field_world is not None
+    assert _again(site, tmp_path).location == site.location
+    turned = dataclasses.replace(site, earth_field_world=1.01 * site.earth_field_world)
+    again = _again(turned, tmp_path)
+    assert again.location is None
+    _assert_same(again.earth_field_world, turned.earth_field_world)
+
+
+@pytest.mark.parametrize(
+    ("model", "entry"),
+    [(ClockModel, ClockEntry), (EarthModel, EarthEntry), (MotionModel, MotionEntry)],
+)
+def test_the_keys_of_a_model_are_its_fields_with_their_units(
+    model: type[Any], entry: type[StrictModel]
+) -> None:
+    for key, name in zip(entry.model_fields, vars(model()), strict=True):
+        assert key.removeprefix(name) in ("", "_deg", "_t", "_s", "_m_s", "_m_s2", "_rad_s"), key
+
+
+def test_what_is_as_usual_of_platform_and_clocks_is_not_written(tmp_path: Path) -> None:
+    site = _loaded(PLAIN, tmp_path)
+    assert (site.clock, site.earth, site.platform.motion) == (
+        ClockModel(),
+        EarthModel(),
+        MotionModel(),
+    )
+    _assert_same(_again(site, tmp_path), site)
+    text = (tmp_path / "saved.yaml").read_text()
+    assert not any(key in text for key in ("clock", "motion", "earth:", "walk_t"))
+    drill = {"rest_gyro_rad_s": 0.3, "rest_accel_m_s2": 2.0}
+    changes = [(("platform", "motion"), drill), (("clock",), {"phase_walk_deg": 5.0})]
+    site = _loaded(_with(*changes), tmp_path)
+    assert site.platform.motion == MotionModel(rest_gyro=0.3, rest_accel=2.0)
+    assert site.clock == ClockModel(phase_walk=5.0 * DEGREE)
+    _assert_same(_again(site, tmp_path), site)
+    written = yaml.safe_load((tmp_path / "saved.yaml").read_text())
+    assert written["platform"]["motion"] == drill
+    assert written["clock"] == {"phase_walk_deg": 5.0}
 
 
 @pytest.mark.parametrize("below_deg", [0.0, 1e-12, 1e-9, 1e-7, 1e-6, 5e-6, 1e-5, 1e-3])

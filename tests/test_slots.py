@@ -11,24 +11,25 @@ from scipy.spatial.transform import Rotation
 from time_slots_and_mains import UNIT, tracker
 
 from magfusion.errors import InputError
-from magfusion.parameters import initial_calibration, predict_channels
+from magfusion.files.site import load_site, save_site
+from magfusion.model.parameters import initial_calibration, predict_channels
+from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
+from magfusion.model.site import Site, Slots
 from magfusion.receiver.ambient import Removal, ambient_weights, subtraction_gain
 from magfusion.receiver.cycles import whole_cycles
+from magfusion.receiver.receiver import Receiver, received
 from magfusion.receiver.slots import (
     SlotSettings,
     default_slot_settings,
-    demodulate_slots,
     schedule,
     slot_settings_of,
 )
+from magfusion.receiver.turn import on_clock
 from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz
-from magfusion.records.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.simulation.field import synchronised_drives
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.motion import Motion, Rests, static_motion, turning_motion
 from magfusion.simulation.waveform import simulate_waveform
-from magfusion.site import Site, Slots
-from magfusion.site_file import load_site, save_site
 
 BOX_WORLD = np.array([[0.25, -0.25, -0.25], [0.75, 0.25, 0.25]])  # m
 EARTH_WORLD = np.array([0.0, 2e-5, -5e-5])  # T
@@ -47,7 +48,7 @@ def _hum(slot: float, hum_hz: float, removal: Removal, cycles: int = 20) -> list
     for phase in np.linspace(0.0, np.pi, 24, endpoint=False):
         hum = np.cos(2.0 * np.pi * hum_hz * time + phase)[:, None] * [1.0, 0.0, 0.0]
         settings = SlotSettings(removal, "rectangular")
-        found, _ = demodulate_slots(Waveform(time, hum), _still(time[-1]), site, settings)
+        found, _ = received(Waveform(time, hum), _still(time[-1]), site, settings)
         inner = found.phasor_sensor[15:-15, :, 0]
         worst = np.maximum(worst, np.nanmax(np.abs(inner), axis=0))
     return [float(20.0 * np.log10(w + 1e-12)) for w in worst]
@@ -144,7 +145,7 @@ def test_a_turning_body_measures_pulses_free_of_the_earth_field(removal: Removal
     site = _with_earth(tracker(0.0, Slots(2.5e-3, 4, start=0.4e-3)))
     motion = _turning(2.0)
     waveform, imu = _recorded(site, motion, 16e3, 2.0)
-    found, _ = demodulate_slots(waveform, imu, site, SlotSettings(removal, "rectangular"))
+    found, _ = received(waveform, imu, site, SlotSettings(removal, "rectangular"))
     # The Earth field is 70 times K/R^3 and turns by a quarter degree in a slot.
     assert len(found) > 590
     assert _wrong(site, found, motion) < 1e-4
@@ -171,15 +172,12 @@ def test_a_gyro_bias_costs_the_paper_dearly_and_its_neighbours_nothing() -> None
     wrong = {}
     for removal in ("subtract", "interpolate"):
         settings = SlotSettings(removal, "rectangular")
-        found, _ = demodulate_slots(waveform, imu, site, settings)
+        found, _ = received(waveform, imu, site, settings)
         wrong[removal] = _wrong(site, _without_ends(found), motion)
-    mended, _ = demodulate_slots(
-        waveform,
-        imu,
-        site,
-        SlotSettings("subtract", "rectangular"),
-        gyro_bias_body=np.full(3, 0.02),
-    )
+    receiver = Receiver.of(site, SlotSettings("subtract", "rectangular"))
+    windows, _ = receiver.whole(waveform, imu)
+    known = on_clock(imu, site.platform.imu.time_offset, np.full(3, 0.02))
+    mended, _ = receiver.phasors(waveform, known, windows, site)
     assert wrong["subtract"] > 5e-3
     assert wrong["interpolate"] < 1e-4
     assert _wrong(site, mended, motion) < 1e-4
@@ -190,7 +188,7 @@ def test_a_carrier_needs_no_whole_number_of_cycles(taper: Any) -> None:
     site = _with_earth(tracker(3.3e3, Slots(2.5e-3, 4), phase=0.7))
     motion = _turning(1.0)
     waveform, imu = _recorded(site, motion, 16e3, 1.0)
-    found, dropped = demodulate_slots(waveform, imu, site, SlotSettings("none", taper))
+    found, dropped = received(waveform, imu, site, SlotSettings("none", taper))
     assert not dropped
     assert _wrong(site, found, motion) < 1e-3
 
@@ -209,7 +207,7 @@ def test_the_covariance_is_that_of_the_noise(
     site = tracker(carrier_hz, Slots(5e-3, 4), density=1e-10)
     motion = static_motion(np.array([0.5, 0.1, -0.2]), Rotation.identity())
     waveform, imu = _recorded(site, motion, 8e3, 20.0)
-    found, _ = demodulate_slots(waveform, imu, site, SlotSettings(removal, taper))
+    found, _ = received(waveform, imu, site, SlotSettings(removal, taper))
     at = motion.trajectory(found.time)
     true = predict_channels(
         initial_calibration(site, 0.0), at.time, at.world_from_body, at.position_world
@@ -231,7 +229,7 @@ def test_what_turns_in_the_earth_field_is_no_noise(carrier_hz: float) -> None:
     site = _with_earth(tracker(carrier_hz, slots, density=1e-10))
     waveform, imu = _recorded(site, _turning(3.0), 16e3, 3.0)
     settings = SlotSettings("none" if carrier_hz else "subtract", "rectangular")
-    found, _ = demodulate_slots(waveform, imu, site, settings)
+    found, _ = received(waveform, imu, site, settings)
     matrix = site.platform.magnetometer.matrix
     # White noise enters after the matrix; 128 degrees of freedom give a variance within a third.
     expected = 1e-20 / slots.duration
@@ -248,7 +246,7 @@ def test_a_cycle_as_one_epoch_is_turned_to_its_own_time() -> None:
         moving, position=static_motion(np.array([0.5, 0, 0]), moving.attitude(0.0)).position
     )
     waveform, imu = _recorded(site, motion, 16e3, 1.0)
-    found, _ = demodulate_slots(waveform, imu, site, default_slot_settings(site))
+    found, _ = received(waveform, imu, site, default_slot_settings(site))
     cycles = whole_cycles(found, imu, site)
     assert len(cycles) == len(found) // 3
     assert np.all(cycles.valid)
@@ -263,8 +261,8 @@ def test_a_gap_costs_the_slots_in_it_and_no_others() -> None:
     waveform, imu = _recorded(site, motion, 8e3, 2.0)
     kept = (waveform.time < 0.5) | (waveform.time >= 0.6)
     short = Waveform(waveform.time[kept], waveform.measured_sensor[kept])
-    whole, none = demodulate_slots(waveform, imu, site, default_slot_settings(site))
-    found, dropped = demodulate_slots(short, imu, site, default_slot_settings(site))
+    whole, none = received(waveform, imu, site, default_slot_settings(site))
+    found, dropped = received(short, imu, site, default_slot_settings(site))
     assert not none
     lost = (whole.time > 0.5) & (whole.time < 0.6)
     np.testing.assert_allclose(found.time, whole.time[~lost], rtol=1e-12)
@@ -281,7 +279,7 @@ def _refused(site: Site, rate_hz: float = 8e3, settings: SlotSettings | None = N
     )
     chosen = default_slot_settings(site) if settings is None else settings
     with pytest.raises(InputError) as caught:
-        demodulate_slots(waveform, _still(4000 / rate_hz), site, chosen)
+        received(waveform, _still(4000 / rate_hz), site, chosen)
     return str(caught.value)
 
 
@@ -294,7 +292,7 @@ def test_a_schedule_must_fit_the_sampling_rate() -> None:
 
 
 def test_a_log_shorter_than_a_slot_is_refused() -> None:
-    assert "no slot of 10 s is usable (too few samples: 1)" in _refused(
+    assert "no slot of 10 s is usable (the log is too short)" in _refused(
         tracker(0.0, Slots(10.0, 4))
     )
 

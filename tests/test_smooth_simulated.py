@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.evaluation.errors import TrajectoryErrors, trajectory_errors
-from magfusion.fusion.batch import Smoothed, SmootherSettings, overlap, smooth
-from magfusion.fusion.source import first_fixes, phasors
-from magfusion.fusion.start import choose_chains, start_phases
-from magfusion.parameters import Calibration, difference, initial_calibration
+from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.demodulation import first_fixes, phasors
+from magfusion.estimation.initialization.chain import choose_chains, start_phases
+from magfusion.estimation.log_graph import overlap
+from magfusion.model.parameters import Calibration, difference, initial_calibration
+from magfusion.model.samples import ImuSamples, Log, Waveform
+from magfusion.model.site import BeaconSigma, MagnetometerSigma, Site
 from magfusion.receiver.windows import LockinSettings
-from magfusion.records.samples import ImuSamples, Log, Waveform
+from magfusion.results.errors import TrajectoryErrors, trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
 from magfusion.simulation.motion import Rests
-from magfusion.site import BeaconSigma, MagnetometerSigma, Site
 
 DURATION = 20.0  # s
 
@@ -249,7 +250,7 @@ def test_one_beacon_leaves_two_chains_of_which_one_is_right(seed: int) -> None:
         return float(np.mean(np.linalg.norm(position - truth, axis=1) > 0.3))  # m
 
     assert wrong(fixes.best().position_world) > 0.3  # a single epoch cannot tell the mirrors apart
-    chains = choose_chains(fixes, made.log.imu, 0.0, site.gravity)
+    chains = choose_chains(fixes, made.log.imu, 0.0, site)
     shares = sorted(wrong(chain.states.position_world) for chain in chains)
     assert len(shares) == 2
     assert shares[0] < 0.06

@@ -13,35 +13,36 @@ from scipy.spatial.transform import Rotation
 from small_problem import SmallLog, small_log, small_problem
 
 from magfusion.errors import EstimationError
-from magfusion.evaluation.consistency import average_nees_bounds
-from magfusion.evaluation.errors import trajectory_errors
-from magfusion.fusion.batch import SmootherSettings, smooth
-from magfusion.fusion.factors import CALIBRATION_KEY, FieldFactors, read_poses, robust_weight
-from magfusion.fusion.ordering import nested_dissection
-from magfusion.fusion.smoother import (
+from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.estimation.factors import CALIBRATION_KEY
+from magfusion.estimation.graph import (
     Estimate,
-    Problem,
-    cost_of,
+    Graph,
     initial_estimate,
-    linearized,
     marginals,
-    optimise,
     read_states,
 )
-from magfusion.parameters import (
+from magfusion.estimation.measurements.measurement import robust_weight
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.solve.bordered import optimise
+from magfusion.estimation.solve.ordering import nested_dissection
+from magfusion.estimation.state import states_in
+from magfusion.model.noise import measurement_cov
+from magfusion.model.parameters import (
     Block,
     Calibration,
     choose_blocks,
+    considered_blocks,
     difference,
     dimension,
-    held_blocks,
     linearize_channels,
     predict_channels,
     prior_sigma,
     retract,
 )
-from magfusion.trajectory import Trajectory
-from magfusion.weights import measurement_cov
+from magfusion.model.trajectory import Trajectory
+from magfusion.results.consistency import average_nees_bounds
+from magfusion.results.errors import trajectory_errors
 
 SURVEY = ("beacons", "moments", "magnetometer", "extrinsics")
 
@@ -112,7 +113,7 @@ def field_error(
 
 
 def native_graph(
-    small: SmallLog, problem: Problem, blocks: tuple[Block, ...]
+    small: SmallLog, problem: Graph, blocks: tuple[Block, ...]
 ) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     graph.push_back(problem.native)
@@ -133,14 +134,14 @@ def native_graph(
     return graph
 
 
-def native_values(problem: Problem, estimate: Estimate) -> gtsam.Values:
+def native_values(problem: Graph, estimate: Estimate) -> gtsam.Values:
     values = gtsam.Values(estimate.values)
     insert_calibration(values, estimate.calibration, problem.declared, problem.blocks)
     return values
 
 
 @pytest.fixture(scope="module")
-def solved() -> tuple[SmallLog, Problem, Estimate, float]:
+def solved() -> tuple[SmallLog, Graph, Estimate, float]:
     """Solve a small problem with all of the survey estimated, by the own loop."""
     small = small_log(1)
     problem, start = small_problem(small, choose_blocks(small.site, SURVEY))
@@ -150,7 +151,7 @@ def solved() -> tuple[SmallLog, Problem, Estimate, float]:
 
 
 def test_the_loop_ends_where_gtsams_own_optimizer_ends(
-    solved: tuple[SmallLog, Problem, Estimate, float],
+    solved: tuple[SmallLog, Graph, Estimate, float],
 ) -> None:
     small, problem, estimate, cost = solved
     graph = native_graph(small, problem, problem.blocks)
@@ -162,7 +163,7 @@ def test_the_loop_ends_where_gtsams_own_optimizer_ends(
     native = gtsam.LevenbergMarquardtOptimizer(graph, native_values(problem, start), parameters)
     values = native.optimize()
     assert cost == pytest.approx(graph.error(values), rel=1e-6)
-    own, other = read_poses(estimate.values), read_poses(values)
+    own, other = states_in(estimate.values), states_in(values)
     assert np.allclose(own.position_world, other.position_world, rtol=0.0, atol=1e-6)  # m
     assert np.allclose(own.world_from_body, other.world_from_body, rtol=0.0, atol=1e-6)  # rad
     moved = difference(
@@ -174,13 +175,13 @@ def test_the_loop_ends_where_gtsams_own_optimizer_ends(
     assert np.max(np.abs(difference(problem.declared, estimate.calibration, problem.blocks))) > 1e-4
 
 
-def test_the_cost_is_gtsams_anywhere(solved: tuple[SmallLog, Problem, Estimate, float]) -> None:
+def test_the_cost_is_gtsams_anywhere(solved: tuple[SmallLog, Graph, Estimate, float]) -> None:
     small, problem, estimate, _ = solved
     rng = np.random.default_rng(2)
     step = prior_sigma(problem.blocks) * rng.standard_normal(dimension(problem.blocks))
     elsewhere = Estimate(estimate.values, retract(estimate.calibration, problem.blocks, step))
     native = native_graph(small, problem, problem.blocks).error(native_values(problem, elsewhere))
-    assert cost_of(problem, elsewhere) == pytest.approx(native, rel=1e-9)
+    assert problem.cost(elsewhere) == pytest.approx(native, rel=1e-9)
 
 
 def same_covariance(found: np.ndarray, expected: np.ndarray, rtol: float) -> bool:
@@ -189,7 +190,7 @@ def same_covariance(found: np.ndarray, expected: np.ndarray, rtol: float) -> boo
     return bool(np.max(np.abs(found - expected) / np.outer(sigma, sigma)) < rtol)
 
 
-def test_the_marginals_are_gtsams(solved: tuple[SmallLog, Problem, Estimate, float]) -> None:
+def test_the_marginals_are_gtsams(solved: tuple[SmallLog, Graph, Estimate, float]) -> None:
     small, problem, estimate, _ = solved
     graph = native_graph(small, problem, problem.blocks)
     native = gtsam.Marginals(graph, native_values(problem, estimate))
@@ -204,20 +205,20 @@ def test_the_marginals_are_gtsams(solved: tuple[SmallLog, Problem, Estimate, flo
 # --- dense linear algebra ---
 
 
-def dense(problem: Problem, estimate: Estimate) -> tuple[np.ndarray, gtsam.Ordering]:
+def dense(problem: Graph, estimate: Estimate) -> tuple[np.ndarray, gtsam.Ordering]:
     ordering = gtsam.Ordering()
     for symbol in (X, V, B):
         for i in range(problem.epochs):
             ordering.push_back(symbol(i))
     if problem.blocks:
         ordering.push_back(CALIBRATION_KEY)
-    jacobian, _ = linearized(problem, estimate).jacobian(ordering)
+    jacobian, _ = problem.linearized(estimate).jacobian(ordering)
     return np.array(jacobian), ordering
 
 
 def whitened_response(small: SmallLog, estimate: Estimate, held: tuple[Block, ...]) -> np.ndarray:
     """Field residuals' derivative by held parameters, in units of their sigma."""
-    poses, time = read_poses(estimate.values), small.fields.time
+    poses, time = states_in(estimate.values), small.fields.time
     cov = measurement_cov(small.site, small.fields)
     root = np.linalg.inv(np.linalg.cholesky(cov))
 
@@ -230,11 +231,17 @@ def whitened_response(small: SmallLog, estimate: Estimate, held: tuple[Block, ..
     return central_difference(residual, dimension(held), 1e-2)
 
 
-def weight_roots(problem: Problem, estimate: Estimate) -> np.ndarray:
+def phasors_of(problem: Graph) -> FieldPhasors:
+    fields = problem.measurements[0]
+    assert isinstance(fields, FieldPhasors)
+    return fields
+
+
+def weight_roots(problem: Graph, estimate: Estimate) -> np.ndarray:
     """Square root of each field residual's robust weight, as a column."""
-    assert problem.fields is not None
-    error, _, _ = problem.fields.residual(read_poses(estimate.values), estimate.calibration)
-    weight, _ = robust_weight(np.sum(error**2, axis=2), problem.fields.loss)
+    fields = phasors_of(problem)
+    error = fields.error(states_in(estimate.values), estimate.calibration)
+    weight, _ = robust_weight(np.sum(error**2, axis=2), fields.robust)
     return np.repeat(np.sqrt(weight).ravel(), 6)[:, None]
 
 
@@ -248,7 +255,7 @@ def test_what_is_held_is_considered_as_dense_algebra_has_it(
         small = with_outliers(small, 3, 0.2)
     problem, start = small_problem(small, choose_blocks(small.site, groups), loss=loss)
     estimate = optimise(problem, start, iterations=50, tolerance=1e-12).estimate
-    wanted = held_blocks(small.site, problem.blocks)
+    wanted = considered_blocks(small.site, problem.blocks)
     held = tuple(b for b in wanted if b.kind != "time_offset")
     poses, calibration = marginals(problem, estimate, held)
     alone, _ = marginals(problem, estimate)
@@ -278,8 +285,7 @@ def test_a_considered_survey_covers_errors_of_the_survey() -> None:
     rng = np.random.default_rng(4)
     small = small_log(4, epochs=6, perturb=False)
     problem, start = small_problem(small, ())
-    assert problem.fields is not None
-    held = tuple(b for b in held_blocks(small.site, ()) if b.kind != "time_offset")
+    held = tuple(b for b in considered_blocks(small.site, ()) if b.kind != "time_offset")
     estimate = optimise(problem, start, tolerance=1e-12).estimate
     with_survey, _ = marginals(problem, estimate, held)
     alone, _ = marginals(problem, estimate)
@@ -336,17 +342,17 @@ def test_field_jacobians_are_difference_quotients_at_the_applied_time_offset() -
     small = small_log(5, epochs=6)
     blocks = choose_blocks(small.site, (*SURVEY, "time-offset"))
     problem, estimate = small_problem(small, blocks)
-    assert problem.fields is not None
     rng = np.random.default_rng(5)
-    data = problem.fields.measurements
+    data = phasors_of(problem)
     own = 1e-6 * rng.standard_normal(data.by_time_offset.shape)  # T/s; some lock-in's
-    fields = FieldFactors(replace(data, by_time_offset=own), blocks, None)
-    poses = read_poses(estimate.values)
-    _, _, by_calibration = fields.residual(poses, estimate.calibration)
+    fields = replace(data, by_time_offset=own)
+    poses = states_in(estimate.values)
+    by_calibration = fields.linearize(poses, estimate.calibration, blocks).by_calibration
+    assert by_calibration is not None
 
     def moved(step: np.ndarray) -> np.ndarray:
         changed = retract(estimate.calibration, blocks, step * prior_sigma(blocks))
-        return fields.residual(poses, changed)[0]
+        return fields.error(poses, changed)
 
     quotient = central_difference(moved, dimension(blocks), 1e-2)
     analytic = by_calibration * prior_sigma(blocks)
@@ -369,15 +375,15 @@ def disturbed(truth: Trajectory, seed: int, metre: float, rad: float) -> Traject
     )
 
 
-def plain_gauss_newton(problem: Problem, estimate: Estimate, steps: int) -> float:
+def plain_gauss_newton(problem: Graph, estimate: Estimate, steps: int) -> float:
     """Return the cost after undamped steps; infinite where they lead to a singular system."""
     ordering = nested_dissection(problem.epochs, CALIBRATION_KEY)
     try:
         for _ in range(steps):
-            step = linearized(problem, estimate).optimize(ordering)
+            step = problem.linearized(estimate).optimize(ordering)
             turned = retract(estimate.calibration, problem.blocks, step.at(CALIBRATION_KEY))
             estimate = Estimate(estimate.values.retract(step), turned)
-        return cost_of(problem, estimate)
+        return problem.cost(estimate)
     except RuntimeError:
         return np.inf
 
@@ -387,7 +393,7 @@ def test_the_loop_recovers_by_damping_where_plain_steps_are_lost() -> None:
     problem, good = small_problem(small, choose_blocks(small.site, SURVEY))
     reached = optimise(problem, good, iterations=50)
     bad = initial_estimate(disturbed(small.truth, 11, metre=1.0, rad=1.2), problem.declared)
-    costs = [cost_of(problem, bad)]
+    costs = [problem.cost(bad)]
     found = optimise(problem, bad, iterations=200, report=lambda _, cost: costs.append(cost))
     assert found.converged
     assert found.cost == pytest.approx(reached.cost, rel=1e-4)
@@ -450,11 +456,11 @@ def test_a_missing_channel_has_no_say() -> None:
     cov[4, 1] = cov[7] = np.nan
     holed = replace(small, fields=replace(small.fields, phasor_sensor=phasor, phasor_cov=cov))
     problem, start = small_problem(holed, ())
-    assert problem.fields is not None
-    error, by_pose, _ = problem.fields.residual(read_poses(start.values), start.calibration)
-    assert np.all(error[4, 1] == 0.0)
-    assert np.all(by_pose[7] == 0.0)
-    assert np.all(error[4, 0] != 0.0)
+    rows = phasors_of(problem).linearize(states_in(start.values), start.calibration, ())
+    assert rows.by_pose is not None
+    assert np.all(rows.error[4, 1] == 0.0)
+    assert np.all(rows.by_pose[7] == 0.0)
+    assert np.all(rows.error[4, 0] != 0.0)
     found = optimise(problem, start)
     states = read_states(found.estimate.values, small.truth.time)
     assert trajectory_errors(states, small.truth, max_gap=1.0).ate < 0.01  # m

@@ -4,8 +4,8 @@ import magpylib
 import numpy as np
 import pytest
 
-from magfusion.physics.dipole import dipole_field
-from magfusion.physics.solenoid import loop_field, solenoid_field
+from magfusion.model.physics.dipole import dipole_field
+from magfusion.model.physics.solenoid import loop_field, solenoid_field
 from magfusion.units import Array
 
 MOMENT = np.array([0.0, 0.0, 65.0])  # A m^2

@@ -13,8 +13,8 @@ import pytest
 import static_48h
 from static_48h import CASES, HOUR, METHODS, Config, Errors, Row
 
-from magfusion.monte_carlo import run_many
 from magfusion.simulation.drift import Clock, Drift
+from magfusion.simulation.monte_carlo import run_many
 from magfusion.simulation.waveform import Mains
 from magfusion.simulation.worlds import F1, S0, draw_world
 

@@ -5,17 +5,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion import strapdown
-from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
-from magfusion.simulation.log import SimulationConfig, simulate_log
-from magfusion.simulation.motion import Rests, turning_motion
-from magfusion.strapdown import (
+from magfusion.model import strapdown
+from magfusion.model.site import MotionModel
+from magfusion.model.strapdown import (
     attitude_at,
     attitude_from_gyro,
     attitude_from_gyro_at,
     resting,
     rotation_increments,
 )
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.log import SimulationConfig, simulate_log
+from magfusion.simulation.motion import Rests, turning_motion
 
 
 def stream(seed, count=300):
@@ -142,7 +143,7 @@ def test_a_body_rests_where_it_is_simulated_at_rest_and_nowhere_in_motion(kind):
     config = SimulationConfig(DEMO_BOX_WORLD, 60.0, kind, rests=rests)
     run = simulate_log(demo_site(), config, np.random.default_rng(8))
     imu, motion = run.log.imu, run.motion
-    found = resting(imu.time, imu.gyro_body, imu.accel_body)
+    found = resting(imu.time, imu.gyro_body, imu.accel_body, motion=MotionModel())
     speed = np.linalg.norm(motion.velocity_world(imu.time), axis=1)
     rate = np.linalg.norm(motion.rate_body(imu.time), axis=1)
     still = (speed == 0.0) & (rate == 0.0)
@@ -163,7 +164,7 @@ def still_stream(seconds=4.0, rate_hz=100.0):
 
 def test_the_ends_of_a_stream_are_not_known_to_rest():
     time, gyro, accel = still_stream()
-    found = resting(time, gyro, accel)
+    found = resting(time, gyro, accel, motion=MotionModel())
     inside = (time >= 0.5) & (time <= time[-1] - 0.5)
     assert np.array_equal(found, inside)
 
@@ -172,7 +173,7 @@ def test_the_ends_of_a_stream_are_not_known_to_rest():
 def test_a_knock_spoils_the_rest_around_it_and_no_more(which):
     time, gyro, accel = still_stream()
     {"gyro": gyro, "accel": accel}[which][200] += 5.0  # at 2 s
-    found = resting(time, gyro, accel)
+    found = resting(time, gyro, accel, motion=MotionModel())
     assert not np.any(found[np.abs(time - 2.0) < 0.49])
     assert np.all(found[(np.abs(time - 2.0) > 0.51) & (time >= 0.5) & (time <= time[-1] - 0.5)])
 
@@ -181,7 +182,7 @@ def test_a_steady_turn_under_gravity_is_no_rest():
     time, gyro, accel = still_stream()
     gyro[:] = [1.0, 0.0, 0.0]
     accel[:] = 9.8 * np.stack([np.zeros_like(time), np.sin(time), np.cos(time)], axis=1)
-    assert not np.any(resting(time, gyro, accel))
+    assert not np.any(resting(time, gyro, accel, motion=MotionModel()))
 
 
 @pytest.mark.parametrize("chunk", [1, 130, 1999])
@@ -191,7 +192,18 @@ def test_a_stream_rests_in_pieces_where_it_rests_as_a_whole(monkeypatch, chunk):
     scale = np.where((time > 5.0) & (time < 12.0), 0.5, 2.0)[:, None]
     gyro = 0.01 * scale * rng.standard_normal((2000, 3))
     accel = 0.08 * scale * rng.standard_normal((2000, 3)) + [0.0, 0.0, 9.81]
-    whole = resting(time, gyro, accel)
+    whole = resting(time, gyro, accel, motion=MotionModel())
     assert 500 < np.sum(whole) < 800
     monkeypatch.setattr(strapdown, "CHUNK", chunk)
-    assert np.array_equal(resting(time, gyro, accel), whole)
+    assert np.array_equal(resting(time, gyro, accel, motion=MotionModel()), whole)
+
+
+def test_what_is_rest_is_for_the_sites_motion_model_to_say():
+    """A drill that stands and runs shakes more than a hand that moves."""
+    rng, time = np.random.default_rng(9), np.arange(0.0, 10.0, 0.005)
+    gyro, accel = rng.normal(0.0, [0.1], (len(time), 3)), rng.normal(0.0, 0.8, (len(time), 3))
+    drill = MotionModel(rest_gyro=0.4, rest_accel=3.0, rest_span=2.0)
+    assert not np.any(resting(time, gyro, accel, motion=MotionModel()))
+    still = resting(time, gyro, accel, motion=drill)
+    assert np.all(still[(time > 1.01) & (time < 8.98)])
+    assert not np.any(still[time < 0.99])  # the span is the model's

@@ -11,9 +11,10 @@ import table1_real_fields as table1
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.fixes.rssi import distances, fit_lines, ranges_from_lines, trilaterate
-from magfusion.physics.dipole import dipole_field
-from magfusion.records.survey import Survey, read_survey, write_survey
+from magfusion.files.survey import Survey, read_survey, write_survey
+from magfusion.model.physics.dipole import dipole_field
+from magfusion.papers.p004_fingerprints.equations import distances
+from magfusion.papers.p004_fingerprints.rssi import fit_lines, ranges_from_lines, trilaterate
 
 
 @pytest.fixture(scope="module")

@@ -6,17 +6,17 @@ import gtsam
 import numpy as np
 import pytest
 
-from magfusion.fusion import thinning
-from magfusion.fusion.batch import Smoothed, smooth
-from magfusion.fusion.inertial import Increments, cut_at_epochs, preintegrate
-from magfusion.fusion.thinning import FEWEST_LEFT, JOINED, preintegrate_stream, thinned
-from magfusion.records.samples import ImuSamples, Log
+from magfusion.estimation import imu_decimation as thinning
+from magfusion.estimation.batch import Smoothed, smooth
+from magfusion.estimation.imu_decimation import FEWEST_LEFT, JOINED, preintegrate_stream, thinned
+from magfusion.estimation.preintegration import Increments, cut_at_epochs, preintegrate
+from magfusion.model.samples import ImuSamples, Log
+from magfusion.model.site import ImuModel
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.log import simulate_fields
 from magfusion.simulation.motion import Rests, turning_motion
-from magfusion.site import ImuModel
-from magfusion.trajectory import Trajectory
 
 GRAVITY = 9.81
 MEMS = ImuModel(3e-4, 3e-3, 1e-5, 1e-4, 5e-3, 0.05)
@@ -160,8 +160,11 @@ def resting_log(seed: int) -> tuple[Log, object]:
     accel = 10.0 * noise.accel_noise * rng.standard_normal((number, 3))
     accel += np.array([0.02, -0.01, site.gravity])
     epochs = np.arange(20.0, 355.0, 40.0)
-    stands = np.tile(np.eye(3), (len(epochs), 1, 1)), np.tile([2.0, 1.5, 1.0], (len(epochs), 1))
-    fields = simulate_fields(site, Trajectory(epochs, *stands), 2e-10, rng)
+    is_stationary = (
+        np.tile(np.eye(3), (len(epochs), 1, 1)),
+        np.tile([2.0, 1.5, 1.0], (len(epochs), 1)),
+    )
+    fields = simulate_fields(site, Trajectory(epochs, *is_stationary), 2e-10, rng)
     return Log("rest", 0, "sim", ImuSamples(time, gyro, accel), None, fields, None), site
 
 

@@ -7,31 +7,34 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tracker_site import body_poses, in_beacon, tracker_site
 
-from magfusion.antenna import antenna_of
-from magfusion.calibration.antenna_bench import bursa_wolf_matrix
 from magfusion.errors import EstimationError, InputError
-from magfusion.fixes.candidates import beacon_directions
-from magfusion.fixes.likelihood import fix_epochs
-from magfusion.fixes.tracker import (
+from magfusion.estimation.snapshot.candidates import beacon_directions
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.antenna import antenna_of
+from magfusion.model.field import predict
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.physics.dipole import dipole_field
+from magfusion.model.samples import FieldSamples
+from magfusion.papers.p000_tracker.equations import (
     Correction,
-    attitude_as_printed,
-    attitude_corrected,
     attitude_from_angles,
-    attitude_of_printed_model,
-    coupling_as_printed,
+    bursa_wolf_matrix,
+    eq_01_coupling,
+    eq_09_whitened,
+    eq_10_coupling_as_printed,
+    eq_11_attitude,
+    eq_11_attitude_as_printed,
+    eq_11_attitude_of_eq_10,
+    eq_12_yaw_as_printed,
+    eq_14_roll_as_printed,
     euler_angles,
-    euler_angles_as_printed,
+)
+from magfusion.papers.p000_tracker.pose import (
     locate_by_svd,
-    position_matrix,
     refine_poses,
     unit_coupling,
-    whitened,
     world_poses,
 )
-from magfusion.observation import predict
-from magfusion.parameters import initial_calibration
-from magfusion.physics.dipole import dipole_field
-from magfusion.records.samples import FieldSamples
 from magfusion.units import DEGREE, MU0_OVER_4PI
 
 NONE = np.zeros((3, 3))
@@ -84,7 +87,9 @@ def test_general_antennas_are_whitened() -> None:
     attitude, position, coupling = ideal(50)
     receiver, transmitter = (np.eye(3) + 0.2 * rng.standard_normal((3, 3)) for _ in range(2))
     seen = receiver @ coupling @ transmitter
-    fix = locate_by_svd(whitened(seen, np.linalg.inv(receiver), transmitter)).nearest(position)
+    fix = locate_by_svd(eq_09_whitened(seen, np.linalg.inv(receiver), transmitter)).nearest(
+        position
+    )
     np.testing.assert_allclose(fix.sensor_from_beacon, attitude, rtol=0, atol=1e-9)
     np.testing.assert_allclose(fix.position_beacon[:, 0], position, rtol=0, atol=1e-9)
 
@@ -92,7 +97,7 @@ def test_general_antennas_are_whitened() -> None:
 def test_eq_1_has_the_minus_that_goes_with_its_matrix() -> None:
     attitude, position, coupling = ideal(5)
     distance = np.linalg.norm(position, axis=1)[:, None, None]
-    printed = -MU0_OVER_4PI / distance**3 * attitude @ position_matrix(position)
+    printed = eq_01_coupling(MU0_OVER_4PI, attitude, position, np.eye(3))
     np.testing.assert_allclose(coupling, printed, rtol=0, atol=1e-13 * np.max(coupling))
     np.testing.assert_allclose(
         np.linalg.det(coupling * distance**3 / MU0_OVER_4PI), 2.0, rtol=1e-12
@@ -107,8 +112,11 @@ def test_angles_and_attitude(angles_deg: tuple[float, float, float]) -> None:
 
 def test_the_printed_arctan_is_wrong_by_half_a_turn() -> None:
     attitude = attitude_from_angles(np.array([170.0, 0.0, 10.0]) * DEGREE)
-    printed = euler_angles_as_printed(attitude) / DEGREE
-    np.testing.assert_allclose(printed, [-10.0, 0.0, 10.0], atol=1e-12)
+    for turned in (attitude, attitude_from_angles(np.array([10.0, 0.0, 170.0]) * DEGREE)):
+        angles = euler_angles(turned) / DEGREE
+        printed = [f(turned) / DEGREE for f in (eq_12_yaw_as_printed, eq_14_roll_as_printed)]
+        wrong = np.abs(angles[[0, 2]]) > 90.0
+        np.testing.assert_allclose(np.abs(angles[[0, 2]] - printed), 180.0 * wrong, atol=1e-12)
 
 
 def test_eq_11_as_printed_does_not_invert_eq_10() -> None:
@@ -124,9 +132,9 @@ def test_eq_11_as_printed_does_not_invert_eq_10() -> None:
         receiver_shift=0.005 * parts[3],
         ambient=0.1 * parts[4],
     )
-    seen = coupling_as_printed(attitude, position, gain, drive, correction)
-    printed = attitude_as_printed(seen, position, gain, drive, correction)
-    repaired = attitude_of_printed_model(seen, position, gain, drive, correction)
+    seen = eq_10_coupling_as_printed(gain, attitude, position, drive, correction)
+    printed = eq_11_attitude_as_printed(seen, position, gain, drive, correction)
+    repaired = eq_11_attitude_of_eq_10(seen, position, gain, drive, correction)
     assert np.max(np.abs(printed - attitude)) > 0.1
     np.testing.assert_allclose(repaired, attitude, rtol=0, atol=1e-12)
 
@@ -137,7 +145,7 @@ def test_eq_11_corrected_is_exact() -> None:
     receiver, transmitter = (np.eye(3) + 0.1 * rng.standard_normal((3, 3)) for _ in range(2))
     ambient = 1e-6 * rng.standard_normal((3, 1)) * np.ones(3)  # T, the same in every slot
     seen = np.linalg.inv(receiver) @ coupling @ transmitter + ambient
-    found = attitude_corrected(seen, position, receiver, transmitter, ambient)
+    found = eq_11_attitude(seen, position, receiver, transmitter, ambient)
     np.testing.assert_allclose(found, attitude, rtol=0, atol=1e-12)
 
 
@@ -154,8 +162,8 @@ def test_printed_rotations_make_it_worse_and_corrected_ones_better() -> None:
     measured = np.swapaxes(seen, 1, 2) @ coupling @ sent
     sent_matrix, seen_matrix = (bursa_wolf_matrix(turn) for turn in turns)
     known = Correction(np.linalg.inv(sent_matrix), NONE, np.linalg.inv(seen_matrix), NONE, NONE)
-    printed = attitude_as_printed(measured, position, MU0_OVER_4PI, np.eye(3), known)
-    corrected = attitude_corrected(measured, position, seen_matrix, sent_matrix, NONE)
+    printed = eq_11_attitude_as_printed(measured, position, MU0_OVER_4PI, np.eye(3), known)
+    corrected = eq_11_attitude(measured, position, seen_matrix, sent_matrix, NONE)
     before = rms(between_deg(locate_by_svd(measured).sensor_from_beacon, attitude))
     after = rms(between_deg(polar(printed), attitude))
     assert before == pytest.approx(2.67, abs=0.3)
@@ -283,4 +291,4 @@ def test_a_runaway_is_no_pose() -> None:
     antenna = antenna_of(site.beacons[0], site.platform.magnetometer)
     wrong = np.broadcast_to(np.eye(3), (3, 3, 3))
     with pytest.raises(EstimationError, match="does not converge"):
-        refine_poses(antenna, coupling, wrong, 3.0 * position[::-1], iterations=2)
+        refine_poses(antenna, coupling, wrong, 3.0 * position[::-1], passes=2)

@@ -11,16 +11,16 @@ import tracker_motion_skew as moving
 from conftest import run_command
 from time_slots_and_mains import tracker
 
-from magfusion.evaluation.errors import trajectory_errors
-from magfusion.fusion.batch import SmootherSettings, smooth
-from magfusion.records.log import read_log, write_log
-from magfusion.records.samples import FieldSamples, Log
+from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.files.log import read_log, write_log
+from magfusion.files.site import save_site
+from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.site import Site, Slots
+from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.field import phasors_world, synchronised_drives
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.motion import Rests, turning_motion
 from magfusion.simulation.waveform import simulate_waveform
-from magfusion.site import Site, Slots
-from magfusion.site_file import save_site
 
 SLOTS = Slots(5e-3, 4)
 
@@ -103,15 +103,15 @@ def test_loose_coupling_takes_a_cycle_for_an_epoch() -> None:
     assert trajectory_errors(loose.states, log.truth).attitude_rmse_deg < 0.2
 
 
-def _recorded(path: Path, carrier_hz: float) -> Path:
+def _recorded(path: Path, carrier_hz: float, duration: float = 3.0) -> Path:
     """Write a log of a slotted tracker, with its waveform and site."""
     site = tracker(carrier_hz, SLOTS, density=1e-10)
     site = replace(site, earth_field_world=np.array([0.0, 2e-5, -5e-5]))
     rng = np.random.default_rng(8)
-    motion = turning_motion(rng, 3.0, moving.BOX_WORLD, 0.2, rate_rms=0.5, rests=Rests(0.5))
-    imu = simulate_imu(motion, site.platform.imu, site.gravity, 500.0, 3.0, rng).samples
+    motion = turning_motion(rng, duration, moving.BOX_WORLD, 0.2, rate_rms=0.5, rests=Rests(0.5))
+    imu = simulate_imu(motion, site.platform.imu, site.gravity, 500.0, duration, rng).samples
     drives = synchronised_drives(site)
-    waveform = simulate_waveform(motion, site, drives, 8e3, 3.0, rng)
+    waveform = simulate_waveform(motion, site, drives, 8e3, duration, rng)
     truth = motion.trajectory(imu.time)
     write_log(
         Log("tracker", 1_700_000_000_000_000_000, "simulation", imu, waveform, None, truth), path
@@ -143,3 +143,21 @@ def test_the_ordinary_commands_read_a_slotted_tracker(tmp_path: Path, carrier_hz
     assert smoothed["attitude_rmse_deg"] < 0.5 * fixed["attitude_rmse_deg"]
     assert again["attitude_rmse_deg"] < 0.5 * fixed["attitude_rmse_deg"]
     assert smoothed["inside_3_sigma"] > 0.9
+
+
+@pytest.mark.parametrize("carrier_hz", [0.0, 2e3])
+def test_raw_slots_navigate_as_well_as_the_phasors_of_the_whole_log(
+    tmp_path: Path, carrier_hz: float
+) -> None:
+    log = _recorded(tmp_path / "log", carrier_hz, 8.0)
+    run_command("demodulate", log, "-o", tmp_path / "phasors")
+    run_command("smooth", log, "-o", tmp_path / "smoothed")
+    for made, name in ((log, "raw"), (tmp_path / "phasors", "known")):
+        run_command("navigate", made, "--estimator", "ekf", "-o", tmp_path / name)
+    raw, known, smoothed = (_figures(tmp_path / name) for name in ("raw", "known", "smoothed"))
+    # A state comes with the end of a cycle, of the slots before.
+    assert raw["epochs"] > 0.9 * known["epochs"]
+    assert raw["attitude_rmse_deg"] < 1.15 * known["attitude_rmse_deg"]
+    assert raw["ate_m"] < 1.15 * known["ate_m"]
+    assert raw["inside_3_sigma"] > 0.97
+    assert raw["attitude_rmse_deg"] < 4.0 * smoothed["attitude_rmse_deg"]

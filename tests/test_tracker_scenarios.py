@@ -13,7 +13,7 @@ from tracker_antennas import Errors
 from tracker_near_field import learn_sizes
 from tracker_table1 import SCENARIO_A, SCENARIO_COMMON, SCENARIO_E, SCENARIO_F2, Row
 
-from magfusion.physics.solenoid import loop_field
+from magfusion.model.physics.solenoid import loop_field
 
 
 @pytest.fixture(scope="module")

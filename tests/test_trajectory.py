@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.trajectory import Trajectory, interpolate
+from magfusion.model.trajectory import Trajectory, interpolate
 
 RATE = np.array([0.4, -0.3, 1.2])  # rad/s
 VELOCITY = np.array([1.0, -2.0, 0.5])  # m/s

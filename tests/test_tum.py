@@ -9,8 +9,8 @@ from example_log import EPOCH_NS, example_trajectory
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.records.tum import read_tum, write_tum
-from magfusion.trajectory import Trajectory
+from magfusion.files.tum import read_tum, write_tum
+from magfusion.model.trajectory import Trajectory
 
 GOOD = "0.0 1 2 3 0 0 0 1"
 

@@ -10,12 +10,13 @@ from rerun.chunk import Chunk, RrdReader
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.evaluation.errors import TrajectoryErrors, trajectory_errors
-from magfusion.physics.dipole import dipole_field
-from magfusion.shapes import beads, coverage_shell, ellipsoids
+from magfusion.model.physics.dipole import dipole_field
+from magfusion.model.trajectory import Trajectory
+from magfusion.results.errors import TrajectoryErrors, trajectory_errors
+from magfusion.results.recording import COVERAGE, open_viewer, write_recording
+from magfusion.results.recording_plots import MAX_ROWS
+from magfusion.results.shapes import beads, coverage_shell, ellipsoids
 from magfusion.simulation.demo_site import demo_site
-from magfusion.trajectory import Trajectory
-from magfusion.view import COVERAGE, MAX_ROWS, open_viewer, write_recording
 
 SITE = demo_site()
 N = 200

@@ -12,13 +12,13 @@ import time
 import gtsam
 import numpy as np
 
-from magfusion.fusion.batch import smooth
-from magfusion.fusion.inertial import preintegration_parameters
-from magfusion.records.samples import ImuSamples, Log
+from magfusion.estimation.batch import smooth
+from magfusion.estimation.preintegration import preintegration_parameters
+from magfusion.model.samples import ImuSamples, Log
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.log import simulate_fields
-from magfusion.site import Site
-from magfusion.trajectory import Trajectory
 
 LONGEST_HOURS = 48.0  # to which the times are scaled
 IMU_RATE_HZ = 100.0

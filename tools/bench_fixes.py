@@ -30,17 +30,17 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from magfusion.fixes.fix import Fixes
-from magfusion.fixes.refine import refine
-from magfusion.observation import observe, observe_from, skew
-from magfusion.parameters import Calibration, initial_calibration
-from magfusion.records.samples import FieldSamples
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.estimation.snapshot.refine import refine
+from magfusion.model.field import observe, observe_from, skew
+from magfusion.model.noise import measurement_cov, paired_whitening, stacked
+from magfusion.model.parameters import Calibration, initial_calibration
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Beacon, Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import simulate_fields
-from magfusion.site import Beacon, Site
-from magfusion.trajectory import Trajectory
 from magfusion.units import Array, ComplexArray
-from magfusion.weights import measurement_cov, paired_whitening, stacked
 
 FIXES, RIVAL_FIXES = 100_000, 300
 BEACONS = 3

@@ -32,25 +32,24 @@ from bench_batch import bench_batch
 from native_graph import native_graph
 from scipy.spatial.transform import Rotation
 
-from magfusion.fusion.factors import FieldFactors, FieldMeasurements
-from magfusion.fusion.inertial import cut_at_epochs, preintegrate
-from magfusion.fusion.smoother import (
+from magfusion.estimation.graph import (
     Estimate,
-    Optimised,
-    Problem,
-    inertial_graph,
+    Graph,
     initial_estimate,
     marginals,
-    optimise,
 )
-from magfusion.parameters import Block, Calibration, choose_blocks, initial_calibration
+from magfusion.estimation.inertial import inertial_graph
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.preintegration import cut_at_epochs, preintegrate
+from magfusion.estimation.solve.bordered import Optimised, optimise
+from magfusion.model.noise import paired_whitening, stacked
+from magfusion.model.parameters import Block, Calibration, choose_blocks, initial_calibration
+from magfusion.model.site import Beacon, BeaconSigma, Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.log import perturb_site, simulate_fields
 from magfusion.simulation.motion import random_walk_motion
-from magfusion.site import Beacon, BeaconSigma, Site
-from magfusion.trajectory import Trajectory
-from magfusion.weights import paired_whitening, stacked
 
 T = TypeVar("T")
 
@@ -93,15 +92,15 @@ class Scene:
     declared: Calibration
     blocks: tuple[Block, ...]
     start: Trajectory
-    measurements: FieldMeasurements
+    measurements: FieldPhasors
     preintegrated: list[gtsam.PreintegratedCombinedMeasurementsG]
     preintegrate_seconds: float
 
-    def problem(self) -> Problem:
+    def problem(self) -> Graph:
         """Return a graph for our loop."""
-        native = inertial_graph(self.preintegrated, self.declared.site.platform.imu)
-        fields = FieldFactors(self.measurements, self.blocks, None)
-        return Problem(native, fields, self.declared, len(self.start))
+        native = inertial_graph(self.preintegrated, self.declared.site.platform)
+        own = (self.measurements,)
+        return Graph(native, own, self.declared, self.blocks, len(self.start))
 
 
 def timed(job: Callable[[], T]) -> tuple[T, float]:
@@ -128,10 +127,11 @@ def make_scene(epochs: int, seed: int) -> Scene:
         position_world=truth.position_world + rng.normal(0.0, POSITION_ERROR, (epochs, 3)),
     )
     measured = stacked(samples.phasor_sensor)
-    measurements = FieldMeasurements(
+    measurements = FieldPhasors(
+        epoch=np.arange(epochs),
         time=samples.time,
         measured=measured,
-        root=paired_whitening(samples.phasor_cov, samples.valid),
+        sqrt_information=paired_whitening(samples.phasor_cov, samples.valid),
         rate_body=zero,
         applied_offset=0.0,
         by_time_offset=np.zeros_like(measured),
@@ -146,11 +146,11 @@ def make_scene(epochs: int, seed: int) -> Scene:
 class Ours:
     """Our loop on one scene, run once or more."""
 
-    problem: Problem
+    problem: Graph
     start: Estimate
     preintegrate_seconds: float
     build_seconds: float
-    found: Optimised
+    found: Optimised[Estimate]
     runs: list[float]
 
     @property

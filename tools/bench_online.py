@@ -22,15 +22,15 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from scipy.spatial.transform import Rotation
 
-from magfusion.fusion.inertial import preintegration_parameters
-from magfusion.fusion.online import Navigator, NavigatorSettings
-from magfusion.observation import skew
-from magfusion.records.samples import FieldSamples, ImuSamples
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.preintegration import preintegration_parameters
+from magfusion.model.field import skew
+from magfusion.model.samples import FieldSamples, ImuSamples
+from magfusion.model.site import Site
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.log import simulate_fields
 from magfusion.simulation.motion import random_walk_motion
-from magfusion.site import Site
 from magfusion.units import Array
 
 IMU_RATE_HZ = 100.0

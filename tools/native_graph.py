@@ -12,15 +12,16 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, M, S, X
 
-from magfusion.fusion.factors import FieldMeasurements
-from magfusion.fusion.ordering import nested_dissection
-from magfusion.fusion.smoother import inertial_graph, initial_estimate
-from magfusion.observation import observe, predict
-from magfusion.parameters import Calibration
-from magfusion.site import Beacon, Magnetometer, Site
-from magfusion.trajectory import Trajectory
+from magfusion.estimation.graph import initial_estimate
+from magfusion.estimation.inertial import inertial_graph
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.solve.ordering import nested_dissection
+from magfusion.model.field import observe, predict
+from magfusion.model.noise import stacked
+from magfusion.model.parameters import Calibration
+from magfusion.model.site import Beacon, Magnetometer, Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
-from magfusion.weights import stacked
 
 JACOBIAN_COLUMNS = (6, 6, 2, 9)  # platform, beacon, log-moments, magnetometer matrix
 
@@ -32,7 +33,7 @@ class BatchedModel:
     comes with others, all are computed anew.
     """
 
-    def __init__(self, site: Site, measurements: FieldMeasurements) -> None:
+    def __init__(self, site: Site, measurements: FieldPhasors) -> None:
         self.site, self.data = site, measurements
         self._poses = np.zeros((0, 12))
         self._calibration = [b""] * len(site.beacons)
@@ -75,14 +76,14 @@ class BatchedModel:
 
     def _add_error(self, value: Array, i: int) -> None:
         error = (value - self.data.measured[:, [i]])[..., None]
-        self._errors.append((self.data.root[:, [i]] @ error)[:, 0, :, 0])
+        self._errors.append((self.data.sqrt_information[:, [i]] @ error)[:, 0, :, 0])
 
     def _differentiate(
         self, beacon: Beacon, sensor: Magnetometer, turn: Array, position: Array, i: int
     ) -> list[Array]:
         seen = observe(beacon, sensor, turn, position)
         self._add_error(stacked(seen.phasor_sensor), i)
-        root = self.data.root[:, i]
+        root = self.data.sqrt_information[:, i]
         blocks = (seen.platform_pose, seen.beacon_pose, seen.log_moments, seen.matrix)
         return [root @ np.concatenate([b[:, 0].real, b[:, 0].imag], axis=1) for b in blocks]
 
@@ -128,12 +129,12 @@ def native_graph(
     declared: Calibration,
     start: Trajectory,
     preintegrated: list[gtsam.PreintegratedCombinedMeasurementsG],
-    measurements: FieldMeasurements,
+    measurements: FieldPhasors,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, gtsam.Ordering]:
     """Return the same problem for GTSAM's optimizer: graph, start and ordering."""
     site, epochs = declared.site, len(start)
     diagonal = gtsam.noiseModel.Diagonal.Sigmas
-    graph = inertial_graph(preintegrated, site.platform.imu)
+    graph = inertial_graph(preintegrated, site.platform)
     values = gtsam.Values(initial_estimate(start, declared).values)
     ordering = nested_dissection(epochs, None)
     for i, beacon in enumerate(site.beacons):

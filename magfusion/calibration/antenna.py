@@ -1,14 +1,16 @@
 """Calibration of a tracker's antennas: joint least squares over a survey of known poses.
 
 Where the poses are themselves uncertain, see `magfusion.calibration.antenna_graph`; the procedure
-of paper 000 is in `magfusion.calibration.antenna_bench`.
+of paper 000 is in `magfusion.papers.p000_tracker.bench`.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.antenna import (
+from magfusion.errors import EstimationError
+from magfusion.estimation.solve.batched import Normal, minimise, normal_equations
+from magfusion.model.antenna import (
     CENTRES,
     KAPPAS,
     MOMENTS,
@@ -18,8 +20,7 @@ from magfusion.antenna import (
     antenna_from_vector,
     observe_antenna,
 )
-from magfusion.errors import EstimationError
-from magfusion.units import Array
+from magfusion.units import Array, IntArray
 
 ITERATIONS = 20
 CONVERGED = 1e-4  # of a prior sigma
@@ -52,7 +53,6 @@ class AntennaFit:
 
     Parameters
     ----------
-    antenna : Antenna
     cov : ndarray, shape (..., k, k)
         Of `Antenna.vector`.
     chi2 : ndarray, shape (...)
@@ -113,15 +113,10 @@ def fit_at_known_poses(survey: AntennaSurvey, start: Antenna, sigma: Array) -> A
 
     Parameters
     ----------
-    survey : AntennaSurvey
     start : Antenna
         Mean of the prior; of a single antenna, or with the survey's leading axes.
     sigma : ndarray, shape (k,)
         Of the prior (`prior_sigma`).
-
-    Returns
-    -------
-    AntennaFit
 
     Raises
     ------
@@ -129,67 +124,62 @@ def fit_at_known_poses(survey: AntennaSurvey, start: Antenna, sigma: Array) -> A
         Where it does not converge.
     """
     lead = survey.coupling.shape[:-3]
-    mean = np.broadcast_to(start.vector(), (*lead, len(sigma)))
-    scaled = np.zeros_like(mean)  # (vector - mean) / sigma
-    for _ in range(ITERATIONS):
-        rest, jacobian = _linearized(survey, mean + scaled * sigma, sigma)
-        turned = np.swapaxes(jacobian, -1, -2)
-        normal = turned @ jacobian + np.eye(len(sigma))
-        right = (turned @ rest[..., None])[..., 0] - scaled
-        step = np.linalg.solve(normal, right[..., None])[..., 0]
-        scaled = scaled + step
-        if not np.all(np.isfinite(step)):
-            break
-        if np.max(np.abs(step)) < CONVERGED:
-            vector = mean + scaled * sigma
-            rest, _ = _linearized(survey, vector, sigma)
-            return AntennaFit(
-                antenna=antenna_from_vector(vector),
-                cov=np.linalg.inv(normal) * sigma[:, None] * sigma,
-                chi2=np.asarray(np.sum(rest**2, axis=-1) + np.sum(scaled**2, axis=-1)),
-                dof=rest.shape[-1],
-                beacon_from_sensor=survey.beacon_from_sensor,
-                position_beacon=survey.position_beacon,
-            )
-    raise EstimationError(
-        f"the antenna's calibration does not converge in {ITERATIONS} steps: poses and couplings"
-        " disagree by far more than the prior allows"
+    mean = np.broadcast_to(start.vector(), (*lead, len(sigma))).reshape(-1, len(sigma))
+    n = survey.coupling.shape[-3]
+    rotation = survey.beacon_from_sensor.reshape(-1, n, 3, 3)
+    position = survey.position_beacon.reshape(-1, n, 3)
+    coupling = survey.coupling.reshape(-1, n, 3, 3)
+    weight = 1.0 / survey.sigma.reshape(-1, n)[..., None, None]
+
+    def model(rows: IntArray, scaled: Array) -> Normal:
+        """Take (vector - mean) / sigma."""
+        antenna = antenna_from_vector((mean[rows] + scaled * sigma)[:, None])
+        seen = observe_antenna(antenna, rotation[rows], position[rows])
+        error = (seen.value - coupling[rows]) * weight[rows]
+        jacobian = seen.antenna * (weight[rows, ..., None] * sigma)
+        fields = normal_equations(
+            error.reshape(len(rows), -1), jacobian.reshape(len(rows), -1, len(sigma))
+        )
+        return Normal(
+            fields.cost + np.sum(scaled**2, axis=-1),
+            fields.gradient + scaled,
+            fields.information + np.eye(len(sigma)),
+        )
+
+    found = minimise(model, np.zeros_like(mean), passes=ITERATIONS, absolute=CONVERGED**2)
+    if not np.all(found.converged):
+        raise EstimationError(
+            f"the antenna's calibration does not converge in {ITERATIONS} steps: poses and"
+            " couplings disagree by far more than the prior allows"
+        )
+    cov = np.linalg.inv(found.information) * sigma[:, None] * sigma
+    return AntennaFit(
+        antenna=antenna_from_vector((mean + found.state * sigma).reshape(*lead, -1)),
+        cov=cov.reshape(*lead, *cov.shape[1:]),
+        chi2=found.cost.reshape(lead),
+        dof=9 * n,
+        beacon_from_sensor=survey.beacon_from_sensor,
+        position_beacon=survey.position_beacon,
     )
-
-
-def _linearized(survey: AntennaSurvey, vector: Array, sigma: Array) -> tuple[Array, Array]:
-    """Return the whitened residual (..., 9 n) and its Jacobian by vector / sigma."""
-    antenna = antenna_from_vector(vector[..., None, :])
-    seen = observe_antenna(antenna, survey.beacon_from_sensor, survey.position_beacon)
-    weight = 1.0 / survey.sigma[..., None, None]
-    rest = (survey.coupling - seen.value) * weight
-    jacobian = seen.antenna * (weight[..., None] * sigma)
-    lead = rest.shape[:-3]
-    return rest.reshape(*lead, -1), jacobian.reshape(*lead, -1, len(sigma))
 
 
 def with_receiver_gain(fit: AntennaFit, declared: Antenna) -> AntennaFit:
     """Return a fit whose sensitivities are as large as declared in their geometric mean.
 
-    Couplings tell the product of moments and sensitivities alone.  The prior shares it out, with a
-    sigma that is no error of any coupling; here the receiver's mean gain is held, and the sigmas
-    are those of everything else (the S-transformation of geodesy).
+    Couplings determine the product of moments and sensitivities alone.  The prior shares it out,
+    with a sigma that is no error of any coupling; here the receiver's mean gain is fixed, and the
+    sigmas are those of everything else (the S-transformation of geodesy).
 
     Parameters
     ----------
     fit : AntennaFit
         Of one antenna.
-    declared : Antenna
-
-    Returns
-    -------
-    AntennaFit
     """
     found = fit.antenna
     size = np.linalg.norm(found.sensitivities_sensor, axis=-1)
     reference = np.linalg.norm(declared.sensitivities_sensor, axis=-1)
     factor = float(np.exp(np.mean(np.log(reference / size))))
-    held = replace(
+    fixed = replace(
         found,
         moments_beacon=found.moments_beacon / factor,
         sensitivities_sensor=found.sensitivities_sensor * factor,
@@ -197,10 +187,10 @@ def with_receiver_gain(fit: AntennaFit, declared: Antenna) -> AntennaFit:
     scale = np.ones(len(fit.cov))
     scale[MOMENTS], scale[SENSITIVITIES] = 1.0 / factor, factor
     gauge, by_gain = np.zeros(len(scale)), np.zeros(len(scale))
-    gauge[MOMENTS] = -held.moments_beacon.ravel()
-    gauge[SENSITIVITIES] = held.sensitivities_sensor.ravel()
+    gauge[MOMENTS] = -fixed.moments_beacon.ravel()
+    gauge[SENSITIVITIES] = fixed.sensitivities_sensor.ravel()
     square = (size * factor)[:, None] ** 2
-    by_gain[SENSITIVITIES] = (held.sensitivities_sensor / square / len(size)).ravel()
+    by_gain[SENSITIVITIES] = (fixed.sensitivities_sensor / square / len(size)).ravel()
     projection = np.eye(len(scale)) - np.outer(gauge, by_gain)  # by_gain @ gauge is one
     transform = projection * scale
-    return replace(fit, antenna=held, cov=transform @ fit.cov @ transform.T)
+    return replace(fit, antenna=fixed, cov=transform @ fit.cov @ transform.T)

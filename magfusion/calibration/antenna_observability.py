@@ -1,4 +1,4 @@
-"""What a survey can tell of a tracker's antennas: rank, null space in words, fewest poses.
+"""What a survey determines of a tracker's antennas: rank, null space in words, fewest poses.
 
 By singular values of the whitened Jacobian; what is not known of the poses is eliminated first, so
 that its columns may take up whatever they can.
@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.antenna import (
+from magfusion.calibration.antenna import AntennaSurvey
+from magfusion.model.antenna import (
     CENTRES,
     KAPPAS,
     MOMENTS,
@@ -17,8 +18,7 @@ from magfusion.antenna import (
     Antenna,
     observe_antenna,
 )
-from magfusion.calibration.antenna import AntennaSurvey
-from magfusion.observation import skew
+from magfusion.model.field import skew
 from magfusion.units import Array
 
 NO_INFORMATION = 1e-8  # of the largest singular value; arithmetic leaves 1e-13, weak poses 1e-3
@@ -38,8 +38,6 @@ class Observability:
 
     Parameters
     ----------
-    parameters : int
-    rank : int
     singular : ndarray
         Relative to the largest, in descending order: parameters are relative to the coils' moments
         and sensitivities and to the mean distance.
@@ -64,7 +62,7 @@ def observability(
     positions_known: bool = True,
     centred: bool = False,
 ) -> Observability:
-    """Tell what a survey determines of the antennas, without any prior.
+    """Return what a survey determines of the antennas, without any prior.
 
     Parameters
     ----------
@@ -74,13 +72,9 @@ def observability(
         Where the Jacobian is taken: a linear statement.  Symmetric opposites ((p, c, b) to
         -(p, c, b), (m, s) to -(m, s)) are beyond it.
     attitudes_known, positions_known : bool
-        What the survey tells of its poses.
+        What the survey knows of its poses.
     centred : bool
         All coils of an antenna at its origin: the centres are no parameters.
-
-    Returns
-    -------
-    Observability
     """
     free = ([] if attitudes_known else [0, 1, 2]) + ([] if positions_known else [3, 4, 5])
     columns = np.arange(antenna.vector().shape[-1])
@@ -97,7 +91,7 @@ def observability(
     return Observability(
         parameters=len(columns),
         rank=rank,
-        singular=np.asarray(size / size[0]),
+        singular=size / size[0],
         null_space=_in_words(null, _gauges(antenna, survey.beacon_from_sensor[0]), scale),
         fewest_poses=_fewest(rows, rank),
     )
@@ -120,10 +114,10 @@ def _remaining(survey: AntennaSurvey, antenna: Antenna, scale: Array, free: list
     weight = 1.0 / survey.sigma[:, None, None]
     rows = (seen.antenna * weight[..., None] * scale).reshape(len(weight), 9, -1)
     if not free:
-        return np.asarray(rows)
+        return rows
     by_pose = (seen.pose * weight[..., None]).reshape(len(weight), 9, 6)[..., free]
     left, _, _ = np.linalg.svd(by_pose / np.linalg.norm(by_pose, axis=1, keepdims=True))
-    return np.asarray(np.swapaxes(left[..., len(free) :], 1, 2) @ rows)
+    return np.swapaxes(left[..., len(free) :], 1, 2) @ rows
 
 
 def _fewest(rows: Array, rank: int) -> int:
@@ -145,7 +139,7 @@ def _gauges(antenna: Antenna, beacon_from_sensor: Array) -> dict[str, Array]:
         return np.pad(tangent, ((0, 0), (0, antenna.vector().shape[-1] - KAPPAS.start)))
 
     def turned(coils: Array, axis: Array) -> Array:
-        return np.asarray(coils @ skew(axis).T)
+        return coils @ skew(axis).T
 
     shifts = [np.tile(axis, (3, 1)) for axis in unit]
     scale = rows((3.0 * moments, centres, zero, arms))
@@ -197,4 +191,4 @@ def _without(null: Array, known: Array) -> Array:
         return null
     basis = np.linalg.qr(known.T)[0]
     _, size, right = np.linalg.svd(null - null @ basis @ basis.T, full_matrices=False)
-    return np.asarray(right[size > 0.5])
+    return right[size > 0.5]

@@ -1,7 +1,7 @@
 """Where a beacon is, how it is turned, and its moments, from magnetometers at known poses.
 
-The exact method beside that of paper 002 (`magfusion.calibration.beacon_paper`).  The phasors are
-linear in the moments, so that of nine unknowns (centre and two moments, imbalance and angle
+The exact method beside that of paper 002 (`magfusion.papers.p002_beacon.calibration`).  The phasors
+are linear in the moments, so that of nine unknowns (centre and two moments, imbalance and angle
 between the coils included) only the centre has to be searched for: variable projection, from a
 grid, because from a single start one fit in two ends in a wrong minimum.
 """
@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.ndimage
 
-from magfusion.calibration.least_squares import minimise
 from magfusion.errors import InputError
-from magfusion.observation import observe_from
-from magfusion.site import Beacon, Magnetometer
+from magfusion.estimation.solve.batched import Normal, minimise, normal_equations
+from magfusion.model.field import observe_from
+from magfusion.model.site import Beacon, Magnetometer
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 SPACING = 0.5  # m; of the grid that seeds the search
@@ -34,7 +34,6 @@ class BeaconMeasurements:
     ----------
     beacon : Beacon
         As declared.
-    magnetometer : Magnetometer
     world_from_body : ndarray, shape (points, 3, 3)
     position_world : ndarray, shape (points, 3)
         Origin of the body (m).
@@ -58,6 +57,18 @@ class BeaconMeasurements:
         return tuple(bool(self.beacon.synchronised and count == 1) for count in coils)
 
     @property
+    def unit_moments(self) -> ComplexArray:
+        """The moments of all tones for one of each unknown, shape (unknowns, tones, 3), world."""
+        units: list[ComplexArray] = []
+        for tone, real in enumerate(self.real_tones):
+            drive = self.beacon.excitation[:, tone].sum()
+            for turn in (drive,) if real else (1.0, 1j):
+                unit = np.zeros((3, len(self.real_tones), 3), dtype=np.complex128)
+                unit[:, tone] = turn * np.eye(3)
+                units.append(unit)
+        return np.concatenate(units)
+
+    @property
     def weight(self) -> Array:
         """One over sigma, shape (points, tones, 2); zero where a phasor is missing."""
         return np.where(self.valid[..., None], 1.0 / self.sigma, 0.0)
@@ -65,7 +76,7 @@ class BeaconMeasurements:
     @property
     def valid(self) -> BoolArray:
         """Which points and tones all runs hold, shape (points, tones)."""
-        return np.asarray(np.isfinite(self.phasor_sensor).all(axis=(0, 3)))
+        return np.all(np.isfinite(self.phasor_sensor), axis=(0, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,13 +111,8 @@ def calibrate_beacon(measured: BeaconMeasurements, reach: float = REACH) -> Beac
 
     Parameters
     ----------
-    measured : BeaconMeasurements
     reach : float
         How far from the declared place the beacon may be (m).
-
-    Returns
-    -------
-    BeaconFits
 
     Raises
     ------
@@ -114,24 +120,25 @@ def calibrate_beacon(measured: BeaconMeasurements, reach: float = REACH) -> Beac
         Where there are fewer than two magnetometers, or they do not determine the unknowns.
     """
     _refuse_too_few(measured)
-    seen = _whitened(measured)
+    seen = whitened_parts(measured, np.nan_to_num(measured.phasor_sensor)[..., None])[..., 0]
     starts = _grid_starts(measured, seen, reach)  # (runs, starts, 3)
     runs, count = starts.shape[:2]
     owner = np.repeat(np.arange(runs), count)
 
-    def model(rows: IntArray, centre: Array) -> tuple[Array, Array]:
-        return _projected(measured, seen[owner[rows]], centre)[:2]
+    def model(rows: IntArray, centre: Array) -> Normal:
+        return normal_equations(*_projected(measured, seen[owner[rows]], centre)[:2])
 
-    found, cost = minimise(model, starts.reshape(-1, 3))
-    order = np.argsort(cost.reshape(runs, count), axis=1)
-    centres = np.take_along_axis(found.reshape(runs, count, 3), order[..., None], axis=1)
-    costs = np.take_along_axis(cost.reshape(runs, count), order, axis=1)
+    found = minimise(model, starts.reshape(-1, 3))
+    costs = found.cost.reshape(runs, count)
+    order = np.argsort(costs, axis=1)
+    centres = np.take_along_axis(found.state.reshape(runs, count, 3), order[..., None], axis=1)
+    costs = np.take_along_axis(costs, order, axis=1)
     best = centres[:, 0]
     _, _, moments, jacobian = _projected(measured, seen, best)
     rival = np.linalg.norm(centres[:, 1:] - best[:, None], axis=-1) > SAME
     return BeaconFits(
         centre_world=best,
-        moments_world=_complex(measured, moments),
+        moments_world=np.einsum("ru,uta->rta", moments, measured.unit_moments),
         chi_square=costs[:, 0],
         cov=_inverse(jacobian, reach),
         rivals_world=np.where(rival[..., None], centres[:, 1:], np.nan),
@@ -160,12 +167,7 @@ def _refuse_too_few(measured: BeaconMeasurements) -> None:
             )
 
 
-def _whitened(measured: BeaconMeasurements) -> Array:
-    """Return the phasors as real numbers of variance one, shape (runs, numbers)."""
-    return _real(measured, np.nan_to_num(measured.phasor_sensor)[..., None])[..., 0]
-
-
-def _real(measured: BeaconMeasurements, columns: ComplexArray) -> Array:
+def whitened_parts(measured: BeaconMeasurements, columns: ComplexArray) -> Array:
     """Stack columns (..., points, tones, 3, n) as (..., numbers, n), weighted; zero if missing."""
     weight = measured.weight[..., None, None]
     parts = np.stack([columns.real * weight[:, :, 0], columns.imag * weight[:, :, 1]], axis=-5)
@@ -187,35 +189,26 @@ def _columns(measured: BeaconMeasurements, centre: Array) -> tuple[Array, Array]
     beacon, turned = measured.beacon, measured.world_from_body
     offset = measured.position_world - centre[:, None]
     bodies = np.broadcast_to(turned, (*offset.shape[:2], 3, 3))
-    shape = (*offset.shape[:2], len(beacon.tones), 3)
-    values, slopes = [], []
-    for tone, real in enumerate(measured.real_tones):
+    units = measured.unit_moments
+    shape = (*offset.shape[:2], len(beacon.tones), 3, len(units))
+    value = np.zeros(shape, dtype=np.complex128)
+    slope = np.zeros((*shape, 3), dtype=np.complex128)
+    for tone in range(len(beacon.tones)):
+        own = np.flatnonzero(units[:, tone].any(axis=-1))
         coil = beacon.coils[int(np.flatnonzero(beacon.excitation[:, tone])[0])]
-        phase = coil.phase if real else 0.0
-        for axis in beacon.world_from_beacon:  # a row: one axis of the world in beacon axes
-            unit = replace(coil, moment_beacon=axis, phase=phase)
-            alone = replace(beacon, position_world=np.zeros(3), coils=(unit,), field_map=None)
-            seen, by_pose = observe_from(alone, measured.magnetometer, bodies, offset)
-            value = np.zeros(shape, dtype=np.complex128)
-            slope = np.zeros((*shape, 3), dtype=np.complex128)
-            value[..., tone, :] = seen[..., 0, :]
-            slope[..., tone, :, :] = -by_pose[..., 0, :, 3:] @ np.swapaxes(turned, -1, -2)
-            turns = (1.0,) if real else (1.0, 1j)
-            values += [value * turn for turn in turns]
-            slopes += [slope * turn for turn in turns]
-    order = _order(measured)
-    stacked = _real(measured, np.stack([values[i] for i in order], axis=-1))
-    by_centre = [_real(measured, slopes[i]) for i in order]
-    return stacked, np.stack(by_centre, axis=-2)
-
-
-def _order(measured: BeaconMeasurements) -> list[int]:
-    """Return the real parts of a tone's moment, then its imaginary parts."""
-    out: list[int] = []
-    for real in measured.real_tones:
-        at = len(out)
-        out += [at, at + 1, at + 2] if real else [at, at + 2, at + 4, at + 1, at + 3, at + 5]
-    return out
+        # The field of a moment along each axis of the world, as if in slots of their own.
+        axes = tuple(
+            replace(coil, moment_beacon=axis, phase=0.0, slot=slot)
+            for slot, axis in enumerate(beacon.world_from_beacon)
+        )
+        alone = replace(beacon, position_world=np.zeros(3), coils=axes, field_map=None)
+        seen, by_pose = observe_from(alone, measured.magnetometer, bodies, offset)
+        by_place = -by_pose[..., 3:] @ np.swapaxes(turned, -1, -2)[:, None]
+        value[:, :, tone][..., own] = np.einsum("ua,kpai->kpiu", units[own, tone], seen)
+        slope[:, :, tone][..., own, :] = np.einsum("ua,kpaij->kpiuj", units[own, tone], by_place)
+    flat = slope.reshape(*shape[:-1], -1)
+    stacked = whitened_parts(measured, flat)
+    return whitened_parts(measured, value), stacked.reshape(*stacked.shape[:-1], -1, 3)
 
 
 def _projected(
@@ -231,19 +224,6 @@ def _projected(
     # Kaufman: the slope without what a change of the moments takes up.
     kept = slope - basis @ (np.swapaxes(basis, -1, -2) @ slope)
     return residual, kept, moments, np.concatenate([slope, -design], axis=-1)
-
-
-def _complex(measured: BeaconMeasurements, moments: Array) -> ComplexArray:
-    out, at = [], 0
-    for tone, real in enumerate(measured.real_tones):
-        vector = moments[..., at : at + 3].astype(np.complex128)
-        if real:
-            phase = measured.beacon.excitation[:, tone].sum()
-            out.append(vector * phase)
-        else:
-            out.append(vector + 1j * moments[..., at + 3 : at + 6])
-        at += 3 if real else 6
-    return np.stack(out, axis=-2)
 
 
 def _grid_starts(measured: BeaconMeasurements, seen: Array, reach: float) -> Array:
@@ -298,4 +278,4 @@ def _inverse(jacobian: Array, reach: float) -> Array:
             f"the magnetometers determine the centre of the beacon to {np.max(worst):.2g} m only;"
             " measure nearer to it, or at more points"
         )
-    return np.asarray(cov)
+    return cov

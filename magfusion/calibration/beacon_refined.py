@@ -5,11 +5,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.calibration.beacon import BeaconFits, BeaconMeasurements, calibrate_beacon
-from magfusion.calibration.least_squares import minimise
-from magfusion.fixes.candidates import wahba
-from magfusion.observation import observe
-from magfusion.site import Beacon, BeaconSigma
+from magfusion.calibration.beacon import (
+    BeaconFits,
+    BeaconMeasurements,
+    calibrate_beacon,
+    whitened_parts,
+)
+from magfusion.estimation.snapshot.candidates import wahba
+from magfusion.estimation.solve.batched import Normal, minimise, moved_poses, normal_equations
+from magfusion.model.field import observe
+from magfusion.model.site import Beacon, BeaconSigma
 from magfusion.units import Array, ComplexArray, IntArray
 
 TURNS = 8  # each leaves the offset over the distance of the error, some hundredths
@@ -72,7 +77,7 @@ def attitudes(beacon: Beacon, moments_world: ComplexArray) -> tuple[Array, Array
 
 def _drive(beacon: Beacon) -> ComplexArray:
     """Return the declared complex moment of each tone, shape (tones, 3), beacon axes."""
-    return np.asarray(beacon.excitation.T @ beacon.moments_beacon)
+    return beacon.excitation.T @ beacon.moments_beacon
 
 
 def coil_moments(
@@ -86,11 +91,11 @@ def coil_moments(
     change = turned - _drive(beacon)
     drive = np.concatenate([beacon.excitation.real, beacon.excitation.imag], axis=1).T
     parts = np.concatenate([change.real, change.imag], axis=-2)
-    return np.asarray(beacon.moments_beacon + np.linalg.pinv(drive) @ parts)
+    return beacon.moments_beacon + np.linalg.pinv(drive) @ parts
 
 
 def open_axes(beacon: Beacon) -> Array:
-    """Return the axes, beacon frame, about which a turn cannot be told, shape (n, 3).
+    """Return the axes, beacon frame, about which a rotation cannot be determined, shape (n, 3).
 
     A coil's own axis, and, where the drive phase is unknown, the axis of a rotating field.
     """
@@ -100,7 +105,7 @@ def open_axes(beacon: Beacon) -> Array:
         phases = np.einsum("kl,ki->kil", np.eye(len(drive)), 1j * drive).reshape(drive.size, -1)
         turns = turns - phases @ np.linalg.lstsq(_parts(phases), _parts(turns), rcond=None)[0]
     _, size, axes = np.linalg.svd(_parts(turns))
-    return np.asarray(axes[size < OPEN * np.linalg.norm(drive)])
+    return axes[size < OPEN * np.linalg.norm(drive)]
 
 
 def _parts(columns: ComplexArray) -> Array:
@@ -115,7 +120,6 @@ def calibrate_one(measured: BeaconMeasurements, reach: float) -> tuple[BeaconFit
 
     Parameters
     ----------
-    measured : BeaconMeasurements
     reach : float
         As in `magfusion.calibration.beacon.calibrate_beacon` (m).
     """
@@ -129,14 +133,7 @@ def calibrate_one(measured: BeaconMeasurements, reach: float) -> tuple[BeaconFit
 
 
 def refine(measured: BeaconMeasurements, fits: BeaconFits, run: int = 0) -> RefinedBeacon:
-    """Return the beacon as one run of the calibration found it, with posterior sigmas.
-
-    Parameters
-    ----------
-    measured : BeaconMeasurements
-    fits : BeaconFits
-    run : int
-    """
+    """Return the beacon as one run of the calibration found it, with posterior sigmas."""
     declared, moments = measured.beacon, fits.moments_world[run : run + 1]
     rotation, phase = attitudes(declared, moments)
     coils = coil_moments(declared, moments, rotation, phase)[0]
@@ -169,22 +166,15 @@ def _spread(
     measured: BeaconMeasurements, moments: ComplexArray, rotation: Array, coils: Array
 ) -> Array:
     """Return how attitude and log-moments follow the fitted moments, by central differences."""
-    units = []
-    for tone, real in enumerate(measured.real_tones):
-        drive = measured.beacon.excitation[:, tone].sum() if real else 1.0
-        for turn in (drive,) if real else (1.0, 1j):
-            for axis in np.eye(3):
-                unit = np.zeros(moments.shape, dtype=np.complex128)
-                unit[tone] = turn * axis
-                units.append(unit)
     step = 1e-5 * float(np.max(np.abs(moments)))
-    sides = np.array([sign * step * unit for sign in (1.0, -1.0) for unit in units])
+    units = step * measured.unit_moments
+    sides = np.concatenate([units, -units])
     turned, phase = attitudes(measured.beacon, moments + sides)
     sizes = np.linalg.norm(coil_moments(measured.beacon, moments + sides, turned, phase), axis=-1)
     angle = Rotation.from_matrix(rotation.T @ turned).as_rotvec()
     value = np.hstack([angle, np.log(sizes / np.linalg.norm(coils, axis=-1))])
     count = len(units)
-    return np.asarray((value[:count] - value[count:]).T / (2.0 * step))
+    return (value[:count] - value[count:]).T / (2.0 * step)
 
 
 def fit_known_moments(
@@ -194,7 +184,6 @@ def fit_known_moments(
 
     Parameters
     ----------
-    measured : BeaconMeasurements
     centre_world : ndarray, shape (runs, 3)
         Where to start (m), e.g. `calibrate_beacon`.
     world_from_beacon : ndarray, shape (runs, 3, 3)
@@ -206,11 +195,10 @@ def fit_known_moments(
     cov : ndarray, shape (runs, 6, 6)
         Of rotation and position, beacon axes: the Cramér-Rao bound.
     """
-    weight = measured.weight[..., None, None]
     seen = np.nan_to_num(measured.phasor_sensor)
 
-    def model(rows: IntArray, pose: Array) -> tuple[Array, Array]:
-        centre, rotation = pose[:, :3], pose[:, 3:].reshape(-1, 3, 3)
+    def model(rows: IntArray, pose: Array) -> Normal:
+        rotation, centre = pose[:, :9].reshape(-1, 3, 3), pose[:, 9:]
         # The beacon stays; magnetometers move with the frame in which it has the asked pose.
         back = measured.beacon.world_from_beacon @ np.swapaxes(rotation, -1, -2)
         position = (measured.position_world - centre[:, None]) @ np.swapaxes(back, -1, -2)
@@ -221,22 +209,11 @@ def fit_known_moments(
             position + measured.beacon.position_world,
         )
         error = (found.phasor_sensor - seen[rows])[..., None]
-        return _halves(error, weight)[..., 0], _halves(found.beacon_pose, weight)
+        return normal_equations(
+            whitened_parts(measured, error)[..., 0], whitened_parts(measured, found.beacon_pose)
+        )
 
-    start = np.concatenate([centre_world, world_from_beacon.reshape(-1, 9)], axis=-1)
-    pose, _ = minimise(model, start, _moved)
-    slope = model(np.arange(len(pose)), pose)[1]
-    cov = np.linalg.inv(np.swapaxes(slope, -1, -2) @ slope)
-    return pose[:, :3], pose[:, 3:].reshape(-1, 3, 3), np.asarray(cov)
-
-
-def _halves(columns: ComplexArray, weight: Array) -> Array:
-    parts = np.stack([columns.real * weight[:, :, 0], columns.imag * weight[:, :, 1]], axis=1)
-    return parts.reshape(len(columns), -1, columns.shape[-1])
-
-
-def _moved(pose: Array, step: Array) -> Array:
-    rotation = pose[:, 3:].reshape(-1, 3, 3)
-    turned = rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
-    centre = pose[:, :3] + (rotation @ step[:, 3:, None])[..., 0]
-    return np.concatenate([centre, turned.reshape(-1, 9)], axis=-1)
+    start = np.concatenate([world_from_beacon.reshape(-1, 9), centre_world], axis=-1)
+    found = minimise(model, start, moved_poses)
+    pose = found.state
+    return pose[:, 9:], pose[:, :9].reshape(-1, 3, 3), np.asarray(np.linalg.inv(found.information))

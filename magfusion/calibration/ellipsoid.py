@@ -5,14 +5,27 @@ a sphere.  With the vertical known in the sensor's axes beside each reading, the
 and vertical must be the same in all of them, which fixes the rotation too.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from magfusion.calibration.magnetometer import MagnetometerFit
 from magfusion.errors import EstimationError
-from magfusion.units import Array
+from magfusion.estimation.solve.batched import (
+    SINGULAR,
+    Normal,
+    conditioning,
+    minimise,
+    normal_equations,
+)
+from magfusion.units import Array, IntArray
 
 FEWEST_READINGS = 9
-_STEPS = 8  # of Gauss-Newton; three are enough where the readings go all round
+EXACT = 1e-12  # of the field; a residual that is rounding
+# What is no ellipsoid of readings, by margins that no rounding reaches and no instrument either.
+NARROWEST = 0.03  # shortest over longest axis
+OFF_SURFACE = 0.1  # of the field; by which readings miss the surface
+LOOSEST = 0.3  # of the longest axis; sigma of the shape
 _NO_ELLIPSOID = "the readings lie on no ellipsoid; turn the sensor all round, away from iron"
 _SYMMETRIC = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
 
@@ -38,20 +51,33 @@ def fit_ellipsoid(measured: Array, field_size: float) -> MagnetometerFit:
         Where the readings lie on no ellipsoid: too few of them, or all on one side.
     """
     scaled = measured / field_size
-    inverse, centre = _algebraic(scaled)
+    if scaled.shape[-2] < FEWEST_READINGS:
+        raise EstimationError(
+            f"{scaled.shape[-2]} readings do not determine an ellipsoid; give {FEWEST_READINGS}"
+        )
     basis = np.zeros((6, 3, 3))
     for k, (i, j) in enumerate(_SYMMETRIC):
         basis[k, i, j] = basis[k, j, i] = 1.0
-    for _ in range(_STEPS):
-        error, jacobian = _size_rows(scaled, inverse, centre, basis)
-        step = _solve(jacobian, error)
-        inverse = inverse - np.einsum("...k,kij->...ij", step[..., :6], basis)
-        centre = centre - step[..., 6:]
-    error, jacobian = _size_rows(scaled, inverse, centre, basis)
-    degrees = max(error.shape[-1] - 9, 1)
-    variance = np.sum(error**2, axis=-1)[..., None, None] / degrees
+    shape, centre = _algebraic(scaled)
+    start = np.concatenate([shape[..., *np.transpose(_SYMMETRIC)], centre], axis=-1)
+
+    def rows_at(points: Array, state: Array) -> tuple[Array, Array]:
+        inverse = np.einsum("...k,kij->...ij", state[..., :6], basis)
+        return _size_rows(points, inverse, state[..., 6:], basis)
+
+    found, error, jacobian = _solved(rows_at, start, scaled)
+    inverse = np.einsum("...k,kij->...ij", found[..., :6], basis)
+    variance = np.sum(error**2, axis=-1)[..., None, None] / max(error.shape[-1] - 9, 1)
     cov = variance * np.linalg.inv(np.swapaxes(jacobian, -1, -2) @ jacobian)
-    return _fit(inverse, centre, cov, basis, field_size)
+    axes = np.linalg.eigvalsh(inverse)
+    sigma = np.sqrt(np.max(np.einsum("...ii->...i", cov)[..., :6], axis=-1))
+    if (
+        np.any(axes[..., 0] < NARROWEST * axes[..., -1])
+        or np.any(np.std(error, axis=-1) > OFF_SURFACE)
+        or np.any(sigma > LOOSEST * axes[..., -1])
+    ):
+        raise EstimationError(_NO_ELLIPSOID)
+    return _fit(inverse, found[..., 6:], cov, basis, field_size)
 
 
 def fit_ellipsoid_gravity(measured: Array, up_sensor: Array, field_size: float) -> MagnetometerFit:
@@ -80,17 +106,13 @@ def fit_ellipsoid_gravity(measured: Array, up_sensor: Array, field_size: float) 
     """
     scaled = measured / field_size
     up = up_sensor / np.linalg.norm(up_sensor, axis=-1, keepdims=True)
-    start = fit_ellipsoid(scaled, 1.0)
-    inverse, centre = np.asarray(np.linalg.inv(start.matrix)), start.offset
-    basis = np.eye(9).reshape(9, 3, 3)
-    along = np.sum(up * _field(scaled, inverse, centre), axis=-1)
-    vertical = np.mean(along, axis=-1)
-    for _ in range(_STEPS):
-        error, jacobian = _both_rows(scaled, up, inverse, centre, vertical)
-        step = _solve(jacobian, error)
-        inverse = inverse - step[..., :9].reshape(inverse.shape)
-        centre, vertical = centre - step[..., 9:12], vertical - step[..., 12]
-    error, jacobian = _both_rows(scaled, up, inverse, centre, vertical)
+    shape = fit_ellipsoid(scaled, 1.0)
+    first: Array = np.asarray(np.linalg.inv(shape.matrix))
+    vertical = np.mean(np.sum(up * _field(scaled, first, shape.offset), axis=-1), axis=-1)
+    flat = first.reshape(*first.shape[:-2], 9)
+    start = np.concatenate([flat, shape.offset, vertical[..., None]], axis=-1)
+    found, error, jacobian = _solved(_both_rows, start, scaled, up)
+    inverse, vertical = found[..., :9].reshape(first.shape), found[..., 12]
     n = scaled.shape[-2]
     variance = np.sum(error**2, axis=-1)[..., None, None] / max(2 * n - 13, 1)
     transposed = np.swapaxes(jacobian, -1, -2)
@@ -99,20 +121,35 @@ def fit_ellipsoid_gravity(measured: Array, up_sensor: Array, field_size: float) 
     noise = square + vertical[..., None, None] * (shared + np.swapaxes(shared, -1, -2))
     unit = np.linalg.inv(square)
     cov = variance * (unit @ noise @ unit)
-    return _fit(inverse, centre, cov[..., :12, :12], basis, field_size)
+    basis = np.eye(9).reshape(9, 3, 3)
+    return _fit(inverse, found[..., 9:12], cov[..., :12, :12], basis, field_size)
 
 
 def _field(measured: Array, inverse: Array, centre: Array) -> Array:
-    return np.asarray((measured - centre[..., None, :]) @ np.swapaxes(inverse, -1, -2))
+    return (measured - centre[..., None, :]) @ np.swapaxes(inverse, -1, -2)
 
 
-def _solve(jacobian: Array, error: Array) -> Array:
-    transposed = np.swapaxes(jacobian, -1, -2)
-    try:
-        step = np.linalg.solve(transposed @ jacobian, transposed @ error[..., None])
-    except np.linalg.LinAlgError as failure:
-        raise EstimationError(_NO_ELLIPSOID) from failure
-    return np.asarray(step[..., 0])
+def _solved(
+    rows_at: Callable[..., tuple[Array, Array]], start: Array, *readings: Array
+) -> tuple[Array, Array, Array]:
+    """Return the state (..., k) of least squares with its residuals and their Jacobian.
+
+    Raises
+    ------
+    EstimationError
+        Where the readings leave a direction of the state open, or the search does not settle.
+    """
+    each = [part.reshape(-1, *part.shape[-2:]) for part in readings]
+
+    def model(rows: IntArray, state: Array) -> Normal:
+        return normal_equations(*rows_at(*(part[rows] for part in each), state))
+
+    solution = minimise(model, start.reshape(-1, start.shape[-1]), absolute=EXACT**2)
+    found = solution.state.reshape(start.shape)
+    error, jacobian = rows_at(*readings, found)
+    if not np.all(solution.converged) or np.any(conditioning(jacobian) < SINGULAR):
+        raise EstimationError(_NO_ELLIPSOID)
+    return found, error, jacobian
 
 
 def _algebraic(points: Array) -> tuple[Array, Array]:
@@ -125,21 +162,22 @@ def _algebraic(points: Array) -> tuple[Array, Array]:
     design = np.stack(
         [x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z, 2 * x, 2 * y, 2 * z], axis=-1
     )
-    if points.shape[-2] < FEWEST_READINGS:
-        raise EstimationError(
-            f"{points.shape[-2]} readings do not determine an ellipsoid; give {FEWEST_READINGS}"
-        )
+    if np.any(conditioning(design) < SINGULAR):
+        raise EstimationError(_NO_ELLIPSOID)
     found = np.sum(np.linalg.pinv(design), axis=-1)
     shape = np.empty((*found.shape[:-1], 3, 3))
     for k, (i, j) in enumerate(_SYMMETRIC):
         shape[..., i, j] = shape[..., j, i] = found[..., k]
+    along = np.linalg.eigvalsh(shape)
+    if np.any(np.min(np.abs(along), axis=-1) < NARROWEST**2 * np.max(np.abs(along), axis=-1)):
+        raise EstimationError(_NO_ELLIPSOID)
     middle = -np.linalg.solve(shape, found[..., 6:, None])
     size = 1.0 + np.sum(middle[..., 0] * (shape @ middle)[..., 0], axis=-1)
     values, vectors = np.linalg.eigh(shape / size[..., None, None])
     if not np.all(values > 0.0):
         raise EstimationError(_NO_ELLIPSOID)
     root = np.sqrt(values)[..., None, :] * vectors @ np.swapaxes(vectors, -1, -2)
-    return np.asarray(root), np.asarray(middle[..., 0] + mean[..., 0, :])
+    return root, middle[..., 0] + mean[..., 0, :]
 
 
 def _size_rows(measured: Array, inverse: Array, centre: Array, basis: Array) -> tuple[Array, Array]:
@@ -150,9 +188,9 @@ def _size_rows(measured: Array, inverse: Array, centre: Array, basis: Array) -> 
     return size - 1.0, np.concatenate([by_inverse, by_centre], axis=-1)
 
 
-def _both_rows(
-    measured: Array, up: Array, inverse: Array, centre: Array, vertical: Array
-) -> tuple[Array, Array]:
+def _both_rows(measured: Array, up: Array, state: Array) -> tuple[Array, Array]:
+    inverse = state[..., :9].reshape(*state.shape[:-1], 3, 3)
+    centre, vertical = state[..., 9:12], state[..., 12]
     basis = np.eye(9).reshape(9, 3, 3)
     size_error, by_size = _size_rows(measured, inverse, centre, basis)
     along = np.sum(up * _field(measured, inverse, centre), axis=-1)
@@ -187,5 +225,5 @@ def _fit(
     flat = by_inverse.reshape(*matrix.shape[:-2], count, 9)
     change[..., :9, :count] = np.swapaxes(flat, -1, -2)
     change[..., 9:, count:] = field_size * np.eye(3)
-    found = np.asarray(change @ cov @ np.swapaxes(change, -1, -2))
+    found = change @ cov @ np.swapaxes(change, -1, -2)
     return MagnetometerFit(matrix, field_size * centre, found)

@@ -11,17 +11,17 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
 
 from magfusion.errors import EstimationError
-from magfusion.field_map import (
+from magfusion.estimation.solve.bounded import minimise_bounded
+from magfusion.model.field import predict, skew
+from magfusion.model.field_map import (
     COMPONENTS,
     FieldMap,
+    block_diagonal,
     process_covariance,
-    spread_blocks,
 )
-from magfusion.observation import predict, skew
-from magfusion.site import Site
+from magfusion.model.site import Site
 from magfusion.units import Array, ComplexArray, IntArray
 
 FEWEST_POINTS = 8
@@ -80,7 +80,6 @@ class MapFit:
 
     Parameters
     ----------
-    site : Site
     error_without, error_with : dict of str to float
         Relative error of each beacon's modelled field at points that the map was not learnt from,
         root mean square over the points.
@@ -94,8 +93,8 @@ class MapFit:
     points: dict[str, int]
 
 
-class _Heard(NamedTuple):
-    """One beacon at the points where it was heard, world axes."""
+class _DetectedFields(NamedTuple):
+    """One beacon at the points where it was detected, world axes."""
 
     sensor_world: Array  # (m, 3)
     model: Array  # (m, 2 tones, 3), real parts, then imaginary parts
@@ -121,38 +120,33 @@ def learn_field_map(site: Site, points: MapPoints) -> MapFit:
     ----------
     site : Site
         Maps that it has already are replaced.
-    points : MapPoints
-
-    Returns
-    -------
-    MapFit
 
     Raises
     ------
     EstimationError
-        Where a beacon was heard at too few points.
+        Where a beacon was detected at too few points.
     """
-    heard = _all_heard(site, points)
-    for beacon, found in zip(site.beacons, heard, strict=True):
+    detected = _all_detected(site, points)
+    for beacon, found in zip(site.beacons, detected, strict=True):
         if len(found.sensor_world) < FEWEST_POINTS:
             raise EstimationError(
-                f"beacon {beacon.name} was heard at {len(found.sensor_world)} points, and a map"
+                f"beacon {beacon.name} was detected at {len(found.sensor_world)} points, and a map"
                 f" needs {FEWEST_POINTS}; survey more of the room"
             )
-    process = _best_process(heard)
-    maps = [_conditioned(found, process) for found in heard]
+    process = _best_process(detected)
+    maps = [_conditioned(found, process) for found in detected]
     beacons = tuple(replace(b, field_map=m) for b, m in zip(site.beacons, maps, strict=True))
     names = [b.name for b in site.beacons]
-    errors = [_cross_validated(found, process) for found in heard]
+    errors = [_cross_validated(found, process) for found in detected]
     return MapFit(
         site=replace(site, beacons=beacons),
         error_without={n: e[0] for n, e in zip(names, errors, strict=True)},
         error_with={n: e[1] for n, e in zip(names, errors, strict=True)},
-        points={n: len(found.sensor_world) for n, found in zip(names, heard, strict=True)},
+        points={n: len(found.sensor_world) for n, found in zip(names, detected, strict=True)},
     )
 
 
-def _all_heard(site: Site, points: MapPoints) -> list[_Heard]:
+def _all_detected(site: Site, points: MapPoints) -> list[_DetectedFields]:
     sensor = site.platform.magnetometer
     world_from_sensor = points.world_from_body @ sensor.body_from_sensor
     sensor_world = points.position_world + points.world_from_body @ sensor.position_body
@@ -176,7 +170,7 @@ def _all_heard(site: Site, points: MapPoints) -> list[_Heard]:
         # A matrix near the identity leaves white noise white.
         variance = np.tile(points.sigma[:, tones] ** 2, 2)
         found.append(
-            _Heard(
+            _DetectedFields(
                 sensor_world[there],
                 _stacked(plain @ undone)[there],
                 _stacked(measured @ undone)[there],
@@ -189,55 +183,57 @@ def _all_heard(site: Site, points: MapPoints) -> list[_Heard]:
 def _aligned(plain: ComplexArray, measured: ComplexArray) -> ComplexArray:
     """Return the model with the drive phase of each tone that the measurement has."""
     lag = np.angle(np.sum(np.conj(plain) * measured, axis=-1, keepdims=True))
-    return np.asarray(plain * np.exp(1j * lag))
+    return plain * np.exp(1j * lag)
 
 
 def _stacked(phasor: ComplexArray) -> Array:
     return np.concatenate([phasor.real, phasor.imag], axis=1)
 
 
-def _reduced(heard: _Heard, state: Array, residual: float) -> tuple[Array, Array]:
+def _reduced(detected: _DetectedFields, state: Array, residual: float) -> tuple[Array, Array]:
     """Return what each point knows of gain and rotation: information (m, 4, 4), vector (m, 4).
 
     Linear about ``state`` (m, 4): gain and rotation at each point.
     """
     gain = np.exp(state[:, :1, None])
-    turn = np.asarray(skew(state[:, 1:]))
-    turned = gain * (heard.model + heard.model @ np.swapaxes(turn, -1, -2))
-    by_rotation = -gain[..., None] * np.asarray(skew(heard.model))
+    turn = skew(state[:, 1:])
+    turned = gain * (detected.model + detected.model @ np.swapaxes(turn, -1, -2))
+    by_rotation = -gain[..., None] * skew(detected.model)
     design = np.concatenate([turned[..., None], by_rotation], axis=-1)  # (m, tones, 3, 4)
-    strength = np.mean(np.sum(heard.model**2, axis=2), axis=1)[:, None]
-    weight = 1.0 / (heard.variance + residual**2 * strength / 3.0)
-    error = heard.measured - turned + (design @ state[:, None, :, None])[..., 0]
+    strength = np.mean(np.sum(detected.model**2, axis=2), axis=1)[:, None]
+    weight = 1.0 / (detected.variance + residual**2 * strength / 3.0)
+    error = detected.measured - turned + (design @ state[:, None, :, None])[..., 0]
     weighted = design * weight[..., None, None]
     information = np.einsum("mtia,mtib->mab", weighted, design)
     vector = np.einsum("mtia,mti->ma", weighted, error)
     return information, vector
 
 
-def _plain_gain(heard: _Heard) -> Array:
+def _plain_gain(detected: _DetectedFields) -> Array:
     """Return the log-gain of each point on its own, shape (m,).
 
     From a gain of one, a step towards one of a half or of two errs by a fifth.
     """
-    gain = np.sum(heard.measured * heard.model, axis=(1, 2)) / np.sum(heard.model**2, axis=(1, 2))
-    return np.asarray(np.log(np.clip(gain, _WEAKEST, 1.0 / _WEAKEST)))
+    gain = np.sum(detected.measured * detected.model, axis=(1, 2)) / np.sum(
+        detected.model**2, axis=(1, 2)
+    )
+    return np.log(np.clip(gain, _WEAKEST, 1.0 / _WEAKEST))
 
 
-def _conditioned(heard: _Heard, process: _Process) -> FieldMap:
-    count = len(heard.sensor_world)
-    kernel = process_covariance(heard.sensor_world, process.length_scale, process.sigma)
+def _conditioned(detected: _DetectedFields, process: _Process) -> FieldMap:
+    count = len(detected.sensor_world)
+    kernel = process_covariance(detected.sensor_world, process.length_scale, process.sigma)
     state = np.zeros((count, COMPONENTS))
-    state[:, 0] = _plain_gain(heard)
+    state[:, 0] = _plain_gain(detected)
     for _ in range(RELINEARISATIONS):
-        information, vector = _reduced(heard, state, process.residual)
-        system = np.eye(len(kernel)) + spread_blocks(information) @ kernel
+        information, vector = _reduced(detected, state, process.residual)
+        system = np.eye(len(kernel)) + block_diagonal(information) @ kernel
         weights = np.linalg.solve(system, vector.ravel())
         before, state = state, (kernel @ weights).reshape(count, COMPONENTS)
         if np.max(np.abs(state - before)) < SETTLED:
             break
     return FieldMap(
-        points_world=heard.sensor_world,
+        points_world=detected.sensor_world,
         weights=np.asarray(weights.reshape(count, COMPONENTS)),
         information=information,
         length_scale=process.length_scale,
@@ -247,38 +243,35 @@ def _conditioned(heard: _Heard, process: _Process) -> FieldMap:
     )
 
 
-def _best_process(heard: Sequence[_Heard]) -> _Process:
+def _best_process(detected: Sequence[_DetectedFields]) -> _Process:
     """Return the process that predicts points left out best, by Student's t.
 
     The greatest likelihood would let the few points beside iron decide: it explains all by noise.
     """
-    parts = [_folds(_evenly(h, LEARNT_FROM), FOLDS) for h in heard]
+    parts = [_folds(_evenly(h, LEARNT_FROM), FOLDS) for h in detected]
     count = sum(asked.model.size for folds in parts for _, asked in folds)
 
     def cost(log_process: Array) -> float:
         process = _Process(*np.exp(log_process))
         return sum(_surprise(*fold, process) for folds in parts for fold in folds) / count
 
-    found = minimize(
-        cost,
-        np.log(_START),
-        method="L-BFGS-B",
-        bounds=np.log(_LIMITS),
-        options={"maxiter": 20, "ftol": 1e-4},
-    )
-    return _Process(*(float(v) for v in np.exp(found.x)))
+    found = minimise_bounded(cost, np.log(_START), np.log(_LIMITS))
+    return _Process(*(float(v) for v in np.exp(found)))
 
 
-def _folds(heard: _Heard, folds: int) -> list[tuple[_Heard, _Heard]]:
+def _folds(detected: _DetectedFields, folds: int) -> list[tuple[_DetectedFields, _DetectedFields]]:
     """Return pairs of points that are known and points that are asked for."""
-    fold = np.arange(len(heard.sensor_world)) % folds
+    fold = np.arange(len(detected.sensor_world)) % folds
     return [
-        (_Heard(*(p[fold != k] for p in heard)), _Heard(*(p[fold == k] for p in heard)))
+        (
+            _DetectedFields(*(p[fold != k] for p in detected)),
+            _DetectedFields(*(p[fold == k] for p in detected)),
+        )
         for k in range(folds)
     ]
 
 
-def _surprise(known: _Heard, asked: _Heard, process: _Process) -> float:
+def _surprise(known: _DetectedFields, asked: _DetectedFields, process: _Process) -> float:
     """Return minus the log-score of what a map predicts, but for a constant."""
     found = _conditioned(known, process)
     strength = np.mean(np.sum(asked.model**2, axis=2), axis=1)
@@ -291,24 +284,24 @@ def _surprise(known: _Heard, asked: _Heard, process: _Process) -> float:
     return float(np.sum(spread + tail))
 
 
-def _mapped(found: FieldMap, asked: _Heard) -> Array:
+def _mapped(found: FieldMap, asked: _DetectedFields) -> Array:
     value, _ = found.mean(asked.sensor_world)
     turned = asked.model + np.cross(value[:, None, 1:], asked.model)
-    return np.asarray(np.exp(value[:, :1, None]) * turned)
+    return np.exp(value[:, :1, None]) * turned
 
 
-def _evenly(heard: _Heard, most: int) -> _Heard:
-    count = len(heard.sensor_world)
+def _evenly(detected: _DetectedFields, most: int) -> _DetectedFields:
+    count = len(detected.sensor_world)
     if count <= most:
-        return heard
+        return detected
     rows = np.unique(np.linspace(0, count - 1, most).astype(np.int64))
-    return _Heard(*(part[rows] for part in heard))
+    return _DetectedFields(*(part[rows] for part in detected))
 
 
-def _cross_validated(heard: _Heard, process: _Process) -> tuple[float, float]:
+def _cross_validated(detected: _DetectedFields, process: _Process) -> tuple[float, float]:
     """Return the relative error at points left out, without the map and with it."""
     without, left = [], []
-    for known, asked in _folds(heard, FOLDS):
+    for known, asked in _folds(detected, FOLDS):
         without.append(_relative(asked.model, asked.measured))
         left.append(_relative(_mapped(_conditioned(known, process), asked), asked.measured))
     return _rms(np.concatenate(without)), _rms(np.concatenate(left))
@@ -316,7 +309,7 @@ def _cross_validated(heard: _Heard, process: _Process) -> tuple[float, float]:
 
 def _relative(model: Array, measured: Array) -> Array:
     error = np.sum((model - measured) ** 2, axis=(1, 2))
-    return np.asarray(np.sqrt(error / np.sum(measured**2, axis=(1, 2))))
+    return np.sqrt(error / np.sum(measured**2, axis=(1, 2)))
 
 
 def _rms(value: Array) -> float:
@@ -330,15 +323,14 @@ def thinned(points: MapPoints, site: Site, spacing: float) -> MapPoints:
     ----------
     points : MapPoints
         E.g. the epochs of a smoothed log.
-    site : Site
     spacing : float
         Edge of the cubes (m).
     """
     sensor = site.platform.magnetometer
     sensor_world = points.position_world + points.world_from_body @ sensor.position_body
     cell = np.floor(sensor_world / spacing).astype(np.int64)
-    heard = np.sum(np.isfinite(points.phasor_sensor).all(axis=2), axis=1)
+    detected = np.sum(np.isfinite(points.phasor_sensor).all(axis=2), axis=1)
     noise = np.nanmean(np.where(np.isfinite(points.sigma), points.sigma, np.nan), axis=1)
-    best = np.lexsort((noise, -heard))
+    best = np.lexsort((noise, -detected))
     _, first = np.unique(cell[best], axis=0, return_index=True)
     return points.rows(np.sort(best[first]))

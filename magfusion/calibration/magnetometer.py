@@ -5,7 +5,7 @@
 ``matrix = diag(K) (I + E)`` and ``offset = b``.
 
 Gravity and angular rate are known in body axes, the field in sensor axes.  A rotation of the
-mounting and one of the matrix cannot be told apart: here the mounting ``body_from_sensor`` is held
+mounting and one of the matrix cannot be separated: here the mounting ``body_from_sensor`` is kept
 as declared and the matrix takes the rest, so that it need not be symmetric.
 """
 
@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.observation import skew
-from magfusion.site import Magnetometer
+from magfusion.model.field import skew
+from magfusion.model.site import Magnetometer
 from magfusion.units import DEGREE, Array
 
 POINTED = 45.0 * DEGREE  # an axis nearer to the vertical than this pointed up, or down
@@ -77,7 +77,7 @@ def field_from_measured(measured: Array, matrix: Array, offset: Array) -> Array:
         (T), sensor axes.
     """
     inverse = np.linalg.inv(matrix)
-    return np.asarray((measured - offset[..., None, :]) @ np.swapaxes(inverse, -1, -2))
+    return (measured - offset[..., None, :]) @ np.swapaxes(inverse, -1, -2)
 
 
 def spread(field: Array) -> float:
@@ -101,13 +101,13 @@ def missing_orientations(up_sensor: Array) -> list[str]:
         both up and down.
     """
     unit = up_sensor / np.linalg.norm(up_sensor, axis=1, keepdims=True)
-    told = []
+    missing = []
     for name, along in zip(_AXES, unit.T, strict=True):
         ways = (("up", float(np.max(along))), ("down", -float(np.min(along))))
         never = [way for way, most in ways if most < np.cos(POINTED)]
         if never:
-            told.append(f"the sensor's {name} axis never pointed {' or '.join(never)}")
-    return told
+            missing.append(f"the sensor's {name} axis never pointed {' or '.join(never)}")
+    return missing
 
 
 def prior_cov(declared: Magnetometer) -> Array:

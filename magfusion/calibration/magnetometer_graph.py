@@ -1,14 +1,10 @@
 """Calibration as a factor graph: an attitude for each epoch, and the magnetometer's twelve numbers.
 
 What the ellipsoid knows as a size and an angle is here the vector itself, so that the noise has the
-weight it should.  The attitudes are held together by what there is: the vertical by the
+weight it should.  The attitudes are tied together by what there is: the vertical by the
 accelerometer, the turn from one epoch to the next by the gyro, a turntable's setting.
-
-GTSAM's own factors hold the attitudes; field and specific force of all epochs are linearised at
-once and enter as Jacobian factors, because a Python factor is called with a copy of all values.
 """
 
-from contextlib import suppress
 from dataclasses import dataclass
 
 import gtsam
@@ -16,17 +12,18 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 from scipy.spatial.transform import Rotation
 
+from magfusion.calibration.graph import CalibrationGraph, Estimate, solve
 from magfusion.calibration.magnetometer import MagnetometerFit
 from magfusion.errors import EstimationError
-from magfusion.observation import skew
-from magfusion.units import Array, BoolArray
+from magfusion.model.field import by_matrix, skew
+from magfusion.model.strapdown import triad
+from magfusion.units import Array
 
-CALIBRATION_KEY = gtsam.symbol("c", 0)
 GYRO_BIAS_KEY = gtsam.symbol("g", 0)
 COLUMNS = 16  # matrix, offset, dip, accelerometer bias
 MOST_STEPS = 40
 SETTLED = 1e-9  # relative decrease of the cost that ends the loop
-_HALVINGS = 10
+ATTITUDE_STEP, GYRO_BIAS_STEP = np.full(3, 0.3), np.full(3, 0.01)  # rad, rad/s
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,17 +62,17 @@ class Epochs:
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known before the data, and held where its sigma is zero.
+    """What is known before the data, and fixed where its sigma is zero.
 
     Parameters
     ----------
     body_from_sensor : ndarray, shape (3, 3)
-        Mounting; always held.
+        Mounting; always fixed.
     matrix, offset : ndarray, shape (3, 3) and (3,)
     cov : ndarray, shape (12, 12)
         Of the matrix, row by row, and the offset (1, T).
     field_world : ndarray, shape (3,)
-        Earth field (T); its size is held, which sets the scale of the matrix.
+        Earth field (T); its size is fixed, which sets the scale of the matrix.
     dip_sigma : float
         Of the angle between field and vertical (rad).
     gravity : float
@@ -101,7 +98,6 @@ class GraphFit:
 
     Parameters
     ----------
-    fit : MagnetometerFit
     world_from_body : ndarray, shape (n, 3, 3)
         Where only the field gives the heading, the world turns with the field's declination.
     dip_change : float
@@ -112,7 +108,6 @@ class GraphFit:
         Predicted less measured, over sigma.
     chi_square : float
         Of all factors.
-    iterations : int
     """
 
     fit: MagnetometerFit
@@ -125,14 +120,11 @@ class GraphFit:
     iterations: int
 
 
-@dataclass(frozen=True, eq=False)
-class _State:
-    values: gtsam.Values
-    calibration: Array  # (16,), offset in units of the field, bias in units of gravity
+class Readings:
+    """What all epochs read, in units of the field and of gravity, which keep all numbers near one.
 
-
-class _Problem:
-    """The graph in units of the field and of gravity, which keep all numbers near one."""
+    The calibration is what is estimated of the sixteen columns.
+    """
 
     def __init__(self, epochs: Epochs, prior: Prior) -> None:
         self.size = float(np.linalg.norm(prior.field_world))
@@ -145,108 +137,62 @@ class _Problem:
             self.force = epochs.accel_body / prior.gravity
             self.force_weight = prior.gravity / epochs.accel_sigma[:, None]
         self.unit = np.concatenate([np.ones(9), np.full(3, 1.0 / self.size), np.ones(4)])
-        self.active = self._active()
-        self.prior_root, self.declared = self._prior()
-        self.native = _native(epochs, prior)
-        self.turned = any(turn is not None for turn in epochs.turns)
-        self.ordering = gtsam.Ordering()
-        for key in [X(i) for i in range(self.n)] + [GYRO_BIAS_KEY] * self.turned:
-            self.ordering.push_back(key)
-        self.ordering.push_back(CALIBRATION_KEY)
+        self.active = np.ones(COLUMNS, dtype=bool)
+        self.active[12] = prior.dip_sigma > 0.0
+        self.active[13:] = self.force is not None and prior.accel_bias_sigma > 0.0
+        self.declared = np.zeros(COLUMNS)
+        self.declared[:12] = np.concatenate([prior.matrix.ravel(), prior.offset / self.size])
 
-    def _active(self) -> BoolArray:
-        estimated = np.ones(COLUMNS, dtype=bool)
-        estimated[12] = self.prior.dip_sigma > 0.0
-        estimated[13:] = self.force is not None and self.prior.accel_bias_sigma > 0.0
-        return estimated
-
-    def _prior(self) -> tuple[Array, Array]:
+    def prior_cov(self) -> Array:
+        """Return the covariance of what is estimated, before the data."""
         cov = np.zeros((COLUMNS, COLUMNS))
         cov[:12, :12] = self.prior.cov * np.outer(self.unit[:12], self.unit[:12])
         cov[12, 12] = self.prior.dip_sigma**2
         cov[13:, 13:] = (self.prior.accel_bias_sigma / self.prior.gravity) ** 2 * np.eye(3)
-        held = cov[np.ix_(self.active, self.active)]
-        declared = np.zeros(COLUMNS)
-        declared[:12] = np.concatenate([self.prior.matrix.ravel(), self.prior.offset / self.size])
-        return np.linalg.inv(np.linalg.cholesky(held)), declared
+        return cov[np.ix_(self.active, self.active)]
+
+    def all_columns(self, estimate: Estimate) -> Array:
+        """Return the sixteen columns: what is estimated among what is fixed."""
+        out = self.declared.copy()
+        out[self.active] = estimate.calibration
+        return out
 
     def field_at(self, dip: float) -> tuple[Array, Array]:
         """Return the Earth field in the world (unit) and its derivative by the dip."""
         east = np.cross(self.field_world, [0.0, 0.0, 1.0])
         across = east / np.linalg.norm(east) if np.linalg.norm(east) > 1e-6 else np.eye(3)[0]
         down = Rotation.from_rotvec(-dip * across)
-        field = np.asarray(down.apply(self.field_world))
+        field = down.apply(self.field_world)
         return field, -np.cross(across, field)
 
-    def rows(self, state: _State) -> tuple[Array, Array, Array]:
+    def rows(self, estimate: Estimate) -> tuple[Array, Array, Array]:
         """Return whitened residuals (n, m) with derivatives by attitude and calibration."""
-        c, mounting = state.calibration, self.prior.body_from_sensor
-        body_from_world = np.swapaxes(_attitudes(state.values, self.n), -1, -2)
+        c, mounting = self.all_columns(estimate), self.prior.body_from_sensor
+        body_from_world = np.swapaxes(_attitudes(estimate.values, self.n), -1, -2)
         field_world, by_dip = self.field_at(c[12])
         field_body = body_from_world @ field_world
         matrix, field_sensor = c[:9].reshape(3, 3), field_body @ mounting
         sensor_from_body = matrix @ mounting.T
         error = field_sensor @ matrix.T + c[9:12] - self.measured
-        by_attitude = np.real(sensor_from_body @ skew(field_body))
+        by_attitude = sensor_from_body @ skew(field_body)
         by_calibration = np.zeros((self.n, 3, COLUMNS))
-        for row in range(3):
-            by_calibration[:, row, 3 * row : 3 * row + 3] = field_sensor
+        by_calibration[:, :, :9] = by_matrix(field_sensor)
         by_calibration[:, :, 9:12] = np.eye(3)
         by_calibration[:, :, 12] = body_from_world @ by_dip @ sensor_from_body.T
         weight = self.field_weight
         if self.force is None:
-            return weight * error, weight * by_attitude, weight * by_calibration
+            return weight * error, weight * by_attitude, weight * by_calibration[..., self.active]
         up_body = body_from_world[:, :, 2]
         by_bias = np.zeros((self.n, 3, COLUMNS))
         by_bias[:, :, 13:] = np.eye(3)
         own = self.force_weight
         return (
             np.concatenate([weight * error, own * (up_body + c[13:] - self.force)], axis=1),
-            np.concatenate([weight * by_attitude, own[..., None] * np.real(skew(up_body))], axis=1),
-            np.concatenate([weight * by_calibration, own[..., None] * by_bias], axis=1),
+            np.concatenate([weight * by_attitude, own[..., None] * skew(up_body)], axis=1),
+            np.concatenate([weight * by_calibration, own[..., None] * by_bias], axis=1)[
+                ..., self.active
+            ],
         )
-
-    def cost(self, state: _State) -> float:
-        """Return the sum of squared whitened residuals."""
-        error, _, _ = self.rows(state)
-        step = self.prior_root @ (state.calibration - self.declared)[self.active]
-        return float(np.sum(error**2) + step @ step + 2.0 * self.native.error(state.values))
-
-    def linear(self, state: _State) -> gtsam.GaussianBayesTree:
-        """Eliminate the linearised graph, the calibration last."""
-        error, by_attitude, by_calibration = self.rows(state)
-        graph = self.native.linearize(state.values)
-        unit = gtsam.noiseModel.Unit.Create(error.shape[1])
-        by_active = by_calibration[:, :, self.active]
-        for i in range(self.n):
-            graph.push_back(
-                gtsam.JacobianFactor(
-                    X(i), by_attitude[i], CALIBRATION_KEY, by_active[i], -error[i], unit
-                )
-            )
-        step = self.prior_root @ (self.declared - state.calibration)[self.active]
-        unit = gtsam.noiseModel.Unit.Create(len(step))
-        graph.push_back(gtsam.JacobianFactor(CALIBRATION_KEY, self.prior_root, step, unit))
-        with suppress(RuntimeError):
-            return graph.eliminateMultifrontal(self.ordering)
-        try:  # sharp fields and shaken verticals: QR needs half the digits
-            return graph.eliminateMultifrontal(self.ordering, gtsam.EliminateQR)
-        except RuntimeError as failure:
-            raise EstimationError(
-                "the calibration's graph cannot be solved: the attitudes are not determined"
-            ) from failure
-
-    def moved(self, state: _State, step: gtsam.VectorValues, share: float) -> _State:
-        """Return the state after a share of a step."""
-        calibration = state.calibration.copy()
-        calibration[self.active] += share * step.at(CALIBRATION_KEY)
-        values = gtsam.Values()
-        for i in range(self.n):
-            values.insert(X(i), state.values.atRot3(X(i)).retract(share * step.at(X(i))))
-        if self.turned:
-            bias = state.values.atVector(GYRO_BIAS_KEY)
-            values.insert(GYRO_BIAS_KEY, bias + share * step.at(GYRO_BIAS_KEY))
-        return _State(values, calibration)
 
 
 def fit_graph(epochs: Epochs, prior: Prior, start: MagnetometerFit | None = None) -> GraphFit:
@@ -254,37 +200,41 @@ def fit_graph(epochs: Epochs, prior: Prior, start: MagnetometerFit | None = None
 
     Parameters
     ----------
-    epochs : Epochs
-    prior : Prior
     start : MagnetometerFit, optional
         Where to begin; the prior's values where it is not given.
-
-    Returns
-    -------
-    GraphFit
 
     Raises
     ------
     EstimationError
         Where the graph leaves attitudes open, or the search does not settle.
     """
-    problem = _Problem(epochs, prior)
-    state = _start(problem, epochs, start)
-    cost = problem.cost(state)
-    for done in range(1, MOST_STEPS + 1):
-        step = problem.linear(state).optimize()
-        for halving in range(_HALVINGS):
-            trial = problem.moved(state, step, 0.5**halving)
-            new_cost = problem.cost(trial)
-            if new_cost <= cost * (1.0 + SETTLED):
-                break
-        else:
-            raise EstimationError("the calibration of the magnetometer found no way down")
-        decrease, state, cost = cost - new_cost, trial, new_cost
-        if decrease <= SETTLED * cost + 1e-12:
-            return _result(problem, state, cost, done)
-    raise EstimationError(
-        f"the calibration of the magnetometer did not settle in {MOST_STEPS} steps"
+    readings = Readings(epochs, prior)
+    first = _start(readings, epochs, start)
+    steps = {X(i): ATTITUDE_STEP for i in range(readings.n)}
+    if first.values.exists(GYRO_BIAS_KEY):
+        steps[GYRO_BIAS_KEY] = GYRO_BIAS_STEP
+    graph = CalibrationGraph(
+        rows=readings.rows,
+        native=_native(epochs, prior),
+        declared=readings.declared[readings.active],
+        cov=readings.prior_cov(),
+        steps=steps,
+    )
+    found, own_cov = solve(graph, first, "magnetometer", MOST_STEPS, SETTLED)
+    cov = np.zeros((COLUMNS, COLUMNS))
+    cov[np.ix_(readings.active, readings.active)] = own_cov
+    cov /= np.outer(readings.unit, readings.unit)
+    c, values = readings.all_columns(found.estimate) / readings.unit, found.estimate.values
+    turned = values.exists(GYRO_BIAS_KEY)
+    return GraphFit(
+        fit=MagnetometerFit(c[:9].reshape(3, 3), c[9:12], cov[:12, :12]),
+        world_from_body=_attitudes(values, readings.n),
+        dip_change=float(c[12]),
+        accel_bias_body=prior.gravity * c[13:],
+        gyro_bias_body=values.atVector(GYRO_BIAS_KEY) if turned else np.zeros(3),
+        field_residual=readings.rows(found.estimate)[0][:, :3],
+        chi_square=2.0 * found.cost,
+        iterations=found.iterations,
     )
 
 
@@ -307,55 +257,22 @@ def _attitudes(values: gtsam.Values, n: int) -> Array:
     return np.array([values.atRot3(X(i)).matrix() for i in range(n)])
 
 
-def _start(problem: _Problem, epochs: Epochs, start: MagnetometerFit | None) -> _State:
-    calibration = problem.declared.copy()
+def _start(readings: Readings, epochs: Epochs, start: MagnetometerFit | None) -> Estimate:
+    calibration = readings.declared.copy()
     if start is not None:
-        calibration[:12] = np.concatenate([start.matrix.ravel(), start.offset / problem.size])
+        calibration[:12] = np.concatenate([start.matrix.ravel(), start.offset / readings.size])
     if epochs.world_from_body is not None:
         attitudes = epochs.world_from_body
-    elif problem.force is not None:
+    elif readings.force is not None:
         inverse = np.linalg.inv(calibration[:9].reshape(3, 3))
-        field_sensor = (problem.measured - calibration[9:12]) @ inverse.T
-        field_body = field_sensor @ problem.prior.body_from_sensor.T
-        attitudes = _triad(problem.field_world, problem.force, field_body)
+        field_sensor = (readings.measured - calibration[9:12]) @ inverse.T
+        field_body = field_sensor @ readings.prior.body_from_sensor.T
+        attitudes = triad(readings.field_world, readings.force, field_body)
     else:
-        raise EstimationError("neither an accelerometer nor a turntable tells the attitudes")
+        raise EstimationError("neither an accelerometer nor a turntable gives the attitudes")
     values = gtsam.Values()
     for i, attitude in enumerate(attitudes):
         values.insert(X(i), gtsam.Rot3(attitude))
-    if problem.turned:
+    if any(turn is not None for turn in epochs.turns):
         values.insert(GYRO_BIAS_KEY, np.zeros(3))
-    return _State(values, calibration)
-
-
-def _triad(field_world: Array, up_body: Array, field_body: Array) -> Array:
-    """Return ``world_from_body`` with the vertical exact and the heading by the field."""
-
-    def axes(up: Array, field: Array) -> Array:
-        z = up / np.linalg.norm(up, axis=-1, keepdims=True)
-        east = np.cross(field, z)
-        x = east / np.linalg.norm(east, axis=-1, keepdims=True)
-        return np.stack([x, np.cross(z, x), z], axis=-1)
-
-    world = axes(np.array([0.0, 0.0, 1.0]), field_world)
-    return np.asarray(world @ np.swapaxes(axes(up_body, field_body), -1, -2))
-
-
-def _result(problem: _Problem, state: _State, cost: float, iterations: int) -> GraphFit:
-    cov = np.zeros((COLUMNS, COLUMNS))
-    tree = problem.linear(state)
-    found = np.array(tree.marginalCovariance(CALIBRATION_KEY))
-    cov[np.ix_(problem.active, problem.active)] = found
-    cov /= np.outer(problem.unit, problem.unit)
-    c = state.calibration / problem.unit
-    turned = problem.turned
-    return GraphFit(
-        fit=MagnetometerFit(c[:9].reshape(3, 3), c[9:12], cov[:12, :12]),
-        world_from_body=_attitudes(state.values, problem.n),
-        dip_change=float(c[12]),
-        accel_bias_body=problem.prior.gravity * c[13:],
-        gyro_bias_body=state.values.atVector(GYRO_BIAS_KEY) if turned else np.zeros(3),
-        field_residual=problem.rows(state)[0][:, :3],
-        chi_square=cost,
-        iterations=iterations,
-    )
+    return Estimate(values, calibration[readings.active])

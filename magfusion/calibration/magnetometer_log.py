@@ -20,8 +20,8 @@ from magfusion.calibration.magnetometer_graph import Epochs, GraphFit, Prior, fi
 from magfusion.calibration.steady_field import LONGEST, SteadyField, average, steady_field
 from magfusion.calibration.stops import distinct, find_stops
 from magfusion.errors import EstimationError, InputError
-from magfusion.records.samples import ImuSamples, Waveform
-from magfusion.site import Magnetometer, Site
+from magfusion.model.samples import ImuSamples, Waveform
+from magfusion.model.site import Magnetometer, Site
 from magfusion.units import DEGREE, Array
 
 POSITIONS = 12
@@ -48,8 +48,6 @@ class LogCalibration:
     ----------
     magnetometer : Magnetometer
         As calibrated.
-    graph : GraphFit
-    prior : Prior
     readings : SteadyField
         What the graph took.
     field_sigma : float
@@ -85,15 +83,10 @@ def calibrate_log(
     ----------
     waveform : Waveform
         Beacons may transmit; their tones average out.
-    imu : ImuSamples
     site : Site
         Its sigmas of the magnetometer are the prior, its Earth field sets the scale.
     at_stops : bool
         Take only the stops, of which twelve are needed, each axis up and down among them.
-
-    Returns
-    -------
-    LogCalibration
 
     Raises
     ------
@@ -156,7 +149,7 @@ def _readings(
                 " needed; turn the sensor slowly for a minute"
             )
         return readings
-    stops = find_stops(imu)
+    stops = find_stops(imu, site.platform.motion)
     if len(stops) == 0:
         raise InputError(
             "imu: no rest was found; set the sensor down for three seconds in each of the twelve"
@@ -226,7 +219,7 @@ def _start(
     size = float(np.linalg.norm(prior.field_world))
     try:
         return fit_ellipsoid_gravity(readings.measured_sensor, up_sensor, size)
-    except (EstimationError, np.linalg.LinAlgError):
+    except EstimationError:
         return None
 
 
@@ -237,7 +230,7 @@ def _accel_sigma(readings: SteadyField, site: Site, at_rest: bool) -> Array:
     if not at_rest:
         excess = np.linalg.norm(readings.accel_body, axis=1) - site.gravity
         variance += IN_STEP**2 * uniform_filter1d(excess**2, SHAKEN, mode="nearest")
-    return np.asarray(np.sqrt(variance))
+    return np.sqrt(variance)
 
 
 def _field_sigma(readings: SteadyField, found: Magnetometer, prior: Prior) -> float:
@@ -268,7 +261,7 @@ def _turns(
         part = slice(begin, end)
         angle = float(np.sum(np.linalg.norm(mean[part], axis=1) * step[part]))
         whole = float(grid[end] - grid[begin])
-        # The same error in every turn, told as an independent one that averages out no further.
+        # The same error in every turn, given as an independent one that averages out no further.
         systematic = GYRO_SCALE**2 * len(epoch) * angle**2
         density = site.platform.imu.gyro_noise**2 + systematic / whole
         parameters = gtsam.PreintegrationParams.MakeSharedU(site.gravity)
@@ -281,7 +274,7 @@ def _turns(
 
 
 def _with_unknown_scale(fit: MagnetometerFit, prior: Prior) -> MagnetometerFit:
-    """Add the scale, which only the declared matrix tells, to the covariance."""
+    """Add the scale, which only the declared matrix gives, to the covariance."""
     variance = float(np.mean(np.diagonal(prior.cov)[[0, 4, 8]])) / 3.0
     direction = np.concatenate([fit.matrix.ravel(), np.zeros(3)])
     return replace(fit, cov=fit.cov + variance * np.outer(direction, direction))
@@ -314,7 +307,7 @@ def _part(epochs: Epochs, part: slice) -> Epochs:
 
 
 def _no_better(unseen: float, readings: SteadyField, known: Magnetometer) -> bool:
-    """Tell whether the spread is not below the declared calibration's by more than chance."""
+    """Return whether the spread is not below the declared calibration's by more than chance."""
     declared = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
     return unseen > spread(declared) * (1.0 - float(np.sqrt(0.5 / len(readings))))
 

@@ -11,9 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.records.samples import ImuSamples, Waveform
-from magfusion.site import Magnetometer, Site
-from magfusion.strapdown import attitude_at, attitude_from_gyro
+from magfusion.model.samples import ImuSamples, Waveform
+from magfusion.model.site import Magnetometer, Site
+from magfusion.model.strapdown import attitude_at, attitude_from_gyro
 from magfusion.units import Array, BoolArray
 
 PERIODS = 8.0  # of the lowest tone in a window; its taper leaves 6e-4 of it, less of the others
@@ -72,9 +72,6 @@ def steady_field(
 
     Parameters
     ----------
-    waveform : Waveform
-    imu : ImuSamples
-    site : Site
     magnetometer : Magnetometer, optional
         The calibration known so far; the site's where it is not given.
 
@@ -105,8 +102,6 @@ def average(
 
     Parameters
     ----------
-    waveform : Waveform
-    imu : ImuSamples
     time_offset : float
         Added to the IMU's stamps (s).
     magnetometer : Magnetometer
@@ -142,7 +137,7 @@ def _turned_means(
     time: Array, body: Array, attitude: Rotation, at_centre: Rotation, centre: Array, window: Array
 ) -> Array:
     means = _tapered_means(time, attitude.apply(body), centre, window)
-    return np.asarray(at_centre.inv().apply(means))
+    return at_centre.inv().apply(means)
 
 
 def _whole(time: Array, centre: Array, window: Array) -> BoolArray:
@@ -152,7 +147,7 @@ def _whole(time: Array, centre: Array, window: Array) -> BoolArray:
     first, last = centre - 0.5 * window, centre + 0.5 * window
     inside = (first > time[0] - usual) & (last < time[-1] + usual)
     met = np.searchsorted(time[gaps], last) > np.searchsorted(time[gaps + 1], first)
-    return np.asarray(inside & ~met)
+    return inside & ~met
 
 
 def _tapered_means(time: Array, vector: Array, centre: Array, window: Array) -> Array:

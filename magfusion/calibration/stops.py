@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.records.samples import ImuSamples
-from magfusion.strapdown import resting
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import MotionModel
+from magfusion.model.strapdown import resting
 from magfusion.units import DEGREE, Array
 
 SHORTEST = 1.5  # s; of a stop
@@ -40,12 +41,13 @@ class Stops:
         return self.end - self.begin
 
 
-def find_stops(imu: ImuSamples, shortest: float = SHORTEST) -> Stops:
+def find_stops(imu: ImuSamples, motion: MotionModel, shortest: float = SHORTEST) -> Stops:
     """Find where the platform stood still for long enough.
 
     Parameters
     ----------
-    imu : ImuSamples
+    motion : MotionModel
+        What is called rest.
     shortest : float
         Length of the shortest stop (s).
 
@@ -54,7 +56,7 @@ def find_stops(imu: ImuSamples, shortest: float = SHORTEST) -> Stops:
     Stops
         In order of time; a slow even turn, which scatters as little as a rest, is none.
     """
-    still = resting(imu.time, imu.gyro_body, imu.accel_body)
+    still = resting(imu.time, imu.gyro_body, imu.accel_body, motion=motion)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int)))
     first, last = edges[::2], edges[1::2] - 1
     long = imu.time[last] - imu.time[first] >= shortest

@@ -1,66 +1,65 @@
 """The job that builds an attitude database: a log of known attitudes in, the database out."""
 
-from dataclasses import dataclass, field
+from __future__ import annotations
+
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from magfusion.calibration.steady_field import average, window_length
 from magfusion.errors import InputError
-from magfusion.fixes.matching import predict_field
-from magfusion.fixes.matching_database import build_database, prepare
-from magfusion.job import Job, claim, named, read_estimate, read_job
-from magfusion.plots.match import write_database_plot
-from magfusion.receiver.windows import sample_rate_hz
-from magfusion.records.attitude_table import write_database
-from magfusion.records.samples import Log
-from magfusion.report import Figures, write_report
-from magfusion.site import Site
-from magfusion.trajectory import Trajectory, interpolate
+from magfusion.jobs.settings import Command, LogSettings, Settings, option
+from magfusion.model.site import Site
 from magfusion.units import DEGREE, Array
+
+if TYPE_CHECKING:
+    from magfusion.jobs.inputs import Job
+    from magfusion.model.samples import Log
+    from magfusion.model.trajectory import Trajectory
+    from magfusion.model.trust import Trust
+    from magfusion.papers.p001_magnetometer.matching_database import Index
+    from magfusion.results.figures import Figures
+
 
 TABLE = "attitudes.parquet"
 LEAST_FIELD = 1e-7  # T; a two hundredth of the Earth's at its weakest
 MAX_GAP = 0.2  # s; of the reference, across which it is interpolated
+DISTORTED, CONTRADICTED = 0.15, 0.3  # of the field: doubt, and more than iron on a platform does
 _TAPER = 1.5  # by which a raised cosine averages white noise less than equal weights do
 
 
-@dataclass(frozen=True)
-class Sampling:
-    """How the steady field is taken from the waveform.
+@dataclass(frozen=True, kw_only=True)
+class Sampling(Settings):
+    """How the steady field is taken from the waveform: averages over which tones vanish, or raw."""
 
-    Parameters
-    ----------
-    raw : bool
-        Every sample as it is, where no beacon radiates; else averages over which tones vanish.
-    step : float, optional
-        Distance of the averages (s); default: half their length.
-    """
-
-    raw: bool = False
-    step: float | None = None
+    raw: bool = option(
+        False,
+        "Take every sample as it is: no beacon radiates, or it spins fast",
+        common=True,
+    )
+    step: float | None = option(
+        None, "Distance of epochs", unit="s", note="default: half a window", common=True
+    )
 
 
-@dataclass(frozen=True)
-class DatabaseSettings:
-    """What a database shall tell, and whence its attitudes are known.
+@dataclass(frozen=True, kw_only=True)
+class DatabaseSettings(LogSettings, Sampling):
+    """What a database is to determine, and where its attitudes come from."""
 
-    Parameters
-    ----------
-    angles : str, optional
-        "roll" or "roll-pitch"; default: what varies.
-    step_deg : float
-        Cells in which measurements are averaged.
-    trajectory : Path, optional
-        Reference in place of the log's truth: a result's directory, TUM file or table.
-    sampling : Sampling
-    """
-
-    angles: str | None = None
-    step_deg: float = 1.0
-    trajectory: Path | None = None
-    sampling: Sampling = field(default_factory=Sampling)
+    angles: Literal["roll", "roll-pitch", "roll-pitch-yaw"] | None = option(
+        None, "What varies in the log", note="default: as it is found"
+    )
+    step_deg: float = option(
+        1.0,
+        "Measurements in cells of this size are averaged",
+        unit="degrees",
+        least=0.05,
+        most=15.0,
+    )
+    trajectory: Path | None = option(
+        None, "Reference: result of smooth, or a table", note="default: the log's truth"
+    )
 
 
 class Steady(NamedTuple):
@@ -88,27 +87,30 @@ class Steady(NamedTuple):
     length: float
 
 
-def run_attitude_database(job: Job, settings: DatabaseSettings) -> Figures:
+def run_attitude_database(settings: DatabaseSettings, output: Path) -> Figures:
     """Build the database of a log whose attitudes are known: table, picture and report.
-
-    Returns
-    -------
-    dict
-        The figures of ``report.json``.
 
     Raises
     ------
     InputError
-        Where the log has no reference, an angle varies that one vector cannot tell, or ``output``
-        is in the way.
+        Where the log has no reference, an angle varies that one vector cannot determine, or
+        ``output`` is in the way.
     """
-    if not 0.05 <= settings.step_deg <= 15.0:
-        raise InputError(f"--step-deg must lie between 0.05 and 15; got {settings.step_deg:g}")
-    claimed = claim(job.output, "calibrate attitude-database")
+    from magfusion.files.attitude_table import write_database
+    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.model.trajectory import interpolate
+    from magfusion.papers.p001_magnetometer.matching import predict_field
+    from magfusion.papers.p001_magnetometer.matching_database import build_database, prepare
+    from magfusion.results.figures import Figure, Figures, heading
+    from magfusion.results.plots.match import write_database_plot
+    from magfusion.results.report import write_report
+    from magfusion.results.verdict import trust_figures
+
+    job, claimed = settings.job(output), claim(output, "calibrate attitude-database")
     log, site = read_job(job)
     reference, place = _reference(job, log, settings.trajectory)
     with named(job.log_path):
-        found = steady(log, site, settings.sampling)
+        found = steady(log, site, settings)
     poses, known = interpolate(reference, found.time, MAX_GAP)
     if not np.any(known):
         raise InputError(f"{place}: does not cover the magnetometer's time; give one that does")
@@ -123,28 +125,68 @@ def run_attitude_database(job: Job, settings: DatabaseSettings) -> Figures:
         index = prepare(built.database)
     entries = built.database
     _, pitch, yaw = entries.rpy[0] / DEGREE
-    figures: Figures = {
-        "job": "calibrate attitude-database",
-        "log": log.name,
-        "angles": entries.angles,
-        "entries": len(entries),
-        "measurements": int(np.sum(known)),
-        "measurements_beyond_fold": built.beyond_fold,
-        "held_yaw_deg": float(yaw),
-        "spacing_t": index.spacing,
-        "unexplained_by_a_uniform_field_t": index.sigma,
-    }
-    if entries.angles == "roll":
-        figures["held_pitch_deg"] = float(pitch)
-    with claimed as directory:
+    fixed = [Figure("held_pitch_deg", float(pitch), "deg")] if entries.angles == "roll" else []
+    trust = judged(index, site, log)
+    figures = (
+        heading("calibrate attitude-database", log.name)
+        | trust_figures(trust)
+        | Figures(
+            Figure("angles", entries.angles),
+            Figure("entries", len(entries)),
+            Figure("measurements", int(np.sum(known))),
+            Figure("measurements_beyond_fold", built.beyond_fold),
+            Figure("held_yaw_deg", float(yaw), "deg"),
+            Figure("spacing_t", index.spacing, "T"),
+            Figure("unexplained_by_a_uniform_field_t", index.sigma, "T"),
+            *fixed,
+        )
+    )
+    with claimed as whole:
+        directory = found_in(whole, trust)
         write_database(entries, directory / TABLE)
         left = entries.field_body - predict_field(entries.rpy, index.field_world)
         write_database_plot(directory / "attitudes.png", entries, left)
-        write_report(directory, figures)
+        write_report(whole, figures)
+    refuse_failed(job.log_path, output, trust)
     return figures
 
 
+def judged(index: Index, site: Site, log: Log) -> Trust:
+    """Return whether a database holds what one field would make at its attitudes.
+
+    Iron on the platform may distort it, for which a database is made; what no uniform field
+    resembles has attitudes that are not those of the field.
+    """
+    from magfusion.estimation.integrity.recording import BRIDGED, recorded
+    from magfusion.model.trust import Finding, Trust, Verdict
+
+    found = list(recorded(log, site, BRIDGED))
+    size = float(np.linalg.norm(index.field_world))
+    share = float(np.sqrt(3.0)) * index.sigma / size
+    if share > DISTORTED:
+        verdict = Verdict.FAILED if share > CONTRADICTED else Verdict.DOUBTFUL
+        text = (
+            f"One uniform field leaves {100.0 * share:.2g} % of the measurements unexplained: the"
+            " attitudes are not those of this log (other clock, axes or mounting), or strong iron"
+            " is on the platform."
+        )
+        found.append(Finding("earth_field", text, verdict, share / DISTORTED))
+    if site.earth_field_world is not None:
+        declared = float(np.linalg.norm(site.earth_field_world))
+        off = max(size / declared, declared / size) - 1.0
+        if off > CONTRADICTED:
+            text = (
+                f"The field of the database is {1e6 * size:.3g} uT and the site's Earth field"
+                f" {1e6 * declared:.3g} uT: check the unit of magnetometer.parquet and the sensor's"
+                " calibration."
+            )
+            found.append(Finding("earth_field", text, Verdict.FAILED, off / CONTRADICTED))
+    return Trust(tuple(found))
+
+
 def _reference(job: Job, log: Log, trajectory: Path | None) -> tuple[Trajectory, Path]:
+    from magfusion.jobs.inputs import read_estimate
+
     if trajectory is not None:
         return read_estimate(trajectory, log.epoch_ns), trajectory
     if log.truth is None:
@@ -162,6 +204,9 @@ def steady(log: Log, site: Site, sampling: Sampling) -> Steady:
     InputError
         Where the log has no waveform, or no stretch of it is long enough.
     """
+    from magfusion.calibration.steady_field import average, window_length
+    from magfusion.receiver.admission import sample_rate_hz
+
     if log.waveform is None:
         raise InputError(
             "holds no magnetometer.parquet, in whose steady part the Earth's field is; give the raw"
@@ -212,3 +257,6 @@ def _windows(
     end = min(log.waveform.time[-1], stamps[-1]) - 0.5 * length
     centre = np.arange(begin, end, distance)
     return centre, np.full(len(centre), length)
+
+
+COMMAND = Command(DatabaseSettings, run_attitude_database)

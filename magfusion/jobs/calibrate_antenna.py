@@ -1,78 +1,65 @@
 """The job that calibrates a tracker's antennas: a survey of known poses in, a refined site out."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from magfusion.antenna import (
-    CENTRES,
-    KAPPAS,
-    MOMENTS,
-    SENSITIVITIES,
-    SENSOR_CENTRES,
-    Antenna,
-    antenna_from_vector,
-    antenna_of,
-)
-from magfusion.calibration.antenna import (
-    AntennaFit,
-    AntennaSurvey,
-    fit_at_known_poses,
-    prior_sigma,
-    with_receiver_gain,
-)
-from magfusion.calibration.antenna_graph import fit_at_uncertain_poses
-from magfusion.calibration.antenna_observability import Observability, observability
 from magfusion.errors import EstimationError, InputError
-from magfusion.fixes.tracker import locate_by_svd, refine_poses, whitened
-from magfusion.job import claim, named
-from magfusion.plots.antenna import write_antenna_plot
-from magfusion.records.survey import Survey, read_survey
-from magfusion.report import Figures, write_report
-from magfusion.site import Beacon, Site
-from magfusion.site_file import load_site, save_site
+from magfusion.jobs.settings import Command, Settings, argument, option, required
+from magfusion.model.site import Beacon, Site
 from magfusion.units import DEGREE, Array
+
+if TYPE_CHECKING:
+    from magfusion.calibration.antenna import AntennaFit, AntennaSurvey
+    from magfusion.calibration.antenna_observability import Observability
+    from magfusion.files.survey import Survey
+    from magfusion.model.antenna import Antenna
+    from magfusion.results.figures import Estimate, Figures
+
 
 JOB = "calibrate antenna"
 FEWEST_POSES = 5  # four determine the antenna; with less than one to spare nothing is tested
 FOLDS = 5  # each pose is judged by an antenna that was fitted without it
 # What a nominal antenna may be off by; wide, since the couplings say more.
 GAIN_SIGMA, TILT_SIGMA, CENTRE_SIGMA, KAPPA_SIGMA = 0.05, 0.05, 0.01, 1e-3
-DETERMINED_RATIO = 0.5
 _AXES = "xyz"
 
 
-@dataclass(frozen=True)
-class AntennaSettings:
-    """How the antennas are calibrated.
+@dataclass(frozen=True, kw_only=True)
+class AntennaSettings(Settings):
+    """How the antennas are calibrated."""
 
-    Parameters
-    ----------
-    beacon : str, optional
-        Which; None takes the only one with three coils, each in a tone or slot of its own.
-    rotation_sigma, position_sigma : float
-        Error of the survey's poses, each axis (rad, m); zero takes them as exact.
-    sizes : bool
-        Estimate the coils' finite size too.
-    """
+    survey: Path = argument("Survey: known poses and the phasors of a three-coil beacon")
+    site: Path = required("Site file")
+    beacon: str | None = option(None, "Which", note="default: the only one of three coils")
+    pose_rotation_deg: float = option(
+        0.1, "Error of the survey's attitudes, one sigma an axis", least=0.0, note="0: exact"
+    )
+    pose_position_m: float = option(
+        0.0005, "Error of the survey's positions, one sigma an axis", least=0.0, note="0: exact"
+    )
+    sizes: bool = option(False, "Estimate the coils' size too (for the report alone)")
 
-    beacon: str | None = None
-    rotation_sigma: float = 0.1 * DEGREE
-    position_sigma: float = 0.5e-3
-    sizes: bool = False
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if (self.pose_rotation_deg == 0.0) != (self.pose_position_m == 0.0):
+            raise InputError(
+                "--pose-rotation-deg and --pose-position-m must both be 0 (poses exact) or both"
+                " above"
+            )
+
+    @property
+    def exact(self) -> bool:
+        """Whether the survey's poses are taken as exact."""
+        return self.pose_rotation_deg == 0.0
 
 
-def run_calibrate_antenna(
-    survey_path: Path, site_path: Path, settings: AntennaSettings, output: Path
-) -> Figures:
+def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
     """Calibrate the antennas of a beacon and of the magnetometer: site, picture and report.
-
-    Returns
-    -------
-    dict
-        The figures of ``report.json``.
 
     Raises
     ------
@@ -82,8 +69,25 @@ def run_calibrate_antenna(
     EstimationError
         Where the fit does not converge.
     """
-    claimed = claim(output, JOB)
-    _check(settings)
+    from magfusion.calibration.antenna import with_receiver_gain
+    from magfusion.calibration.antenna_observability import observability
+    from magfusion.files.site import load_site, save_site
+    from magfusion.files.survey import read_survey
+    from magfusion.jobs.antenna_trust import judged
+    from magfusion.jobs.inputs import claim, found_in, named, refuse_failed
+    from magfusion.model.antenna import antenna_from_vector, antenna_of
+    from magfusion.results.figures import (
+        Figure,
+        Figures,
+        calibration_record,
+        determined_figures,
+        heading,
+    )
+    from magfusion.results.plots.antenna import write_antenna_plot
+    from magfusion.results.report import write_report
+    from magfusion.results.verdict import trust_figures
+
+    claimed, survey_path, site_path = claim(output, JOB), settings.survey, settings.site
     site = load_site(site_path)
     with named(site_path):
         beacon = _tracker(site, settings.beacon)
@@ -94,27 +98,29 @@ def run_calibrate_antenna(
     if settings.sizes:
         start = antenna_from_vector(np.concatenate([start.vector(), np.zeros(2)]))
     fit = with_receiver_gain(_fit(survey, start, settings), start)
-    told = observability(survey, fit.antenna)
-    after = _judged(survey, start, settings)
-    figures: Figures = {"job": JOB, "log": survey_path.stem, "beacon": beacon.name}
-    figures |= {"poses": len(survey.sigma), "poses_dropped": dropped}
-    figures |= _error_figures(before, after) | _figures(fit, told, start, settings)
-    with claimed as directory:
-        save_site(_refined(site, beacon, fit, figures), directory / "site.yaml")
-        write_antenna_plot(directory / "antenna.png", before, after)
-        write_report(directory, figures)
-    return figures
-
-
-def _check(settings: AntennaSettings) -> None:
-    sigmas = (settings.rotation_sigma, settings.position_sigma)
-    for name, value in zip(("--pose-rotation-deg", "--pose-position-m"), sigmas, strict=True):
-        if not 0.0 <= value < np.inf:
-            raise InputError(f"{name} must be at least 0; got {value:g}")
-    if (sigmas[0] == 0.0) != (sigmas[1] == 0.0):
-        raise InputError(
-            "--pose-rotation-deg and --pose-position-m must both be 0 (poses exact) or both above"
+    observed = observability(survey, fit.antenna)
+    after = _left_out(survey, start, settings)
+    fit, trust = judged(fit, _estimates(fit, start), observed.null_space, before, after)
+    figures = (
+        heading(JOB, survey_path.stem)
+        | trust_figures(trust)
+        | Figures(
+            Figure("beacon", beacon.name),
+            Figure("poses", len(survey.sigma)),
+            Figure("poses_dropped", dropped),
         )
+    )
+    estimates = _estimates(fit, start)
+    record = calibration_record(survey_path.stem, estimates)
+    figures |= _error_figures(before, after) | _figures(fit, observed, start, settings)
+    figures |= determined_figures(estimates)
+    with claimed as whole:
+        directory = found_in(whole, trust)
+        save_site(_refined(site, beacon, fit, record), directory / "site.yaml")
+        write_antenna_plot(directory / "antenna.png", before, after)
+        write_report(whole, figures)
+    refuse_failed(survey_path, output, trust)
+    return figures
 
 
 def _tracker(site: Site, name: str | None) -> Beacon:
@@ -147,6 +153,8 @@ def _tracker(site: Site, name: str | None) -> Beacon:
 
 def _couplings(survey: Survey, site: Site, beacon: Beacon) -> tuple[AntennaSurvey, int]:
     """Return a survey's couplings at poses of the sensor in beacon axes, and how many it lost."""
+    from magfusion.calibration.antenna import AntennaSurvey
+
     if survey.phasor_sensor is None:
         raise InputError("holds amplitudes, and antennas need phasors; survey again")
     wanted = [(beacon.name, tone) for tone in range(3)]
@@ -183,6 +191,8 @@ def _couplings(survey: Survey, site: Site, beacon: Beacon) -> tuple[AntennaSurve
 
 
 def _some(survey: AntennaSurvey, rows: Array) -> AntennaSurvey:
+    from magfusion.calibration.antenna import AntennaSurvey
+
     return AntennaSurvey(
         survey.beacon_from_sensor[rows],
         survey.position_beacon[rows],
@@ -192,18 +202,26 @@ def _some(survey: AntennaSurvey, rows: Array) -> AntennaSurvey:
 
 
 def _fit(survey: AntennaSurvey, start: Antenna, settings: AntennaSettings) -> AntennaFit:
+    from magfusion.calibration.antenna import fit_at_known_poses, prior_sigma
+    from magfusion.calibration.antenna_graph import fit_at_uncertain_poses
+
     sigma = prior_sigma(start, GAIN_SIGMA, TILT_SIGMA, CENTRE_SIGMA, KAPPA_SIGMA)
-    if settings.rotation_sigma == 0.0:
+    if settings.exact:
         return fit_at_known_poses(survey, start, sigma)
     return fit_at_uncertain_poses(
-        survey, start, sigma, settings.rotation_sigma, settings.position_sigma
+        survey, start, sigma, settings.pose_rotation_deg * DEGREE, settings.pose_position_m
     )
 
 
 def _pose_errors(antenna: Antenna, survey: AntennaSurvey) -> tuple[Array, Array]:
     """Return how far tracked poses are from the surveyed ones (rad, m)."""
+    from scipy.spatial.transform import Rotation
+
+    from magfusion.papers.p000_tracker.equations import eq_09_whitened
+    from magfusion.papers.p000_tracker.pose import locate_by_svd, refine_poses
+
     receiver = np.asarray(np.linalg.inv(antenna.sensitivities_sensor))
-    free = whitened(survey.coupling, receiver, antenna.moments_beacon.T)
+    free = eq_09_whitened(survey.coupling, receiver, antenna.moments_beacon.T)
     try:
         start = locate_by_svd(free).nearest(survey.position_beacon)
         rotation, position = refine_poses(
@@ -213,13 +231,13 @@ def _pose_errors(antenna: Antenna, survey: AntennaSurvey) -> tuple[Array, Array]
             start.position_beacon[:, 0],
         )
     except EstimationError as error:
-        raise InputError(f"{error}; mend the wiring or the site") from error
+        raise InputError(f"{error}; correct the wiring or the site") from error
     turn = np.swapaxes(survey.beacon_from_sensor, -1, -2) @ rotation
     off = np.linalg.norm(position - survey.position_beacon, axis=-1)
     return np.asarray(Rotation.from_matrix(turn).magnitude()), np.asarray(off)
 
 
-def _judged(
+def _left_out(
     survey: AntennaSurvey, start: Antenna, settings: AntennaSettings
 ) -> tuple[Array, Array]:
     """Return the errors of every pose by an antenna that was fitted without it."""
@@ -234,58 +252,77 @@ def _judged(
 
 
 def _error_figures(before: tuple[Array, Array], after: tuple[Array, Array]) -> Figures:
-    figures: Figures = {}
+    from magfusion.results.figures import Figure, Figures
+
+    figures = []
     for name, (attitude, position) in (("before", before), ("after", after)):
-        figures[f"attitude_deg_{name}"] = float(np.sqrt(np.mean(attitude**2)) / DEGREE)
-        figures[f"position_m_{name}"] = float(np.sqrt(np.mean(position**2)))
-    return figures
+        turned = float(np.sqrt(np.mean(attitude**2)) / DEGREE)
+        moved = float(np.sqrt(np.mean(position**2)))
+        figures += [
+            Figure(f"attitude_deg_{name}", turned, "deg", label=f"attitude error {name}"),
+            Figure(f"position_m_{name}", moved, "m", label=f"position error {name}"),
+        ]
+    return Figures(*figures)
 
 
-def _names(parameters: int) -> list[str]:
+def _estimates(fit: AntennaFit, start: Antenna) -> list[Estimate]:
+    from magfusion.calibration.antenna import prior_sigma
+    from magfusion.results.figures import Estimate
+
     blocks = ("transmitter.moment", "transmitter.centre", "receiver.matrix", "receiver.centre")
     names = [f"{block}_{coil}{axis}" for block in blocks for coil in _AXES for axis in _AXES]
-    return [*names, "transmitter.kappa", "receiver.kappa"][:parameters]
+    found = fit.antenna.vector()
+    names = [*names, "transmitter.kappa", "receiver.kappa"][: len(found)]
+    prior = prior_sigma(start, GAIN_SIGMA, TILT_SIGMA, CENTRE_SIGMA, KAPPA_SIGMA)
+    rows = zip(names, found - start.vector(), np.diagonal(fit.cov), prior, strict=True)
+    return [
+        Estimate(name, float(change), sigma=float(np.sqrt(variance)), prior_sigma=float(before))
+        for name, change, variance, before in rows
+    ]
 
 
 def _figures(
-    fit: AntennaFit, told: Observability, start: Antenna, settings: AntennaSettings
+    fit: AntennaFit, observed: Observability, start: Antenna, settings: AntennaSettings
 ) -> Figures:
+    from magfusion.model.antenna import CENTRES, KAPPAS, MOMENTS, SENSITIVITIES, SENSOR_CENTRES
+    from magfusion.results.figures import Figure, Figures
+
     sigma = np.sqrt(np.diagonal(fit.cov))
-    prior = prior_sigma(start, GAIN_SIGMA, TILT_SIGMA, CENTRE_SIGMA, KAPPA_SIGMA)
     found = fit.antenna.vector()
     change = found - start.vector()
-    figures: Figures = {
-        "poses_taken_as": "exact" if settings.rotation_sigma == 0.0 else "uncertain",
-        "chi2_per_dof": float(fit.chi2 / fit.dof),
-        "parameters": told.parameters,
-        "rank": told.rank,
-        "not_seen_by_these_poses": list(told.null_space),
-        "weakest_seen_relative": float(told.singular[told.rank - 1]),
-        "fewest_of_these_poses": told.fewest_poses,
-    }
-    for columns, name in (
-        (MOMENTS, "moment_change_a_m2"),
-        (CENTRES, "transmitter_centre_change_m"),
-        (SENSITIVITIES, "matrix_change"),
-        (SENSOR_CENTRES, "receiver_centre_change_m"),
+    figures = [
+        Figure("poses_taken_as", "exact" if settings.exact else "uncertain"),
+        Figure("chi2_per_dof", float(fit.chi2 / fit.dof), label="chi square per degree of freedom"),
+        Figure("parameters", observed.parameters),
+        Figure("rank", observed.rank),
+        Figure("not_seen_by_these_poses", list(observed.null_space)),
+        Figure("weakest_seen_relative", float(observed.singular[observed.rank - 1])),
+        Figure("fewest_of_these_poses", observed.fewest_poses),
+    ]
+    for columns, name, unit in (
+        (MOMENTS, "moment_change_a_m2", "A m^2"),
+        (CENTRES, "transmitter_centre_change_m", "m"),
+        (SENSITIVITIES, "matrix_change", ""),
+        (SENSOR_CENTRES, "receiver_centre_change_m", "m"),
     ):
-        figures[f"{name}_largest"] = float(np.max(np.abs(change[columns])))
-        figures[f"{name}_sigma_largest"] = float(np.max(sigma[columns]))
+        figures += [
+            Figure(f"{name}_largest", float(np.max(np.abs(change[columns]))), unit),
+            Figure(f"{name}_sigma_largest", float(np.max(sigma[columns])), unit),
+        ]
     if settings.sizes:
-        for name, value, error in zip(
-            ("transmitter", "receiver"), found[KAPPAS], sigma[KAPPAS], strict=True
-        ):
-            figures[f"{name}_kappa_m2"] = float(value)
-            figures[f"{name}_kappa_m2_sigma"] = float(error)
-    settled = sigma < DETERMINED_RATIO * prior
-    names = _names(len(found))
-    figures["determined"] = [n for n, yes in zip(names, settled, strict=True) if yes]
-    figures["undetermined"] = [n for n, yes in zip(names, settled, strict=True) if not yes]
-    return figures
+        sizes = zip(("transmitter", "receiver"), found[KAPPAS], sigma[KAPPAS], strict=True)
+        for name, value, error in sizes:
+            figures += [
+                Figure(f"{name}_kappa_m2", float(value), "m^2", label=f"{name} kappa"),
+                Figure(f"{name}_kappa_m2_sigma", float(error), "m^2", label=f"{name} kappa sigma"),
+            ]
+    return Figures(*figures)
 
 
-def _refined(site: Site, beacon: Beacon, fit: AntennaFit, figures: Figures) -> Site:
+def _refined(site: Site, beacon: Beacon, fit: AntennaFit, record: dict[str, object]) -> Site:
     """Return the site with the antennas' vectors, centres and matrix, and their sigmas."""
+    from magfusion.model.antenna import SENSITIVITIES
+
     antenna, sensor = fit.antenna, site.platform.magnetometer
     sigma = np.sqrt(np.diagonal(fit.cov))
     size = np.linalg.norm(antenna.moments_beacon, axis=1)
@@ -305,11 +342,6 @@ def _refined(site: Site, beacon: Beacon, fit: AntennaFit, figures: Figures) -> S
         coil_centres_sensor=antenna.centres_sensor,
         sigma=replace(sensor.sigma, matrix=sigma[SENSITIVITIES].reshape(3, 3)),
     )
-    record = {
-        "log": figures["log"],
-        "determined": figures["determined"],
-        "undetermined": figures["undetermined"],
-    }
     known, owners = site.correlation, (beacon.name, "magnetometer")
     return replace(
         site,
@@ -318,3 +350,6 @@ def _refined(site: Site, beacon: Beacon, fit: AntennaFit, figures: Figures) -> S
         calibration=record,
         correlation=known and known.without(("moments", "magnetometer"), owners),
     )
+
+
+COMMAND = Command(AntennaSettings, run_calibrate_antenna, output="antenna")

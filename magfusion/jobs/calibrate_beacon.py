@@ -1,29 +1,30 @@
 """The job that finds where beacons are and how they are turned: survey in, refined site out."""
 
-from collections.abc import Callable
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from magfusion.calibration.beacon import REACH, BeaconFits, BeaconMeasurements
-from magfusion.calibration.beacon_refined import RefinedBeacon, calibrate_one
 from magfusion.errors import InputError
-from magfusion.job import claim, named
-from magfusion.observation import model_error_cov, predict
-from magfusion.plots.beacon import BeaconPanel, write_beacon_plot
-from magfusion.records.survey import Survey, read_survey
-from magfusion.refinement import DETERMINED_RATIO, Finding
-from magfusion.report import AMBIGUOUS_CHI_SQUARE, Figures, write_report
-from magfusion.site import Beacon, Site
-from magfusion.site_file import load_site, save_site
+from magfusion.jobs.settings import Command, Settings, argument, option, required
+from magfusion.model.progress import Report, quiet
+from magfusion.model.site import Beacon, Site
 from magfusion.units import DEGREE, Array
+
+if TYPE_CHECKING:
+    from magfusion.calibration.beacon import BeaconFits, BeaconMeasurements
+    from magfusion.calibration.beacon_refined import RefinedBeacon
+    from magfusion.files.survey import Survey
+    from magfusion.model.trust import Trust
+    from magfusion.results.figures import Estimate, Figures
+    from magfusion.results.plots.beacon import BeaconPanel
+
 
 JOB = "calibrate beacon"
 FARTHEST = 5.0  # m from the declared place, however wide its sigma
-CONTRADICTED = 4.0  # sigmas of survey and calibration together
-Report = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,71 +39,78 @@ class _Calibrated:
         return 6 * int(np.count_nonzero(self.measured.valid)) - int(self.fits.cov.shape[-1])
 
 
-def run_calibrate_beacon(
-    survey_path: Path, site_path: Path, names: tuple[str, ...], output: Path, *, report: Report
-) -> Figures:
+@dataclass(frozen=True, kw_only=True)
+class BeaconSettings(Settings):
+    """What was surveyed, and which beacons are calibrated by it."""
+
+    survey: Path = argument("Survey: what magnetometers at known poses measured")
+    site: Path = required("Site file with the declared beacons")
+    beacon: tuple[str, ...] = option(
+        (), "Name of a beacon; repeatable", note="default: all that were surveyed"
+    )
+
+
+def run_calibrate_beacon(settings: BeaconSettings, output: Path, report: Report = quiet) -> Figures:
     """Calibrate beacons from magnetometers at the known poses of a survey.
 
     A beacon that is not synchronised must have had one drive phase at all points, as for
     magnetometers that record at the same time.
-
-    Parameters
-    ----------
-    survey_path, site_path : Path
-    names : tuple of str
-        The beacons; empty for all that the survey heard.
-    output : Path
-    report : callable
-
-    Returns
-    -------
-    dict
-        The figures of ``report.json``.
 
     Raises
     ------
     InputError
         Where a file cannot be used, a beacon was not surveyed, or it is not determined.
     """
-    claimed = claim(output, JOB)
-    site, survey = load_site(site_path), read_survey(survey_path)
+    from magfusion.files.site import load_site, save_site
+    from magfusion.files.survey import read_survey
+    from magfusion.jobs.inputs import claim, found_in, named, refuse_failed
+    from magfusion.model.trust import Trust
+    from magfusion.results.plots.beacon import write_beacon_plot
+    from magfusion.results.report import write_report
+
+    claimed, survey_path = claim(output, JOB), settings.survey
+    site, survey = load_site(settings.site), read_survey(survey_path)
     if survey.phasor_sensor is None:
         raise InputError(
             f"{survey_path}: holds amplitudes, and the calibration of a beacon needs phasors;"
             " survey again"
         )
-    beacons = _chosen(site, survey, names, survey_path)
-    found = []
+    beacons = _chosen(site, survey, settings.beacon, survey_path)
+    found, trust = [], Trust()
     for done, beacon in enumerate(beacons):
         report(f"beacon {beacon.name}", done, len(beacons))
         with named(survey_path):
-            found.append(_calibrated(site, beacon, survey))
+            honest, said = judged(_calibrated(site, beacon, survey))
+        found.append(honest)
+        trust |= said
     report("done", len(beacons), len(beacons))
-    figures = _figures(survey_path, survey, found)
-    with claimed as directory:
-        save_site(_refined_site(site, found, survey_path, figures), directory / "site.yaml")
+    figures = _figures(survey_path, survey, found, trust)
+    with claimed as whole:
+        directory = found_in(whole, trust)
+        save_site(_refined_site(site, found, survey_path), directory / "site.yaml")
         write_beacon_plot(directory / "beacon.png", [_panel(c) for c in found])
-        write_report(directory, figures)
+        write_report(whole, figures)
+    refuse_failed(survey_path, output, trust)
     return figures
 
 
 def _chosen(site: Site, survey: Survey, names: tuple[str, ...], path: Path) -> list[Beacon]:
     known = {b.name: b for b in site.beacons}
-    heard = list(dict.fromkeys(name for name, _ in survey.channels))
+    detected = list(dict.fromkeys(name for name, _ in survey.channels))
     for name in names:
         if name not in known:
             raise InputError(f"--beacon {name}: the site has {', '.join(known)}; choose of these")
-        if name not in heard:
+        if name not in detected:
             raise InputError(
-                f"{path}: beacon {name} was not surveyed (found {', '.join(heard)}); survey it"
+                f"{path}: beacon {name} was not surveyed (found {', '.join(detected)}); survey it"
             )
-    strange = [name for name in heard if name not in known]
+    strange = [name for name in detected if name not in known]
     if strange and not names:
         raise InputError(
             f"{path}: beacon {strange[0]} is unknown to the site (it has {', '.join(known)}); give"
             " the site that was surveyed, or choose with --beacon"
         )
-    chosen = [known[name] for name in dict.fromkeys(names or heard)]
+    chosen = [known[name] for name in dict.fromkeys(names or detected)]
     for name, tone in survey.channels:
         if name in known and tone >= len(known[name].tones):
             raise InputError(
@@ -113,6 +121,10 @@ def _chosen(site: Site, survey: Survey, names: tuple[str, ...], path: Path) -> l
 
 
 def _calibrated(site: Site, beacon: Beacon, survey: Survey) -> _Calibrated:
+    from magfusion.calibration.beacon import REACH, BeaconMeasurements
+    from magfusion.calibration.beacon_refined import calibrate_one
+    from magfusion.model.field import model_error_cov
+
     assert survey.phasor_sensor is not None
     shape = (len(survey), len(beacon.tones))
     phasor, sigma = np.full((*shape, 3), np.nan + 0j), np.ones(shape)
@@ -121,21 +133,23 @@ def _calibrated(site: Site, beacon: Beacon, survey: Survey) -> _Calibrated:
             phasor[:, tone], sigma[:, tone] = survey.phasor_sensor[:, c], survey.sigma[:, c]
     model = np.nan_to_num(model_error_cov(phasor, site.model_error)[..., 0, 0])
     total = np.sqrt(np.nan_to_num(sigma, nan=1.0) ** 2 + model)
-    heard = np.isfinite(phasor).any(axis=(1, 2))
+    detected = np.isfinite(phasor).any(axis=(1, 2))
     measured = BeaconMeasurements(
         beacon,
         site.platform.magnetometer,
-        survey.world_from_body[heard],
-        survey.position_world[heard],
-        phasor[None, heard],
-        np.stack([total, total], axis=-1)[heard],
+        survey.world_from_body[detected],
+        survey.position_world[detected],
+        phasor[None, detected],
+        np.stack([total, total], axis=-1)[detected],
     )
     reach = float(np.clip(3.0 * np.max(beacon.sigma.position_world), REACH, FARTHEST))
-    return _Calibrated(measured, *calibrate_one(measured, reach), survey.point[heard])
+    return _Calibrated(measured, *calibrate_one(measured, reach), survey.point[detected])
 
 
 def _residual(found: _Calibrated) -> Array:
     """Return the root mean square of each point's whitened residual."""
+    from magfusion.model.field import predict
+
     measured = found.measured
     turned, place = measured.world_from_body, measured.position_world
     phase = np.broadcast_to(found.refined.phase, (len(place), len(found.refined.phase)))
@@ -147,6 +161,8 @@ def _residual(found: _Calibrated) -> Array:
 
 
 def _panel(found: _Calibrated) -> BeaconPanel:
+    from magfusion.results.plots.beacon import BeaconPanel
+
     return BeaconPanel(
         declared=found.measured.beacon,
         found=found.refined.beacon,
@@ -156,51 +172,140 @@ def _panel(found: _Calibrated) -> BeaconPanel:
     )
 
 
-def _told(found: _Calibrated) -> list[tuple[Finding, bool]]:
-    """Return each parameter before and after, and whether the survey determined it."""
+def _estimates(found: _Calibrated) -> list[Estimate]:
+    """Return each parameter before and after the survey."""
+    from scipy.spatial.transform import Rotation
+
+    from magfusion.results.figures import Estimate
+
     old, new = found.measured.beacon, found.refined.beacon
     turn = Rotation.from_matrix(old.world_from_beacon.T @ new.world_from_beacon).as_rotvec()
     size = [np.linalg.norm(b.moments_beacon, axis=1) for b in (old, new)]
-    rows = []
-    for i, axis in enumerate("xyz"):
-        place = new.position_world[i] - old.position_world[i]
-        sigma = new.sigma.position_world[i], old.sigma.position_world[i]
-        rows.append((Finding(f"{old.name}.position_{axis}_m", place, *sigma), False))
-    for i, axis in enumerate("xyz"):
-        sigma = new.sigma.rotation_beacon[i] / DEGREE, old.sigma.rotation_beacon[i] / DEGREE
-        is_open = bool(np.any(np.abs(found.refined.open_beacon[:, i]) > 0.5))
-        rows.append((Finding(f"{old.name}.rotation_{axis}_deg", turn[i] / DEGREE, *sigma), is_open))
-    for i, change in enumerate(np.log(size[1] / size[0])):
-        sigma = new.sigma.log_moment[i], old.sigma.log_moment[i]
-        tail = f"_{i}" if len(size[0]) > 1 else ""
-        rows.append((Finding(f"{old.name}.log_moment{tail}", change, *sigma), False))
-    # A sigma that the site does not declare is no prior.
+    left_open = np.any(np.abs(found.refined.open_beacon) > 0.5, axis=0)
+    coils = [f"_{i}" for i in range(len(size[0]))] if len(size[0]) > 1 else [""]
+
+    def of(kind: str, unit: str, tails: list[str], *values: Array) -> list[Estimate]:
+        rows = zip(tails, *(np.broadcast_to(v, len(tails)) for v in values), strict=True)
+        return [
+            Estimate(
+                f"{{beacon}}.{kind}{tail}",
+                float(change),
+                unit,
+                old.name,
+                label=f"{old.name}.{kind}",
+                sigma=float(sigma),
+                prior_sigma=float(prior),
+                is_open=bool(is_open),
+            )
+            for tail, change, sigma, prior, is_open in rows
+        ]
+
+    place = new.position_world - old.position_world
+    sigma, prior, closed = new.sigma, old.sigma, np.zeros(1)
+    turned = (turn, sigma.rotation_beacon, prior.rotation_beacon)
     return [
-        (told, not is_open and told.sigma < DETERMINED_RATIO * (told.prior_sigma or np.inf))
-        for told, is_open in rows
+        *of(
+            "position",
+            "m",
+            ["_x_m", "_y_m", "_z_m"],
+            place,
+            sigma.position_world,
+            prior.position_world,
+            closed,
+        ),
+        *of(
+            "rotation",
+            "deg",
+            ["_x_deg", "_y_deg", "_z_deg"],
+            *(v / DEGREE for v in turned),
+            left_open,
+        ),
+        *of(
+            "log_moment",
+            "",
+            coils,
+            np.log(size[1] / size[0]),
+            sigma.log_moment,
+            prior.log_moment,
+            closed,
+        ),
     ]
 
 
-def _figures(path: Path, survey: Survey, found: list[_Calibrated]) -> Figures:
-    figures: Figures = {"job": JOB, "log": path.stem, "points": len(survey)}
-    told = [(c, row) for c in found for row in _told(c)]
-    for c in found:
-        name = c.measured.beacon.name
-        chi_square = float(c.fits.chi_square[0])
-        figures[f"residual_rms_{name}"] = float(np.sqrt(chi_square / max(c.freedom, 1)))
-        figures[f"centre_moved_m_{name}"] = float(
-            np.linalg.norm(c.refined.beacon.position_world - c.measured.beacon.position_world)
+def judged(found: _Calibrated) -> tuple[_Calibrated, Trust]:
+    """Return a calibration with sigmas that its witnesses allow, and what they say."""
+    from magfusion.estimation.integrity.priors import contradiction, trust_of, unexplained
+    from magfusion.model.trust import Finding, Trust, Verdict
+
+    name = found.refined.beacon.name
+    fitted = unexplained(
+        f"beacon {name}",
+        float(found.fits.chi_square[0]),
+        found.freedom,
+        "Check the poses of the survey, iron near the beacon, and that it stood still.",
+    )
+    closed = [one for one in _estimates(found) if not one.is_open]
+    prior = np.diag([one.prior_sigma**2 for one in closed])
+    moved = contradiction(
+        [one.key for one in closed],
+        np.array([one.change for one in closed]),
+        fitted.excess * np.diag([one.sigma**2 for one in closed]) + prior,
+        prior,
+        "Check the beacon's coils and the survey's frame, or declare larger sigmas.",
+        f"The calibration of beacon {name}",
+    )
+    trust, excess = trust_of(fitted, moved)
+    findings = [
+        Finding(
+            "ambiguous",
+            f"Beacon {name} could be at {np.round(place, 3).tolist()} as well: the chi square is"
+            f" only {worse:.2g} larger there; measure at more points.",
         )
-        figures[f"coil_bent_deg_{name}"] = _bent_deg(c)
-        figures[f"other_places_{name}"] = len(_rivals(c))
-    for _, (one, _) in told:
-        figures[one.name] = float(one.change)
-        figures[f"{one.name}_sigma"] = float(one.sigma)
-        figures[f"{one.name}_prior_sigma"] = float(one.prior_sigma)
-    figures["determined"] = [one.name for _, (one, yes) in told if yes]
-    figures["undetermined"] = [one.name for _, (one, yes) in told if not yes]
-    figures["notes"] = [sentence for c in found for sentence in _notes(c)]
-    return figures
+        for place, worse in _rivals(found)
+    ]
+    if len(found.refined.open_beacon):
+        text = (
+            f"The field does not determine a rotation of beacon {name} about its own axis: there"
+            " the declared attitude and its sigma are kept."
+        )
+        findings.append(Finding("geometry", text, Verdict.TRUSTWORTHY))
+    sigma, scale = found.refined.beacon.sigma, float(np.sqrt(excess))
+    honest = replace(
+        sigma,
+        position_world=scale * sigma.position_world,
+        rotation_beacon=scale * sigma.rotation_beacon,
+        log_moment=scale * sigma.log_moment,
+    )
+    refined = replace(found.refined, beacon=replace(found.refined.beacon, sigma=honest))
+    return replace(found, refined=refined), trust | Trust(tuple(findings))
+
+
+def _figures(path: Path, survey: Survey, found: list[_Calibrated], trust: Trust) -> Figures:
+    from magfusion.results.figures import Figure, Figures, determined_figures, heading
+    from magfusion.results.report import residual_figure
+    from magfusion.results.verdict import said_as_notes, trust_figures
+
+    estimates = [estimate for c in found for estimate in _estimates(c)]
+    figures = [Figure("points", len(survey))]
+    for c in found:
+        old, new = c.measured.beacon, c.refined.beacon
+        chi_square = float(c.fits.chi_square[0])
+        moved = float(np.linalg.norm(new.position_world - old.position_world))
+        figures += [
+            replace(
+                residual_figure(old.name, float(np.sqrt(chi_square / max(c.freedom, 1)))), note=""
+            ),
+            Figure("centre_moved_m_{beacon}", moved, "m", old.name, label="centre moved"),
+            Figure("coil_bent_deg_{beacon}", _bent_deg(c), "deg", old.name, label="coil bent"),
+            Figure("other_places_{beacon}", len(_rivals(c)), "", old.name),
+        ]
+    return (
+        heading(JOB, path.stem)
+        | trust_figures(trust)
+        | Figures(*figures, *estimates)
+        | determined_figures(estimates)
+        | said_as_notes(trust)
+    )
 
 
 def _bent_deg(found: _Calibrated) -> float:
@@ -214,6 +319,8 @@ def _bent_deg(found: _Calibrated) -> float:
 
 
 def _rivals(found: _Calibrated) -> list[tuple[Array, float]]:
+    from magfusion.estimation.batch import AMBIGUOUS_CHI_SQUARE
+
     excess = found.fits.rival_chi_square[0] - found.fits.chi_square[0]
     out: list[tuple[Array, float]] = []
     for place, worse in zip(found.fits.rivals_world[0], excess, strict=True):
@@ -223,40 +330,19 @@ def _rivals(found: _Calibrated) -> list[tuple[Array, float]]:
     return out
 
 
-def _notes(found: _Calibrated) -> list[str]:
-    name = found.measured.beacon.name
-    notes = [
-        f"Beacon {name} could be at {np.round(place, 3).tolist()} as well: the chi square is only"
-        f" {worse:.2g} larger there; measure at more points."
-        for place, worse in _rivals(found)
-    ]
-    if len(found.refined.open_beacon):
-        notes.append(
-            f"The field does not tell a turn of beacon {name} about its own axis: there the"
-            " declared attitude and its sigma are kept."
-        )
-    for one, _ in _told(found):
-        both = float(np.hypot(one.sigma, one.prior_sigma))
-        if one.prior_sigma > 0.0 and abs(one.change) > CONTRADICTED * both:
-            notes.append(
-                f"{one.name} changed by {abs(one.change) / both:.0f} sigmas of survey and"
-                " calibration; check the beacon's coils, or declare larger sigmas."
-            )
-    return notes
+def _refined_site(site: Site, found: list[_Calibrated], path: Path) -> Site:
+    from magfusion.results.figures import calibration_record
 
-
-def _refined_site(site: Site, found: list[_Calibrated], path: Path, figures: Figures) -> Site:
     new = {c.refined.beacon.name: c.refined.beacon for c in found}
-    record = {
-        "log": path.name,
-        "determined": figures["determined"],
-        "undetermined": figures["undetermined"],
-    }
+    estimates = [estimate for c in found for estimate in _estimates(c)]
     beacons = tuple(new.get(b.name, b) for b in site.beacons)
     known = site.correlation
     return replace(
         site,
         beacons=beacons,
-        calibration=record,
+        calibration=calibration_record(path.name, estimates),
         correlation=known and known.without(("beacons", "moments"), new),
     )
+
+
+COMMAND = Command(BeaconSettings, run_calibrate_beacon, output="beacon")

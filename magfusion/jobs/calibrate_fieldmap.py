@@ -1,92 +1,122 @@
 """The job that learns where the field is not what the model says: survey or log in, site out."""
 
-from collections.abc import Callable
+from __future__ import annotations
+
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magfusion.calibration.fieldmap import MapFit, MapPoints, learn_field_map, thinned
 from magfusion.errors import EstimationError, InputError
-from magfusion.fusion.source import open_source
-from magfusion.job import Job, claim, named, read_estimate, read_job
-from magfusion.parameters import initial_calibration
-from magfusion.plots.fieldmap import write_plot
-from magfusion.records.samples import FieldSamples, Log
-from magfusion.records.survey import Survey, read_survey
-from magfusion.report import Figures, dropped_figures, write_report
-from magfusion.site import Site
-from magfusion.site_file import load_site, save_site
-from magfusion.trajectory import Trajectory, interpolate
+from magfusion.jobs.settings import Command, Settings, argument, option
+from magfusion.model.progress import Report, quiet
+from magfusion.model.site import Site
+
+if TYPE_CHECKING:
+    from magfusion.calibration.fieldmap import MapFit, MapPoints
+    from magfusion.files.survey import Survey
+    from magfusion.model.samples import FieldSamples, Log
+    from magfusion.model.trajectory import Trajectory
+    from magfusion.model.trust import Finding, Trust
+    from magfusion.results.figures import Figures
+
 
 LONGEST_GAP = 1.0  # s, of the trajectory that is interpolated across
 SAME_TIME = 1e-6  # s
 MOST_POINTS = 600  # the posterior takes the cube of their number
-Report = Callable[[str, int, int], None]
+UNEXPLAINED = 0.3  # relative error of the mapped field, from which it contradicts the site
+WORSE = 1.2  # the same with the map by that without it
 
 
-@dataclass(frozen=True)
-class MapSource:
+@dataclass(frozen=True, kw_only=True)
+class MapSettings(Settings):
     """Where the points of a map come from.
 
-    Parameters
-    ----------
-    path : Path
-        A survey (Parquet, CSV, or a directory with survey.parquet), or a log.
-    site_path : Path, optional
-        None takes ``site.yaml`` of the trajectory's directory, then that of ``path``.
-    trajectory_path : Path, optional
-        Of a log: the result of a job, or a table; None takes the log's truth.  Poses that were
-        found by the same field have taken up its error, and teach little of it.
-    spacing : float
-        One epoch of a log for each cube of this edge (m).
+    Poses of a log that were found by the same field have taken up its error, and teach little.
     """
 
-    path: Path
-    site_path: Path | None = None
-    trajectory_path: Path | None = None
-    spacing: float = 0.25
+    source: Path = argument("Survey (a table, or a directory that holds one), or a log")
+    site: Path | None = option(None, "Site file", note="default: beside the survey or log")
+    trajectory: Path | None = option(
+        None, "Of a log: poses, best not from this field", note="default: the log's truth"
+    )
+    spacing: float = option(
+        0.25, "Of a log: one point in each cube of this edge", unit="m", above=0.0
+    )
 
 
-def run_calibrate_fieldmap(source: MapSource, output: Path, *, report: Report) -> Figures:
+def run_calibrate_fieldmap(settings: MapSettings, output: Path, report: Report = quiet) -> Figures:
     """Learn the field map of a site's beacons; write the site that carries it.
-
-    Returns
-    -------
-    dict
-        The figures of ``report.json``.
 
     Raises
     ------
     InputError
     """
+    from magfusion.calibration.fieldmap import learn_field_map
+    from magfusion.files.site import save_site
+    from magfusion.jobs.inputs import claim, found_in, refuse_failed
+    from magfusion.results.figures import Figure, Figures, heading
+    from magfusion.results.plots.fieldmap import write_plot
+    from magfusion.results.report import write_report
+    from magfusion.results.verdict import trust_figures
+
     claimed = claim(output, "calibrate fieldmap")
-    if not 0.0 < source.spacing < np.inf:
-        raise InputError(f"--spacing must be above 0 m; got {source.spacing:g}")
     report("reading", 0, 2)
-    survey = _survey_path(source.path)
+    survey = _survey_path(settings.source)
     if survey is None:
-        site, points, extra = _from_log(source)
+        site, points, extra, streams = _from_log(settings)
     else:
-        site, points, extra = _from_survey(source, survey)
+        site, points, extra = _from_survey(settings, survey)
+        streams = ()
     if len(points) > MOST_POINTS:
         raise InputError(
-            f"{source.path}: gives {len(points)} points where a map takes {MOST_POINTS};"
+            f"{settings.source}: gives {len(points)} points where a map takes {MOST_POINTS};"
             " choose a larger --spacing"
         )
     report("learning", 1, 2)
     try:
         fit = learn_field_map(site, points)
     except EstimationError as error:
-        raise InputError(f"{source.path}: {error}") from error
+        raise InputError(f"{settings.source}: {error}") from error
     report("done", 2, 2)
-    figures: Figures = {"job": "calibrate fieldmap", "log": source.path.stem, "points": len(points)}
-    figures |= _figures(fit) | extra
-    with claimed as directory:
+    trust = judged(fit, streams)
+    figures = heading("calibrate fieldmap", settings.source.stem) | trust_figures(trust)
+    figures |= Figures(Figure("points", len(points))) | _figures(fit) | extra
+    with claimed as whole:
+        directory = found_in(whole, trust)
         save_site(fit.site, directory / "site.yaml")
         write_plot(directory / "field_map.png", fit)
-        write_report(directory, figures)
+        write_report(whole, figures)
+    refuse_failed(settings.source, output, trust)
     return figures
+
+
+def judged(fit: MapFit, streams: tuple[Finding, ...] = ()) -> Trust:
+    """Return whether a map holds at points that it was not learnt from.
+
+    Parameters
+    ----------
+    streams : tuple of Finding
+        Of the log that the points come from.
+    """
+    from magfusion.model.trust import Finding, Trust, Verdict
+
+    found = []
+    for beacon, error in fit.error_with.items():
+        without = fit.error_without[beacon]
+        said = (
+            f"Beacon {beacon}: at points left out the field with the map is {100.0 * error:.2g} %"
+            f" wrong, without it {100.0 * without:.2g} %"
+        )
+        if error > UNEXPLAINED:
+            text = f"{said}: check that the survey is of this site, and its frame and units."
+            found.append(Finding("transfer", text, Verdict.FAILED, error / UNEXPLAINED))
+        elif error > WORSE * without:
+            text = f"{said}: survey more densely, or do without a map."
+            found.append(Finding("transfer", text, weight=error / without))
+    return Trust((*found, *streams))
 
 
 def _survey_path(path: Path) -> Path | None:
@@ -96,15 +126,19 @@ def _survey_path(path: Path) -> Path | None:
     return path if path.suffix in (".parquet", ".csv") else None
 
 
-def _from_survey(source: MapSource, path: Path) -> tuple[Site, MapPoints, Figures]:
-    if source.trajectory_path is not None:
+def _from_survey(settings: MapSettings, path: Path) -> tuple[Site, MapPoints, Figures]:
+    from magfusion.files.site import load_site
+    from magfusion.files.survey import read_survey
+    from magfusion.results.figures import Figures
+
+    if settings.trajectory is not None:
         raise InputError(f"{path}: a survey has its own poses; leave --trajectory out")
     beside = path.parent / "site.yaml"
-    site_path = beside if source.site_path is None else source.site_path
-    if source.site_path is None and not beside.is_file():
+    site_path = beside if settings.site is None else settings.site
+    if settings.site is None and not beside.is_file():
         raise InputError(f"{path}: has no site.yaml beside it; name the site with --site SITE.yaml")
     site = load_site(site_path)
-    return site, points_of(read_survey(path), site, path), {}
+    return site, points_of(read_survey(path), site, path), Figures()
 
 
 def points_of(survey: Survey, site: Site, path: Path) -> MapPoints:
@@ -115,6 +149,8 @@ def points_of(survey: Survey, site: Site, path: Path) -> MapPoints:
     InputError
         Where the survey holds amplitudes only, or channels that the site does not have.
     """
+    from magfusion.calibration.fieldmap import MapPoints
+
     if survey.phasor_sensor is None:
         raise InputError(f"{path}: holds amplitudes, and a field map needs phasors; survey again")
     for beacon, tone in survey.channels:
@@ -133,52 +169,73 @@ def points_of(survey: Survey, site: Site, path: Path) -> MapPoints:
     return MapPoints(survey.world_from_body, survey.position_world, phasor, sigma)
 
 
-def _from_log(source: MapSource) -> tuple[Site, MapPoints, Figures]:
-    site_path, result = source.site_path, source.trajectory_path
+def _from_log(settings: MapSettings) -> tuple[Site, MapPoints, Figures, tuple[Finding, ...]]:
+    from magfusion.calibration.fieldmap import MapPoints, thinned
+    from magfusion.estimation.integrity.recording import BRIDGED, recorded
+    from magfusion.jobs.inputs import Job, named, read_estimate, read_job
+    from magfusion.model.trajectory import interpolate
+    from magfusion.results.report import dropped_figures
+
+    site_path, result = settings.site, settings.trajectory
     if site_path is None and result is not None and (result / "site.yaml").is_file():
         site_path = result / "site.yaml"
-    log, site = read_job(Job(source.path, site_path, Path()))
+    log, site = read_job(Job(settings.source, site_path, Path()))
     if result is None and log.truth is None:
         raise InputError(
-            f"{source.path}: holds no truth; smooth it and name the result with --trajectory RUN"
+            f"{settings.source}: holds no truth; smooth it and name the result with"
+            " --trajectory RUN"
         )
     poses = log.truth if result is None else read_estimate(result, log.epoch_ns)
     assert poses is not None
-    with named(source.path):
+    with named(settings.source):
         samples, dropped = _samples(log, site, poses)
     there, exists = interpolate(poses, samples.time, LONGEST_GAP)
     if not np.any(exists):
-        raise InputError(f"{source.path}: the trajectory and the log do not overlap in time")
+        raise InputError(f"{settings.source}: the trajectory and the log do not overlap in time")
     sigma = np.sqrt(np.trace(samples.phasor_cov[exists], axis1=2, axis2=3) / 3.0)
     points = MapPoints(
         there.world_from_body, there.position_world, samples.phasor_sensor[exists], sigma
     )
-    return site, thinned(points, site, source.spacing), dropped_figures(dropped)
+    streams = recorded(log, site, BRIDGED)
+    return site, thinned(points, site, settings.spacing), dropped_figures(dropped), streams
 
 
 def _samples(log: Log, site: Site, poses: Trajectory) -> tuple[FieldSamples, dict[str, int]]:
     """Return phasors; with the motion in each window taken off where the poses are its own."""
-    source = open_source(log, site, None)
+    from magfusion.estimation.demodulation import demodulated
+    from magfusion.model.parameters import initial_calibration
+
+    source = demodulated(log, site, None)
     calibration = initial_calibration(site, 0.0)
-    samples = source.first(calibration)
+    samples = source.fields
     whole = poses.velocity_world is not None and poses.gyro_bias_body is not None
     same = len(poses) == len(samples) and np.all(np.abs(poses.time - samples.time) < SAME_TIME)
     if log.waveform is not None and whole and same:
-        samples = source.about(calibration, poses).fields
+        samples = source.compensated(calibration, poses).fields
     return samples, dict(source.dropped)
 
 
 def _figures(fit: MapFit) -> Figures:
+    from magfusion.results.figures import Figure, Figures
+
     found = fit.site.beacons[0].field_map
     assert found is not None
-    figures: Figures = {
-        "length_scale_m": found.length_scale,
-        "gain_sigma": found.gain_sigma,
-        "rotation_sigma_deg": float(np.rad2deg(found.rotation_sigma)),
-        "residual": found.residual,
-    }
-    for name in fit.points:
-        figures[f"points_{name}"] = fit.points[name]
-        figures[f"relative_error_without_{name}"] = fit.error_without[name]
-        figures[f"relative_error_with_{name}"] = fit.error_with[name]
-    return figures
+    by_beacon: list[tuple[str, str, Mapping[str, float]]] = [
+        ("points", "points", fit.points),
+        ("relative_error_without", "relative error without the map", fit.error_without),
+        ("relative_error_with", "relative error with the map", fit.error_with),
+    ]
+    return Figures(
+        Figure("length_scale_m", found.length_scale, "m"),
+        Figure("gain_sigma", found.gain_sigma),
+        Figure("rotation_sigma_deg", float(np.rad2deg(found.rotation_sigma)), "deg"),
+        Figure("residual", found.residual),
+        *(
+            Figure(f"{name}_{{beacon}}", values[beacon], "", beacon, label=label)
+            for name, label, values in by_beacon
+            for beacon in fit.points
+        ),
+    )
+
+
+COMMAND = Command(MapSettings, run_calibrate_fieldmap, output="field_map")

@@ -1,41 +1,38 @@
 """The job that refines a site by a log: what it determined, what it could not, what is missing."""
 
-from collections.abc import Callable
-from dataclasses import replace
-from typing import NamedTuple
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from magfusion.errors import EstimationError, InputError
-from magfusion.evaluation.errors import trajectory_errors
-from magfusion.evaluation.motion_coverage import MotionCoverage, missing_motion, motion_coverage
-from magfusion.evaluation.observability import observability
-from magfusion.evaluation.transfer import Estimated, agreement
-from magfusion.fusion.batch import Smoothed, SmootherSettings, smooth
-from magfusion.fusion.self_survey import smooth_and_place
-from magfusion.job import Job, claim, named, read_job
-from magfusion.plots.log_calibration import write_log_calibration_plot
-from magfusion.records.samples import Log
-from magfusion.refinement import Finding, findings, refined_site
-from magfusion.report import (
-    Figures,
-    compared_with_truth,
-    placement_figures,
-    smoothed_figures,
-    write_report,
-)
-from magfusion.site import Site
-from magfusion.site_file import save_site
+from magfusion.errors import InputError
+from magfusion.jobs.settings import Command, EstimateSettings, LogSettings, WindowSettings, option
+from magfusion.model.progress import Report, quiet
+from magfusion.model.site import Site
+
+if TYPE_CHECKING:
+    from magfusion.estimation.batch import Smoothed, SmootherSettings
+    from magfusion.jobs.inputs import Job
+    from magfusion.model.samples import Log
+    from magfusion.model.trust import Trust, Verdict
+    from magfusion.results.figures import Figures
+    from magfusion.results.motion_coverage import MotionCoverage
+
 
 JOB = "calibrate log"
-HELD = ("phase", "time-offset")  # what every log has of its own
+OF_LOG = ("phase", "time-offset")  # every log has its own: estimated even so
 SHORTEST_PART = 15.0  # s
 MOST_PARTS = 6
-Report = Callable[[str, int, int], None]
+APART = 5.0  # sigmas; the largest of tens of directions, by chance once in thousands
+WORSE = 1.2  # residual on other parts, by that of the declared calibration
+OVERLAP = 2.0  # windows that share their samples
 
 
 class Score(NamedTuple):
-    """How well a part of a log is explained with the calibration held.
+    """How well a part of a log is explained with the calibration fixed.
 
     Parameters
     ----------
@@ -56,7 +53,7 @@ class Transfer(NamedTuple):
     Parameters
     ----------
     declared : list of Score
-        Of each part, with the survey held.
+        Of each part, with the survey fixed.
     calibrated : list of Score
         Of each pair of parts: calibrated on the one, scored on the other.
     pairs : list of (int, int)
@@ -71,84 +68,182 @@ class Transfer(NamedTuple):
     disagreement: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class LogCalibrationSettings(LogSettings, WindowSettings, EstimateSettings):
+    """What is calibrated by a log of ordinary motion."""
+
+    cross_validate: int | None = option(
+        None, "Calibrate on each of so many parts of the log, score on the others"
+    )
+
+
 def run_calibrate_log(
-    job: Job,
-    settings: SmootherSettings,
-    *,
-    parts: int | None = None,
-    report: Report,
+    settings: LogCalibrationSettings, output: Path, report: Report = quiet
 ) -> Figures:
     """Calibrate a site by a log of ordinary motion.
-
-    Parameters
-    ----------
-    job : Job
-    settings : SmootherSettings
-    parts : int, optional
-        Cross-validate: calibrate on each of so many parts of the log and score on the others.
-    report : callable
-        Told stage, steps done and steps in all.
-
-    Returns
-    -------
-    dict
-        The figures of ``report.json``.
 
     Raises
     ------
     InputError
         Where the log or the site cannot be used, or nothing is to be calibrated.
     EstimationError
-        Where the smoother fails or does not converge.
+        Where the smoother fails, or the verdict is failed.
     """
-    claimed = claim(job.output, JOB)
+    from magfusion.estimation.batch import SmootherSettings
+    from magfusion.estimation.integrity.judge import judged
+    from magfusion.estimation.self_survey import smooth_and_place
+    from magfusion.files.site import save_site
+    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.model.trust import Trust
+    from magfusion.results.figures import Figure, Figures, Section, heading
+    from magfusion.results.motion_coverage import missing_motion, motion_coverage
+    from magfusion.results.observability import observability
+    from magfusion.results.plots.log_calibration import write_log_calibration_plot
+    from magfusion.results.refinement import parameter_estimates, result_site
+    from magfusion.results.report import (
+        compared_with_truth,
+        placement_figures,
+        smoothed_figures,
+        write_report,
+    )
+    from magfusion.results.verdict import trust_figures
+
+    job = settings.job(output)
+    smoother = SmootherSettings(estimate=settings.groups, lockin=settings.lockin(job))
+    claimed = claim(output, JOB)
     log, site = read_job(job, unknown=True)
-    cuts = _cuts(job, log, site, parts)
-    settings = replace(settings, lockin=job.lockin)
+    cuts = _cuts(job, log, site, settings.cross_validate)
     with named(job.log_path):
-        result, placed = smooth_and_place(log, site, settings, report)
+        result, placed = smooth_and_place(log, site, smoother, report)
     if not result.blocks:
         raise InputError(
             f"{job.site_path or job.log_path}: the site's sigmas are zero or negligible, so there"
             " is nothing to calibrate; declare how well the survey is known"
         )
-    if not result.converged:
-        raise EstimationError(
-            f"{job.log_path}: the smoother did not converge, so its calibration is not to be"
-            " trusted; add motion or a beacon, or check the survey"
-        )
-    told = findings(result.declared, result.calibration, result.blocks, result.calibration_cov)
-    found = observability(result.calibration, result.blocks, result.calibration_cov)
+    honest, trust = judged(result, log)
+    result, moved = against_site(honest, grown(result, honest))
+    moved = Trust(tuple(f for f in moved.findings if f.code not in _said(trust, f.verdict)))
+    trust = Trust(
+        tuple(f for f in trust.findings if f.code not in _said(moved, f.verdict)), trust.unverified
+    )
+    compared = None if cuts is None else _transfer(job, site, smoother, cuts, report)
+    trust |= moved if compared is None else moved | transferred(compared)
+    parts_of = result.calibration, result.blocks, result.calibration_cov
+    found = observability(*parts_of)
     covered = motion_coverage(result.states, result.calibration, log.imu)
-    figures: Figures = {"job": JOB, "log": log.name}
-    figures |= smoothed_figures(result)
+    figures = heading(JOB, log.name) | trust_figures(trust)
+    figures |= smoothed_figures(result, Section.DIRECTIONS)
     figures |= compared_with_truth(result.states, log)[1]
     figures |= placement_figures(placed, result.calibration.site)
     figures |= _coverage_figures(covered)
-    figures["missing_motion"] = missing_motion(covered, result.calibration, result.blocks, found)
-    if cuts is not None:
-        figures |= _transfer_figures(_transfer(job, site, settings, cuts, report))
-    refined = _refined(result, told, log)
-    with claimed as directory:
-        save_site(refined, directory / "site.yaml")
+    missing = missing_motion(covered, result.calibration, result.blocks, found)
+    label = "missing motion"
+    figures |= Figures(Figure("missing_motion", missing, section=Section.DIRECTIONS, label=label))
+    if compared is not None:
+        figures |= _transfer_figures(compared)
+    estimates = parameter_estimates(result.declared, *parts_of)
+    with claimed as whole:
+        directory = found_in(whole, trust)
+        save_site(result_site(result, log.name), directory / "site.yaml")
         write_log_calibration_plot(
-            directory / "calibration.png", told, found.ratio_but_for_gauge, found.direction_ratio
+            directory / "calibration.png",
+            estimates,
+            found.ratio_but_for_gauge,
+            found.direction_ratio,
         )
-        write_report(directory, figures)
+        write_report(whole, figures)
+    refuse_failed(job.log_path, output, trust)
     return figures
 
 
-def _refined(result: Smoothed, told: list[Finding], log: Log) -> Site:
-    return refined_site(result.calibration, result.blocks, result.calibration_cov, told, log.name)
+def _said(trust: Trust, verdict: Verdict) -> set[str]:
+    """Return the codes of what is said with a verdict that is as bad, or worse."""
+    return {f.code for f in trust.findings if f.verdict.rank >= verdict.rank}
+
+
+def grown(result: Smoothed, honest: Smoothed) -> float:
+    """Return by what the covariance of the poses was enlarged, median over the states."""
+    before, after = result.states.pose_cov, honest.states.pose_cov
+    if before is None or after is None:
+        return 1.0
+    variances = (np.diagonal(cov, axis1=1, axis2=2) for cov in (after, before))
+    return max(1.0, float(np.median(np.mean(np.divide(*variances), axis=1))))
+
+
+def against_site(result: Smoothed, least: float = 1.0) -> tuple[Smoothed, Trust]:
+    """Return a result with sigmas of the calibration that its fit allows, and what that says.
+
+    Parameters
+    ----------
+    least : float
+        What the covariance of the calibration is multiplied by at least.
+    """
+    from magfusion.estimation.integrity.priors import contradiction, trust_of, unexplained
+    from magfusion.model.parameters import difference
+    from magfusion.model.prior import prior_sqrt_covariance
+    from magfusion.results.refinement import parameter_estimates
+
+    parts = result.calibration, result.blocks, result.calibration_cov
+    spread = prior_sqrt_covariance(result.declared.site, result.blocks)
+    prior, known = spread @ spread.T, np.isfinite(result.residual)
+    fitted = unexplained(
+        "the fields of the beacons",
+        float(np.sum(result.residual[known] ** 2)) / OVERLAP,
+        float(np.sum(known)) / OVERLAP,
+        "Check the survey of the beacons, iron among them, and the noise that the site declares.",
+    )
+    moved = contradiction(
+        [estimate.key for estimate in parameter_estimates(result.declared, *parts)],
+        difference(result.declared, result.calibration, result.blocks),
+        prior - result.calibration_cov,
+        prior,
+        "Check what the site declares of them; where it is only roughly known, declare larger"
+        " sigmas.",
+    )
+    trust, excess = trust_of(fitted, moved)
+    factor = max(excess, least)
+    return replace(result, calibration_cov=factor * result.calibration_cov), trust
+
+
+def transferred(compared: Transfer) -> Trust:
+    """Return whether the calibrations of parts of a log agree, and serve its other parts."""
+    from magfusion.model.trust import Finding, Trust
+
+    found = []
+    if compared.disagreement > APART:
+        text = (
+            f"The calibrations of parts of the log disagree by {compared.disagreement:.1f} sigmas"
+            " along a direction that both determined: something changed during the log, or the"
+            " sigmas that the site declares are too small."
+        )
+        found.append(Finding("transfer", text, weight=compared.disagreement / APART))
+    before, after = (
+        float(np.sqrt(np.mean([one.residual**2 for one in scores])))
+        for scores in (compared.declared, compared.calibrated)
+    )
+    if after > WORSE * before:
+        text = (
+            f"A calibration by one part of the log leaves a residual of {after:.3g} on the others,"
+            f" where the declared one leaves {before:.3g}: record more motion."
+        )
+        found.append(Finding("transfer", text, weight=after / before))
+    return Trust(tuple(found))
 
 
 def _coverage_figures(covered: MotionCoverage) -> Figures:
-    figures: Figures = {f"nearest_m_{name}": least for name, least in covered.nearest.items()}
+    from magfusion.results.figures import Figure, Figures, Section
+
+    motion = {"motion_at_rest": covered.rest_share}
     for axis, extent, turned in zip("xyz", covered.extent_world, covered.turned_deg, strict=True):
-        figures[f"motion_extent_{axis}_m"] = float(extent)
-        figures[f"motion_turned_{axis}_deg"] = float(turned)
-    figures["motion_at_rest"] = covered.rest_share
-    return figures
+        motion[f"motion_extent_{axis}_m"] = float(extent)
+        motion[f"motion_turned_{axis}_deg"] = float(turned)
+    return Figures(
+        *(
+            Figure("nearest_m_{beacon}", least, "m", beacon, Section.REPORT)
+            for beacon, least in covered.nearest.items()
+        ),
+        *(Figure(name, value, section=Section.REPORT) for name, value in motion.items()),
+    )
 
 
 def _cuts(job: Job, log: Log, site: Site, parts: int | None) -> list[float | None] | None:
@@ -174,16 +269,18 @@ def _cuts(job: Job, log: Log, site: Site, parts: int | None) -> list[float | Non
 def _transfer(
     job: Job, site: Site, settings: SmootherSettings, cuts: list[float | None], report: Report
 ) -> Transfer:
+    from magfusion.estimation.batch import smooth
+    from magfusion.jobs.inputs import read_job
+    from magfusion.results.refinement import result_site
+    from magfusion.results.transfer import Estimated, agreement
+
     count = len(cuts) - 1
     logs = [read_job(replace(job, start=cuts[i], end=cuts[i + 1]))[0] for i in range(count)]
     results = []
     for i, log in enumerate(logs):
         report(f"calibrating on part {i + 1}", i, count)
         results.append(smooth(log, site, settings))
-    sites = [
-        _refined(r, findings(r.declared, r.calibration, r.blocks, r.calibration_cov), log)
-        for r, log in zip(results, logs, strict=True)
-    ]
+    sites = [result_site(r, log.name) for r, log in zip(results, logs, strict=True)]
     pairs = [(i, j) for i in range(count) for j in range(count) if i != j]
     declared = [_score(log, site, settings) for log in logs]
     calibrated = []
@@ -200,32 +297,50 @@ def _transfer(
 
 
 def _score(log: Log, site: Site, settings: SmootherSettings) -> Score:
-    held = smooth(log, site, replace(settings, estimate=HELD))
-    residual = float(np.sqrt(np.nanmean(held.residual**2)))
+    from magfusion.estimation.batch import smooth
+    from magfusion.results.errors import trajectory_errors
+
+    fixed = smooth(log, site, replace(settings, estimate=OF_LOG))
+    residual = float(np.sqrt(np.nanmean(fixed.residual**2)))
     if log.truth is None:
         return Score(residual, None, None)
-    errors = trajectory_errors(held.states, log.truth)
+    errors = trajectory_errors(fixed.states, log.truth)
     return Score(residual, errors.aligned_ate, errors.aligned_attitude_rmse_deg)
 
 
+# Attribute of a score, key of its figure, label and unit.
+_SCORES = (
+    ("residual", "residual_rms", "residual", "sigma"),
+    ("position", "aligned_ate_m", "position, aligned", "m"),
+    ("attitude_deg", "aligned_attitude_rmse_deg", "attitude, aligned", "deg"),
+)
+
+
 def _transfer_figures(transfer: Transfer) -> Figures:
-    figures: Figures = {"cross_parts": len(transfer.declared)}
-    units = {"residual": "residual_rms", "position": "aligned_ate_m"}
-    units |= {"attitude_deg": "aligned_attitude_rmse_deg"}
-    for name, key in units.items():
-        for label, scores in (
-            ("declared", transfer.declared),
-            ("calibrated", transfer.calibrated),
-        ):
+    from magfusion.results.figures import Column, Figure, Figures, Section
+
+    figures = [Figure("cross_parts", len(transfer.declared), section=Section.REPORT)]
+    by_part = {f"part_{j + 1}_declared": score for j, score in enumerate(transfer.declared)}
+    for (i, j), score in zip(transfer.pairs, transfer.calibrated, strict=True):
+        by_part[f"part_{i + 1}_on_{j + 1}"] = score
+    columns = (
+        ("declared", Column.FIXED, transfer.declared),
+        ("calibrated", Column.CALIBRATED, transfer.calibrated),
+    )
+    for name, key, label, unit in _SCORES:
+        for which, column, scores in columns:
             values = [getattr(score, name) for score in scores]
             if None not in values:
-                figures[f"cross_{label}_{key}"] = float(np.sqrt(np.mean(np.square(values))))
-    for (i, j), score in zip(transfer.pairs, transfer.calibrated, strict=True):
-        before = transfer.declared[j]
-        for name, key in units.items():
-            if getattr(score, name) is not None:
-                stem = f"cross_part_{i + 1}_on_{j + 1}"
-                figures[f"{stem}_{key}"] = getattr(score, name)
-                figures[f"cross_part_{j + 1}_declared_{key}"] = getattr(before, name)
-    figures["cross_disagreement_sigma"] = transfer.disagreement
-    return figures
+                rms = float(np.sqrt(np.mean(np.square(values))))
+                place = (Section.TRANSFER, label, column)
+                figures.append(Figure(f"cross_{which}_{key}", rms, unit, None, *place))
+        figures += [
+            Figure(f"cross_{part}_{key}", getattr(score, name), section=Section.REPORT)
+            for part, score in by_part.items()
+            if getattr(score, name) is not None
+        ]
+    apart = Figure("cross_disagreement_sigma", transfer.disagreement, section=Section.REPORT)
+    return Figures(*figures, apart)
+
+
+COMMAND = Command(LogCalibrationSettings, run_calibrate_log, output="calibration")

@@ -1,25 +1,43 @@
 """The job that calibrates a magnetometer: a log of turning in, a refined site out."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magfusion.calibration.magnetometer import field_from_measured, spread
-from magfusion.calibration.magnetometer_log import LogCalibration, calibrate_log
 from magfusion.errors import InputError
-from magfusion.job import Job, claim, named, read_job
-from magfusion.plots.magnetometer import write_magnetometer_plot
-from magfusion.records.samples import Log
-from magfusion.report import Figures, write_report
-from magfusion.site import Magnetometer, Site
-from magfusion.site_file import save_site
+from magfusion.jobs.settings import Command, LogSettings, option
+from magfusion.model.site import Magnetometer, Site
 from magfusion.units import DEGREE, NANOTESLA, Array
 
+if TYPE_CHECKING:
+    from magfusion.calibration.magnetometer_log import LogCalibration
+    from magfusion.estimation.integrity.priors import Contradiction
+    from magfusion.jobs.inputs import Job
+    from magfusion.model.samples import Log
+    from magfusion.model.trust import Finding, Trust
+    from magfusion.results.figures import Estimate, Figures
+
+
 JOB = "calibrate magnetometer"
-DETERMINED_RATIO = 0.5  # posterior over prior sigma below which the data, not the prior, spoke
-CONTRADICTED = 4.0  # declared sigmas
+SCALE = 0.3  # of the matrix, by which it contradicts the site, however wide its sigmas
 _AXES = "xyz"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MagnetometerSettings(LogSettings):
+    """Which part of a log calibrates the magnetometer."""
+
+    positions: bool = option(False, "Use only the stops of the log: twelve or more")
+
+
+def run(settings: MagnetometerSettings, output: Path) -> Figures:
+    """Calibrate the magnetometer as the settings ask; see `run_calibrate_magnetometer`."""
+    return run_calibrate_magnetometer(settings.job(output), positions=settings.positions)
 
 
 def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
@@ -32,19 +50,19 @@ def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
     positions : bool
         Use only the stops, twelve of them, instead of all the turning.
 
-    Returns
-    -------
-    dict
-        The figures of ``report.json``.
-
     Raises
     ------
     InputError
-        For what a user must mend: no waveform, NaN or a wrong unit in it, too few orientations, no
-        rest for ``positions``, or ``job.output`` in the way.
+        For what a user must correct: no waveform, NaN or a wrong unit in it, too few orientations,
+        no rest for ``positions``, or ``job.output`` in the way.
     EstimationError
         Where the calibration has no solution.
     """
+    from magfusion.calibration.magnetometer_log import calibrate_log
+    from magfusion.files.site import save_site
+    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.results.report import write_report
+
     claimed = claim(job.output, JOB)
     log, site = read_job(job)
     if log.waveform is None:
@@ -55,110 +73,202 @@ def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
     with named(job.log_path):
         found = calibrate_log(log.waveform, log.imu, site, at_stops=positions)
     declared = site.platform.magnetometer
+    found, trust = judged(found, site, log)
     before, after = _fields(found, declared), _fields(found, found.magnetometer)
     size = float(np.linalg.norm(found.prior.field_world))
-    figures = _figures(log, found, declared, before, after)
-    with claimed as directory:
-        save_site(_refined_site(site, found, log.name, figures), directory / "site.yaml")
+    estimates = _estimates(found, declared)
+    figures = _figures(log, found, estimates, before, after, trust)
+    with claimed as whole:
+        directory = found_in(whole, trust)
+        save_site(_refined_site(site, found, log.name, estimates), directory / "site.yaml")
         _plot(directory / "magnetometer.png", found, before, after, size)
-        write_report(directory, figures)
+        write_report(whole, figures)
+    refuse_failed(job.log_path, job.output, trust)
     return figures
 
 
 def _fields(found: LogCalibration, magnetometer: Magnetometer) -> Array:
+    from magfusion.calibration.magnetometer import field_from_measured
+
     measured = found.readings.measured_sensor
     return field_from_measured(measured, magnetometer.matrix, magnetometer.offset)
 
 
 def _plot(path: Path, found: LogCalibration, before: Array, after: Array, size: float) -> None:
+    from magfusion.results.plots.magnetometer import write_magnetometer_plot
+
     write_magnetometer_plot(path, found.readings.time, before, after, size)
 
 
-def _refined_site(site: Site, found: LogCalibration, log_name: str, figures: Figures) -> Site:
-    record = {
-        "log": log_name,
-        "determined": figures["determined"],
-        "undetermined": figures["undetermined"],
-    }
+def _refined_site(
+    site: Site, found: LogCalibration, log_name: str, estimates: list[Estimate]
+) -> Site:
+    from magfusion.results.figures import calibration_record
+
     platform = replace(site.platform, magnetometer=found.magnetometer)
     known = site.correlation
     return replace(
         site,
         platform=platform,
-        calibration=record,
+        calibration=calibration_record(log_name, estimates),
         correlation=known and known.without(("magnetometer",), ["magnetometer"]),
     )
 
 
-@dataclass(frozen=True)
-class _Told:
-    """One parameter before and after, with the name of its figure."""
+def _estimates(found: LogCalibration, declared: Magnetometer) -> list[Estimate]:
+    from magfusion.results.figures import Estimate
 
-    name: str
-    change: float
-    sigma: float
-    prior_sigma: float
-
-
-def _told(found: LogCalibration, declared: Magnetometer) -> list[_Told]:
     fit, prior = found.graph.fit, found.prior
     names = [f"magnetometer.matrix_{row}{column}" for row in _AXES for column in _AXES]
     names += [f"magnetometer.offset_nt_{axis}" for axis in _AXES]
+    vectors = [("magnetometer.matrix", "", 1.0)] * 9
+    vectors += [("magnetometer.offset", "nT", NANOTESLA)] * 3
     change = np.concatenate([(fit.matrix - declared.matrix).ravel(), fit.offset - declared.offset])
-    sigma, before = (np.sqrt(np.diagonal(cov)) for cov in (fit.cov, prior.cov))
-    unit = np.repeat([1.0, NANOTESLA], [9, 3])
-    values = zip(names, change / unit, sigma / unit, before / unit, strict=True)
-    return [_Told(name, float(c), float(s), float(p)) for name, c, s, p in values]
+    rows = zip(names, vectors, change, np.diagonal(fit.cov), np.diagonal(prior.cov), strict=True)
+    return [
+        Estimate(
+            name,
+            float(moved / scale),
+            unit,
+            label=label,
+            sigma=float(np.sqrt(variance) / scale),
+            prior_sigma=float(np.sqrt(before) / scale),
+        )
+        for name, (label, unit, scale), moved, variance, before in rows
+    ]
 
 
 def _figures(
-    log: Log, found: LogCalibration, declared: Magnetometer, before: Array, after: Array
+    log: Log,
+    found: LogCalibration,
+    estimates: list[Estimate],
+    before: Array,
+    after: Array,
+    trust: Trust,
 ) -> Figures:
-    told, graph, readings = _told(found, declared), found.graph, found.readings
-    figures: Figures = {
-        "job": JOB,
-        "log": log.name,
-        "readings": len(readings),
-        "window_s": float(np.median(readings.window)),
-        "spread_before": spread(before),
-        "spread_after": spread(after),
-        "spread_unseen": found.spread_unseen,
-        "field_size_before_t": float(np.mean(np.linalg.norm(before, axis=1))),
-        "field_size_after_t": float(np.mean(np.linalg.norm(after, axis=1))),
-        "field_noise_t": found.field_sigma,
-        "scale_from": "the site's Earth field" if found.scale_known else "the declared matrix",
-        "dip_change_deg": graph.dip_change / DEGREE,
-        "accel_bias_m_s2_largest": float(np.max(np.abs(graph.accel_bias_body))),
-        "gyro_bias_rad_s_largest": float(np.max(np.abs(graph.gyro_bias_body))),
-        "field_residual_rms": float(np.sqrt(np.mean(graph.field_residual**2))),
-    }
-    for parameter in told:
-        figures[parameter.name] = parameter.change
-        figures[f"{parameter.name}_sigma"] = parameter.sigma
-        figures[f"{parameter.name}_prior_sigma"] = parameter.prior_sigma
-    settled = {p.name: p.sigma < DETERMINED_RATIO * p.prior_sigma for p in told}
-    figures["determined"] = [name for name, yes in settled.items() if yes]
-    figures["undetermined"] = [name for name, yes in settled.items() if not yes]
-    figures["notes"] = _notes(found, told)
-    return figures
+    from magfusion.calibration.magnetometer import spread
+    from magfusion.results.figures import Figure, Figures, determined_figures, heading
+    from magfusion.results.verdict import said_as_notes, trust_figures
+
+    graph, readings = found.graph, found.readings
+    sizes = [float(np.mean(np.linalg.norm(field, axis=1))) for field in (before, after)]
+    scale = "the site's Earth field" if found.scale_known else "the declared matrix"
+    residual = float(np.sqrt(np.mean(graph.field_residual**2)))
+    biases = graph.accel_bias_body, graph.gyro_bias_body
+    largest = [float(np.max(np.abs(bias))) for bias in biases]
+    return (
+        heading(JOB, log.name)
+        | trust_figures(trust)
+        | Figures(
+            Figure("readings", len(readings)),
+            Figure("window_s", float(np.median(readings.window)), "s"),
+            Figure("spread_before", spread(before)),
+            Figure("spread_after", spread(after)),
+            Figure("spread_unseen", found.spread_unseen),
+            Figure("field_size_before_t", sizes[0], "T"),
+            Figure("field_size_after_t", sizes[1], "T"),
+            Figure("field_noise_t", found.field_sigma, "T"),
+            Figure("scale_from", scale),
+            Figure("dip_change_deg", graph.dip_change / DEGREE, "deg"),
+            Figure("accel_bias_m_s2_largest", largest[0], "m/s^2", label="accel bias, largest"),
+            Figure("gyro_bias_rad_s_largest", largest[1], "rad/s", label="gyro bias, largest"),
+            Figure("field_residual_rms", residual),
+            *estimates,
+        )
+        | determined_figures(estimates)
+        | said_as_notes(trust)
+    )
 
 
-def _notes(found: LogCalibration, told: list[_Told]) -> list[str]:
-    notes = [f"{sentence[0].upper()}{sentence[1:]}." for sentence in found.missing]
+def judged(found: LogCalibration, site: Site, log: Log) -> tuple[LogCalibration, Trust]:
+    """Return a calibration with sigmas that its witnesses allow, and what they say."""
+    from magfusion.calibration.magnetometer import refined
+    from magfusion.estimation.integrity.priors import contradiction, trust_of
+    from magfusion.estimation.integrity.recording import BRIDGED, recorded
+    from magfusion.model.trust import Trust
+
+    declared, prior, fit = site.platform.magnetometer, found.prior, found.graph.fit
+    estimates = _estimates(found, declared)
+    change = np.concatenate([(fit.matrix - declared.matrix).ravel(), fit.offset - declared.offset])
+    own = contradiction(
+        [one.key for one in estimates],
+        change,
+        prior.cov - fit.cov,
+        prior.cov,
+        "Declare larger sigmas if the sensor was not calibrated before; else check its mounting.",
+    )
+    trust, excess = trust_of(own, _beside(found))
+    honest = replace(fit, cov=excess * fit.cov)
+    found = replace(
+        found,
+        graph=replace(found.graph, fit=honest),
+        magnetometer=refined(declared, honest),
+    )
+    platform = replace(site.platform, magnetometer=found.magnetometer)
+    streams = recorded(log, replace(site, platform=platform), BRIDGED)
+    return found, trust | Trust((*_doubts(found, site), *_remarks(found), *streams))
+
+
+def _beside(found: LogCalibration) -> Contradiction:
+    """Return whether what was found beside the calibration contradicts the site."""
+    from magfusion.estimation.integrity.priors import contradiction
+
+    graph, prior = found.graph, found.prior
+    names = ["earth.dip", *(f"imu.{k}_bias_{axis}" for k in ("accel", "gyro") for axis in _AXES)]
+    change = np.concatenate([[graph.dip_change], graph.accel_bias_body, graph.gyro_bias_body])
+    sigma = np.repeat([prior.dip_sigma, prior.accel_bias_sigma, prior.gyro_bias_sigma], [1, 3, 3])
+    cov = np.diag(sigma**2)
+    remedy = (
+        "Check the Earth field and the mounting in the site, and that gravity is in the specific"
+        " force; turn more slowly, away from iron."
+    )
+    return contradiction(names, change, cov, cov, remedy, "What was found beside the calibration")
+
+
+def _doubts(found: LogCalibration, site: Site) -> Iterator[Finding]:
+    from magfusion.model.trust import Finding, Verdict
+
+    declared = site.platform.magnetometer.matrix
+    ratio = float(np.cbrt(np.linalg.det(found.graph.fit.matrix) / np.linalg.det(declared)))
+    if not 1.0 / (1.0 + SCALE) < ratio < 1.0 + SCALE:
+        yield Finding(
+            "earth_field",
+            f"The scale of the magnetometer came out {ratio:.3g} times the declared one: the"
+            " readings are in another unit, or the site's Earth field is of another size.",
+            Verdict.FAILED,
+            abs(ratio - 1.0) / SCALE,
+        )
+    disturbed = found.field_sigma / float(np.linalg.norm(found.prior.field_world))
+    if disturbed > site.earth.strength_sigma:
+        yield Finding(
+            "earth_field",
+            f"The size of the calibrated field scatters by {100.0 * disturbed:.2g} %, and the site"
+            f" declares a disturbance of {100.0 * site.earth.strength_sigma:.2g} %"
+            " (world.earth.strength_sigma). Turn the sensor in one place, away from iron.",
+            weight=disturbed / site.earth.strength_sigma,
+        )
+
+
+def _remarks(found: LogCalibration) -> Iterator[Finding]:
+    from magfusion.model.trust import Finding, Verdict
+
+    for sentence in found.missing:
+        text = f"{sentence[0].upper()}{sentence[1:]}."
+        yield Finding("few_data", text, Verdict.TRUSTWORTHY)
     if not found.scale_known:
-        notes.append(
+        yield Finding(
+            "few_data",
             "The site has no Earth field: the scale of the matrix is the declared one, and only"
-            " ratios, angles and offset are found; give earth_field_t or a location."
+            " ratios, angles and offset are found; give earth_field_t or a location.",
+            Verdict.TRUSTWORTHY,
         )
     if found.shape_kept:
-        notes.append(
+        yield Finding(
+            "transfer",
             "The declared shape and offset leave no more spread than what one half of the log finds"
-            " for the other: they were kept, and only the sensor's rotation was taken."
+            " for the other: they were kept, and only the sensor's rotation was taken.",
+            Verdict.TRUSTWORTHY,
         )
-    largest = max(told, key=lambda p: abs(p.change) / p.prior_sigma)
-    if abs(largest.change) > CONTRADICTED * largest.prior_sigma:
-        notes.append(
-            f"{largest.name} changed by {abs(largest.change) / largest.prior_sigma:.0f} of the"
-            " site's sigmas; declare larger ones if the sensor was not calibrated before."
-        )
-    return notes
+
+
+COMMAND = Command(MagnetometerSettings, run, output="magnetometer")

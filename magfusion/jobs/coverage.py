@@ -1,76 +1,72 @@
 """The job that plans an installation: a site in, a directory with its coverage out."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.evaluation.coverage import (
-    Coverage,
-    ExtraBeacon,
-    best_extra_beacon,
-    coverage,
-    phasor_variance,
-    usual_box,
-    volume,
-)
-from magfusion.job import claim, named
-from magfusion.plots.coverage import write_plot
-from magfusion.receiver.windows import default_settings
-from magfusion.records.table import write_table
-from magfusion.report import Figures, write_report
-from magfusion.site import Site
-from magfusion.site_file import load_site
+from magfusion.jobs.settings import Command, Settings, argument, option
+from magfusion.jobs.simulate import box_option
+from magfusion.model.site import Site
 from magfusion.units import Array
-from magfusion.view_coverage import write_coverage_recording
+
+if TYPE_CHECKING:
+    from magfusion.results.coverage import Coverage, ExtraBeacon
+    from magfusion.results.figures import Figures
+
 
 MOST_POINTS = 100_000
-LONGEST_WINDOW = 3600.0  # s; a platform at rest
 
 
-@dataclass(frozen=True, eq=False)
-class CoverageSettings:
-    """Where and how to bound; None takes what fits the site.
+@dataclass(frozen=True, kw_only=True)
+class CoverageSettings(Settings):
+    """Where and how to bound; None takes what fits the site."""
 
-    Parameters
-    ----------
-    box_world : ndarray, shape (2, 3), optional
-        Lower and upper corner of the volume (m).
-    height : float, optional
-        Height of a single slice (m).
-    spacing : float, optional
-        Of the points (m).
-    window : float, optional
-        Time over which the tones are averaged (s).
-    extra_beacon : bool
-        Find where one more beacon adds most.
-    """
+    site: Path = argument("Site file of the installation")
+    box: str | None = option(
+        None,
+        "Volume, m: xmin,xmax,ymin,ymax,zmin,zmax",
+        note="default: about the beacons",
+    )
+    height: float | None = option(None, "A single height", unit="m")
+    spacing: float | None = option(
+        None, "Of the points", unit="m", above=0.0, note="default: a twentieth of the volume"
+    )
+    window: float | None = option(
+        None,
+        "Time over which the tones are averaged",
+        unit="s",
+        least=1e-3,
+        most=3600.0,
+        note="default: from the tones' spacing",
+    )
+    extra_beacon: bool = option(False, "Find where one more beacon adds most")
 
-    box_world: Array | None = None
-    height: float | None = None
-    spacing: float | None = None
-    window: float | None = None
-    extra_beacon: bool = False
 
-
-def run_coverage(site_path: Path, settings: CoverageSettings, output: Path) -> Figures:
+def run_coverage(settings: CoverageSettings, output: Path) -> Figures:
     """Bound the pose over a volume: table, picture, recording and report.
-
-    Returns
-    -------
-    dict
-        The figures of ``report.json``.
 
     Raises
     ------
     InputError
         Where the site cannot be read, the settings do not fit, or ``output`` is in the way.
     """
-    claimed = claim(output, "coverage")
+    from magfusion.files.site import load_site
+    from magfusion.jobs.inputs import claim
+    from magfusion.results.coverage import best_extra_beacon, coverage, usual_box, volume
+    from magfusion.results.plots.coverage import write_plot
+    from magfusion.results.recording_coverage import write_coverage_recording
+    from magfusion.results.report import write_report
+
+    claimed, site_path = claim(output, "coverage"), settings.site
+    given = box_option(settings.box)
     site = load_site(site_path)
     window = _window(site, site_path, settings.window)
-    box = usual_box(site) if settings.box_world is None else settings.box_world
+    box = usual_box(site) if given is None else given
     spacing = _spacing(box, settings)
     heights = None if settings.height is None else np.array([settings.height])
     points = volume(box, spacing, heights)
@@ -89,17 +85,18 @@ def run_coverage(site_path: Path, settings: CoverageSettings, output: Path) -> F
 
 
 def _window(site: Site, site_path: Path, given: float | None) -> float:
+    from magfusion.jobs.inputs import named
+    from magfusion.receiver.windows import default_settings
+
     if given is None:
         in_turn = [b.name for b in site.beacons if any(slot is not None for _, slot in b.tones)]
         if in_turn:
             raise InputError(
                 f"{site_path}: beacon {in_turn[0]} is driven in time slots, whose length the site"
-                " does not tell; give the time of one round with --window"
+                " does not give; give the time of one round with --window"
             )
         with named(site_path):
             return default_settings(site).window
-    if not 1e-3 <= given <= LONGEST_WINDOW:
-        raise InputError(f"--window must lie between 0.001 and 3600 s; got {given:g}")
     return given
 
 
@@ -110,8 +107,6 @@ def _spacing(box: Array, settings: CoverageSettings) -> float:
             raise InputError(f"--height must be a height in metres; got {settings.height:g}")
         size = size[:2]
     spacing = float(np.max(size)) / 20.0 if settings.spacing is None else settings.spacing
-    if not 0.0 < spacing < np.inf:
-        raise InputError(f"--spacing must be above 0 m; got {spacing:g}")
     if float(np.prod(size / spacing + 1.0)) > MOST_POINTS:
         raise InputError(
             f"--spacing {spacing:g} gives more than {MOST_POINTS} points in the box; choose a"
@@ -128,28 +123,45 @@ def _figures(
     found: Coverage,
     extra: ExtraBeacon | None,
 ) -> Figures:
-    figures: Figures = {
-        "job": "coverage",
-        "log": site_path.stem,
-        "points": len(found),
-        "spacing_m": spacing,
-        "window_s": window,
-        "noise_of_a_phasor_t": float(np.sqrt(np.max(phasor_variance(site, window)))),
-        "share_determined": float(np.mean(found.determined)),
-        "share_below_1_cm": float(np.mean(found.position_sigma < 0.01)),
-        "share_below_10_cm": float(np.mean(found.position_sigma < 0.1)),
-        "position_sigma_m_median": _finite(found.position_quantile(0.5)),
-        "position_sigma_m_p90": _finite(found.position_quantile(0.9)),
-        "attitude_sigma_deg_median": _finite(np.rad2deg(found.attitude_quantile(0.5))),
-        "attitude_sigma_deg_p90": _finite(np.rad2deg(found.attitude_quantile(0.9))),
-        "beacons_heard_least": int(np.min(found.beacons)),
-    }
+    from magfusion.model.trust import Trust
+    from magfusion.results.coverage import phasor_variance
+    from magfusion.results.figures import Figure, Figures, heading
+    from magfusion.results.verdict import trust_figures
+
+    position, attitude = found.position_quantile, found.attitude_quantile
+    figures = [
+        Figure("points", len(found)),
+        Figure("spacing_m", spacing, "m"),
+        Figure("window_s", window, "s"),
+        Figure("noise_of_a_phasor_t", float(np.sqrt(np.max(phasor_variance(site, window)))), "T"),
+        Figure("share_determined", float(np.mean(found.determined))),
+        Figure("share_below_1_cm", float(np.mean(found.position_sigma < 0.01))),
+        Figure("share_below_10_cm", float(np.mean(found.position_sigma < 0.1))),
+        *(
+            Figure(
+                f"{name}_sigma_{unit}_{key}", _finite(value), unit, label=f"{name} sigma, {word}"
+            )
+            for name, unit, quantile in (
+                ("position", "m", position),
+                ("attitude", "deg", lambda q: np.rad2deg(attitude(q))),
+            )
+            for key, word, value in (
+                ("median", "median", quantile(0.5)),
+                ("p90", "90th percentile", quantile(0.9)),
+            )
+        ),
+        Figure("beacons_heard_least", int(np.min(found.beacons)), label="beacons in reach, least"),
+    ]
     if extra is not None:
-        x, y, z = extra.beacon.position_world
-        figures |= {"extra_beacon_x_m": x, "extra_beacon_y_m": y, "extra_beacon_z_m": z}
-        figures["median_without_extra_m"] = _finite(extra.before)
-        figures["median_with_extra_m"] = _finite(extra.after)
-    return figures
+        figures += [
+            *(
+                Figure(f"extra_beacon_{axis}_m", float(value), "m")
+                for axis, value in zip("xyz", extra.beacon.position_world, strict=True)
+            ),
+            Figure("median_without_extra_m", _finite(extra.before), "m"),
+            Figure("median_with_extra_m", _finite(extra.after), "m"),
+        ]
+    return heading("coverage", site_path.stem) | trust_figures(Trust()) | Figures(*figures)
 
 
 def _finite(value: float) -> float | None:
@@ -158,6 +170,8 @@ def _finite(value: float) -> float | None:
 
 
 def _write_points(path: Path, found: Coverage) -> None:
+    from magfusion.files.table import write_table
+
     columns: dict[str, object] = dict(
         zip(("position_x", "position_y", "position_z"), found.position_world.T, strict=True)
     )
@@ -165,3 +179,6 @@ def _write_points(path: Path, found: Coverage) -> None:
     columns |= dict(zip(("worst_x", "worst_y", "worst_z"), found.worst_world.T, strict=True))
     columns |= {"beacons": found.beacons, "determined": found.determined}
     write_table(columns, path)
+
+
+COMMAND = Command(CoverageSettings, run_coverage, output="coverage")

@@ -1,100 +1,71 @@
-"""The job that proves, or disproves, that an online estimator stands for days."""
+"""The job that proves, or disproves, that an online estimator is stable over days."""
 
-import json
+from __future__ import annotations
+
+import shutil
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-from magfusion.errors import InputError
-from magfusion.evaluation.drift import Course, Verdict, settled_after
-from magfusion.files import whole_file
-from magfusion.job import UNFINISHED_DRIFT, claim
-from magfusion.jobs.drift_figures import MINUTE, Finding, judged, minutes
-from magfusion.jobs.drift_world import (
-    Estimator,
-    WorldRun,
-    WorldTask,
-    forget,
-    run_world,
-    stretches_done,
-)
-from magfusion.monte_carlo import run_many
-from magfusion.plots.drift import write_plot, write_stability
-from magfusion.report import Figures, write_report
-from magfusion.view_drift import write_drift_recording
+from magfusion.jobs.settings import Command, RandomSettings, option
+from magfusion.model.progress import Report
+
+if TYPE_CHECKING:
+    from magfusion.jobs.drift_figures import Judgement
+    from magfusion.jobs.drift_world import Estimator, WorldRun, WorldTask
+    from magfusion.results.drift import Course, Verdict
+    from magfusion.results.figures import Figures
+
 
 ESTIMATORS: tuple[Estimator, ...] = ("ekf", "smoother")
 SHORTEST, LONGEST = 0.1, 1000.0  # h
 LOOK = 1.0  # s between two looks at how far the runs are
-Report = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True)
-class DriftSettings:
+@dataclass(frozen=True, kw_only=True)
+class DriftSettings(RandomSettings):
     """What is tried.
 
-    Parameters
-    ----------
-    hours : float
-    estimators : tuple of str
-        Of `ESTIMATORS`.
-    worlds : int
-    seed : int
-    drive : {'current', 'voltage'}
-        How the coils are driven, and so what their heat does to their moments.
-    phase_known : bool
-        Declare the drives synchronised.  Together with a clock error: what the test must find.
-    clock_ppm : float
-        Error of the clock that all drives share.
-    cluster : str, optional
-        Address of a Dask scheduler, whose workers see the directory of the results.
-    workers : int, optional
-    resume : bool
-        Go on with the runs that are unfinished in the directory.
+    A declared phase together with a clock error is what the test must find.
     """
 
-    hours: float = 48.0
-    estimators: tuple[Estimator, ...] = ESTIMATORS
-    worlds: int = 1
-    seed: int = 0
-    drive: str = "current"
-    phase_known: bool = False
-    clock_ppm: float = 0.0
-    cluster: str | None = None
-    workers: int | None = None
-    resume: bool = False
-
-    def check(self) -> None:
-        """Refuse what cannot be run.
-
-        Raises
-        ------
-        InputError
-        """
-        if not SHORTEST <= self.hours <= LONGEST:
-            raise InputError(f"--hours must lie between 0.1 and 1000; got {self.hours:g}")
-        if not 1 <= self.worlds <= 10_000:
-            raise InputError(f"--worlds must lie between 1 and 10000; got {self.worlds}")
-        if self.seed < 0:
-            raise InputError(f"--seed must not be negative; got {self.seed}")
-        if not abs(self.clock_ppm) <= 100.0:
-            raise InputError(f"--clock-ppm must lie within 100; got {self.clock_ppm:g}")
-
-    @property
-    def key(self) -> dict[str, object]:
-        """What two runs share that may go on from each other's."""
-        return {
-            "hours": self.hours,
-            "seed": self.seed,
-            "drive": self.drive,
-            "phase_known": self.phase_known,
-            "clock_ppm": self.clock_ppm,
-        }
+    hours: float = option(48.0, "Simulated length", unit="h", least=SHORTEST, most=LONGEST)
+    estimators: tuple[Literal["ekf", "smoother"], ...] = option(
+        ESTIMATORS,
+        "Estimator",
+        name="estimator",
+        words={"both": ESTIMATORS, "ekf": ("ekf",), "smoother": ("smoother",)},
+    )
+    worlds: int = option(1, "Independent worlds", least=1, most=10_000, note="8 for a firm verdict")
+    drive: Literal["current", "voltage"] = option(
+        "current", "A voltage drives less current through warm coils"
+    )
+    phase_known: bool = option(
+        False,
+        "Declared of the drives: own clocks, or synchronised",
+        name="phase",
+        words={"free": False, "known": True},
+    )
+    clock_ppm: float = option(
+        0.0,
+        "Error of the drives' common clock",
+        least=-100.0,
+        most=100.0,
+        note="with --phase known: a trap",
+    )
+    cluster: str | None = option(
+        None, "Dask scheduler, tcp://host:8786, whose workers see the results"
+    )
+    workers: int | None = option(None, "Processes on this machine", note="default: one a core")
+    resume: bool = option(False, "Continue an interrupted run")
 
     def tasks(self, place: Path) -> list[WorldTask]:
         """Return all runs."""
+        from magfusion.jobs.drift_world import WorldTask
+
         return [
             WorldTask(
                 world=world,
@@ -116,11 +87,6 @@ def run_drift(settings: DriftSettings, output: Path, report: Report | None = Non
 
     Until all is done, ``output`` holds what is needed to go on.
 
-    Returns
-    -------
-    dict
-        The figures of ``report.json``.
-
     Raises
     ------
     InputError
@@ -128,12 +94,25 @@ def run_drift(settings: DriftSettings, output: Path, report: Report | None = Non
     EstimationError
         Where an estimator finds no start.
     """
-    settings.check()
+    from magfusion.files.checkpoint import read_position
+    from magfusion.jobs.drift_world import claim_place, run_world
+    from magfusion.jobs.inputs import UNFINISHED_DRIFT, claim
+    from magfusion.results.plots.drift import write_plot, write_stability
+    from magfusion.results.recording_drift import write_drift_recording
+    from magfusion.results.report import write_report
+    from magfusion.simulation.monte_carlo import run_many
+
     claimed = claim(output, "drift")
     place = output.resolve() / UNFINISHED_DRIFT
-    _prepare(place, settings)
     tasks = settings.tasks(place)
-    with _told(place, tasks, report):
+    claim_place(place)
+    if settings.resume:
+        for task in tasks:
+            read_position(task.progress, task.key)
+    else:
+        shutil.rmtree(place, ignore_errors=True)
+    place.mkdir(parents=True, exist_ok=True)
+    with _progress(tasks, report):
         runs = run_many(
             run_world,
             tasks,
@@ -152,29 +131,53 @@ def run_drift(settings: DriftSettings, output: Path, report: Report | None = Non
 
 
 def summarise(settings: DriftSettings, runs: list[WorldRun]) -> Figures:
-    """Return the figures of all runs, the verdict first, and the findings in words."""
-    figures: Figures = {}
-    findings: list[Finding] = []
+    """Return the figures of all runs, the verdict first, and the judgements as sentences.
+
+    An instability that is found makes the estimates doubtful; a run too short to tell does not.
+    """
+    from magfusion.jobs.drift_figures import STABILITY, judged
+    from magfusion.model.trust import Finding, Trust
+    from magfusion.results.drift import QUANTITIES, settled_after
+    from magfusion.results.figures import Figure, Figures, Section, heading
+    from magfusion.results.verdict import trust_figures
+
+    figures = Figures()
+    judgements: list[Judgement] = []
     for estimator in settings.estimators:
         own = [run for run in runs if run.task.estimator == estimator]
-        found, told = judged(estimator, own)
+        found, judgements_of_one = judged(estimator, own)
         figures |= found
-        findings += told
-    settled_h = settled_after(settings.hours) / 3600.0
-    head: Figures = {
-        "job": "drift",
-        "log": f"{settings.hours:g} h in {settings.worlds} world(s)",
-        "verdict": overall([f.verdict for f in findings]),
-        "hours": settings.hours,
-        "worlds": settings.worlds,
-        "seed": settings.seed,
-        "drive": settings.drive,
-        "phase": "known" if settings.phase_known else "free",
-        "clock_ppm": settings.clock_ppm,
-        "settled_after_h": settled_h,
+        judgements += judgements_of_one
+    failed = [one for one in judgements if one.verdict == "fail"]
+    trust = Trust(tuple(Finding("unstable", f"{one.sentence}.") for one in failed))
+    by_quantity = {
+        quantity.name: [
+            one.verdict
+            for one in judgements
+            if one.name.endswith((f"{quantity.name}_drift", f"{quantity.name}_common_drift"))
+        ]
+        for quantity in QUANTITIES
     }
-    notes = [f"{f.verdict.upper()}: {f.sentence}." for f in findings]
-    return {**head, **figures, "notes": notes}
+    head = heading("drift", f"{settings.hours:g} h in {settings.worlds} world(s)")
+    head |= trust_figures(trust) | Figures(
+        Figure("stability", STABILITY[overall([one.verdict for one in judgements])]),
+        *(
+            Figure(f"{name}_stability", STABILITY[overall(verdicts)], section=Section.REPORT)
+            for name, verdicts in by_quantity.items()
+        ),
+        Figure("hours", settings.hours),
+        Figure("worlds", settings.worlds),
+        Figure("seed", settings.seed),
+        Figure("drive", settings.drive),
+        Figure("phase", "known" if settings.phase_known else "free"),
+        Figure("clock_ppm", settings.clock_ppm, "ppm"),
+        Figure("settled_after_h", settled_after(settings.hours) / 3600.0, "h"),
+    )
+    notes = [f"{_WORD[one.verdict]}: {one.sentence}." for one in judgements]
+    return head | figures | Figures(Figure("notes", notes, section=Section.NOTES))
+
+
+_WORD = {"pass": "PASS", "fail": "FAIL", "undecided": "INCONCLUSIVE"}
 
 
 def overall(verdicts: list[Verdict]) -> Verdict:
@@ -185,6 +188,9 @@ def overall(verdicts: list[Verdict]) -> Verdict:
 
 def courses(settings: DriftSettings, runs: list[WorldRun]) -> list[Course]:
     """Return what is drawn of each estimator: its errors, and its pace in the first world."""
+    from magfusion.jobs.drift_figures import MINUTE, minutes
+    from magfusion.results.drift import Course
+
     out = []
     for estimator in settings.estimators:
         own = [r for r in runs if r.task.estimator == estimator]
@@ -192,25 +198,11 @@ def courses(settings: DriftSettings, runs: list[WorldRun]) -> list[Course]:
     return out
 
 
-def _prepare(place: Path, settings: DriftSettings) -> None:
-    """Make the directory of what is unfinished, or see that it is of these settings."""
-    told = place / "settings.json"
-    if settings.resume and told.is_file():
-        if json.loads(told.read_text()) != settings.key:
-            raise InputError(
-                f"{place}: holds runs of other settings; repeat the command as it was, or run"
-                " without --resume"
-            )
-        return
-    forget(place)
-    place.mkdir(parents=True)
-    with whole_file(told) as unfinished:
-        unfinished.write_text(json.dumps(settings.key) + "\n")
-
-
 @contextmanager
-def _told(place: Path, tasks: list[WorldTask], report: Report | None) -> Iterator[None]:
-    """Tell how far the runs are while they run, wherever they do."""
+def _progress(tasks: list[WorldTask], report: Report | None) -> Iterator[None]:
+    """Report the progress of the runs, in whichever process they run."""
+    from magfusion.jobs.drift_world import stretches_done
+
     if report is None:
         yield
         return
@@ -218,7 +210,7 @@ def _told(place: Path, tasks: list[WorldTask], report: Report | None) -> Iterato
 
     def look() -> None:
         while not stop.wait(LOOK):
-            tell("navigating", stretches_done(place), total)
+            tell("navigating", stretches_done(tasks), total)
 
     thread = threading.Thread(target=look, daemon=True)
     thread.start()
@@ -227,3 +219,6 @@ def _told(place: Path, tasks: list[WorldTask], report: Report | None) -> Iterato
     finally:
         stop.set()
         thread.join()
+
+
+COMMAND = Command(DriftSettings, run_drift, output="drift")

@@ -1,24 +1,29 @@
 """One estimator through one simulated world of hours: what it errs, what it takes; resumable."""
 
 import os
-import pickle
+import re
 import resource
-import shutil
 import time
-from dataclasses import dataclass, fields, replace
+from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import gtsam
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.evaluation.drift import ErrorSeries
-from magfusion.files import whole_file
-from magfusion.fusion.inertial import preintegration_parameters
-from magfusion.fusion.online import Navigator, NavigatorSettings, restored
-from magfusion.fusion.state import ACCEL_BIAS, GYRO_BIAS, State, pose_of
-from magfusion.records.samples import ImuSamples
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.preintegration import preintegration_parameters
+from magfusion.estimation.state import ACCEL_BIAS, GYRO_BIAS, State, pose_of
+from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
+from magfusion.files.row_file import Mark, RowFile, claim_rows
+from magfusion.jobs.checkpoint import begin, save
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import ImuModel, Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.results.drift import ErrorSeries
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.endurance import (
     Biases,
@@ -29,8 +34,6 @@ from magfusion.simulation.endurance import (
     usual_drift,
 )
 from magfusion.simulation.inertial import BiasInstability
-from magfusion.site import ImuModel, Site
-from magfusion.trajectory import Trajectory
 from magfusion.units import Array, BoolArray
 
 STRETCH = 10  # blocks that are made, navigated and written at once
@@ -42,6 +45,9 @@ INSTABILITY = BiasInstability(gyro=1e-5, accel=1e-4, time=300.0)
 MOMENT_SIGMA = {"current": 0.005, "voltage": 0.08}
 Estimator = Literal["ekf", "smoother"]
 PACE = ("time", "seconds", "updates", "memory_mib", "distortion", "bare_sample_seconds")
+_ERRORS = {"time": 1, "measured": 1, "error": 15, "sigma": 15, "pose_nees": 1, "bias_nees": 1}
+_PACE = dict.fromkeys(PACE, 1)
+_PROGRESS, _ERROR_ROWS, _PACE_ROWS = "progress.bin", "errors.rows", "pace.rows"
 
 
 @dataclass(frozen=True)
@@ -50,10 +56,7 @@ class WorldTask:
 
     Parameters
     ----------
-    world : int
     estimator : {'ekf', 'smoother'}
-    hours : float
-    seed : int
     drive : {'current', 'voltage'}
     phase_known : bool
         Whether the drives are declared synchronised; otherwise each beacon has a clock of its own.
@@ -73,11 +76,15 @@ class WorldTask:
     place: str | None = None
 
     @property
-    def own_place(self) -> Path | None:
-        """Directory of this run."""
-        if self.place is None:
-            return None
-        return Path(self.place) / f"world_{self.world}_{self.estimator}"
+    def progress(self) -> Path:
+        """File of what is needed to go on; the rows made so far are beside it."""
+        assert self.place is not None
+        return Path(self.place) / f"world_{self.world}_{self.estimator}" / _PROGRESS
+
+    @property
+    def key(self) -> str:
+        """What two runs share that may go on from each other's."""
+        return run_key("drift", replace(self, place=None))
 
     @property
     def stretches(self) -> int:
@@ -91,7 +98,6 @@ class WorldRun:
 
     Parameters
     ----------
-    task : WorldTask
     errors : ErrorSeries
         Of all states.
     pace : ndarray, shape (pieces, 6)
@@ -113,12 +119,12 @@ class WorldRun:
 
 @dataclass(frozen=True, eq=False)
 class _Progress:
-    """Where a run is: all that it needs beside the rows already written."""
+    """What a run needs to go on beside its navigator."""
 
-    stretch: int
     biases: Biases
-    navigator: bytes
     bare: float
+    errors: Mark | None = None
+    pace: Mark | None = None
 
 
 def declared_site(drive: str, phase_known: bool) -> Site:
@@ -150,36 +156,45 @@ def run_world(task: WorldTask, _rng: np.random.Generator | None = None) -> World
     EstimationError
         Where the navigator finds no start.
     """
-    world = draw_task(task)
-    place = task.own_place
-    if place is not None:
-        place.mkdir(parents=True, exist_ok=True)
-    progress = _begun(place, world, task)
-    navigator = restored(progress.navigator)
-    kept: list[tuple[ErrorSeries, Array]] = []
-    while progress.stretch < task.stretches:
-        made = world.stretch(progress.stretch * STRETCH, STRETCH, progress.biases)
-        sample = bare_loop(made.imu, world.site.platform.imu, world.site.gravity)
-        errors, pace = navigate(navigator, world, made)
-        pace = np.column_stack([pace, np.full(len(pace), sample)])
-        bare = progress.bare + sample * len(made.imu)
-        number = progress.stretch
-        saved = navigator.checkpoint() if place is not None else b""
-        progress = _Progress(number + 1, made.after, saved, bare)
-        if place is None:
-            kept.append((errors, pace))
-        else:
-            _write_rows(place, number, errors, pace)
-            _write_progress(place, progress)
-    if place is not None:
-        kept = [_read_rows(place, k) for k in range(task.stretches)]
+    if task.place is None:
+        with TemporaryDirectory() as place:
+            return replace(run_world(replace(task, place=place)), task=task)
+    world, settings = draw_task(task), NavigatorSettings(estimator=task.estimator)
+    task.progress.parent.mkdir(parents=True, exist_ok=True)
+    unmoved = _Progress(world.start(), 0.0)
+    begun = begin(task.progress, task.key, world.site, settings, unmoved, resume=True)
+    navigator, progress = begun.navigator, begun.beside
+    with (
+        closing(RowFile(task.progress.with_name(_ERROR_ROWS), _ERRORS, progress.errors)) as errors,
+        closing(RowFile(task.progress.with_name(_PACE_ROWS), _PACE, progress.pace)) as pace,
+    ):
+        for stretch in range(begun.position, task.stretches):
+            made = world.stretch(stretch * STRETCH, STRETCH, progress.biases)
+            sample = bare_loop(made.imu, world.site.platform.imu, world.site.gravity)
+            new, own_pace = navigate(navigator, world, made)
+            errors.extend({name: getattr(new, name) for name in _ERRORS})
+            own_pace = np.column_stack([own_pace, np.full(len(own_pace), sample)])
+            pace.extend(dict(zip(PACE, own_pace.T, strict=True)))
+            bare = progress.bare + sample * len(made.imu)
+            progress = _Progress(made.after, bare, errors.settle(), pace.settle())
+            save(navigator, stretch + 1, progress, task.progress, task.key)
+        series, every = _series(errors.rows()), np.column_stack(list(pace.rows().values()))
     if not navigator.started:
         raise EstimationError(
             f"world {task.world}: {task.hours:g} h lead the {task.estimator} to no state"
         )
-    series = _joined([errors for errors, _ in kept])
-    every = np.concatenate([pace for _, pace in kept])
     return WorldRun(task, series, every, progress.bare, navigator.losses)
+
+
+def _series(rows: dict[str, Array]) -> ErrorSeries:
+    return ErrorSeries(
+        time=rows["time"][:, 0],
+        measured=rows["measured"][:, 0] > 0.0,
+        error=rows["error"],
+        sigma=rows["sigma"],
+        pose_nees=rows["pose_nees"][:, 0],
+        bias_nees=rows["bias_nees"][:, 0],
+    )
 
 
 def navigate(navigator: Navigator, world: World, made: Stretch) -> tuple[ErrorSeries, Array]:
@@ -190,14 +205,15 @@ def navigate(navigator: Navigator, world: World, made: Stretch) -> tuple[ErrorSe
     grid = np.arange(made.imu.time[0], made.imu.time[-1], PIECE)
     starts = np.union1d(grid, made.fields.time)
     inertial = np.searchsorted(made.imu.time, [*starts, np.inf])
-    heard = np.searchsorted(made.fields.time, [*starts, np.inf])
+    detected = np.searchsorted(made.fields.time, [*starts, np.inf])
     for i in range(len(starts)):
         rows = slice(inertial[i], inertial[i + 1])
         began = time.process_time()
-        for k in range(heard[i], heard[i + 1]):
+        for k in range(detected[i], detected[i + 1]):
             navigator.add_fields(made.fields.rows(slice(k, k + 1)))
         navigator.add_imu(made.imu.time[rows], made.imu.gyro_body[rows], made.imu.accel_body[rows])
-        new = navigator.take()
+        # What the estimator itself claims: a claim widened by its witnesses would hide a drift.
+        new = [replace(s, cov=s.judgement.estimators(s.cov)) for s in navigator.take()]
         spent = time.process_time() - began
         navigator.take_lagged()
         level = list(navigator.distortion.values())
@@ -216,7 +232,6 @@ def state_errors(states: list[State], truth: Trajectory, measured: BoolArray) ->
 
     Parameters
     ----------
-    states : list of State
     truth : Trajectory
         At their times, with velocity and biases.
     measured : ndarray of bool, shape (n,)
@@ -263,51 +278,22 @@ def memory_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-def stretches_done(place: Path) -> int:
-    """Return how many stretches all runs of a place have written."""
-    return sum(1 for _ in place.glob("world_*/rows_*.npz"))
+def stretches_done(tasks: list[WorldTask]) -> int:
+    """Return how many stretches runs have written."""
+    return sum(read_position(task.progress) for task in tasks)
 
 
-def forget(place: Path) -> None:
-    """Remove what an earlier run left."""
-    shutil.rmtree(place, ignore_errors=True)
+def claim_place(place: Path) -> None:
+    """See that a directory holds nothing but what unfinished runs left.
 
-
-def _begun(place: Path | None, world: World, task: WorldTask) -> _Progress:
-    if place is not None and (place / "progress.pickle").is_file():
-        try:
-            found = pickle.loads((place / "progress.pickle").read_bytes())
-        except (pickle.UnpicklingError, AttributeError, EOFError, ImportError) as error:
-            raise InputError(
-                f"{place}: cannot be gone on with ({error}); run without --resume"
-            ) from error
-        assert isinstance(found, _Progress)
-        return found
-    navigator = Navigator(world.site, NavigatorSettings(estimator=task.estimator))
-    return _Progress(0, world.start(), navigator.checkpoint(), 0.0)
-
-
-def _write_progress(place: Path, progress: _Progress) -> None:
-    with whole_file(place / "progress.pickle") as unfinished:
-        unfinished.write_bytes(pickle.dumps(progress))
-
-
-def _write_rows(place: Path, number: int, errors: ErrorSeries, pace: Array) -> None:
-    columns = {f.name: getattr(errors, f.name) for f in fields(errors)}
-    with whole_file(_rows_path(place, number)) as unfinished, unfinished.open("wb") as stream:
-        np.savez(stream, pace=pace, **columns)
-
-
-def _read_rows(place: Path, number: int) -> tuple[ErrorSeries, Array]:
-    with np.load(_rows_path(place, number)) as found:
-        return ErrorSeries(**{f.name: found[f.name] for f in fields(ErrorSeries)}), found["pace"]
-
-
-def _rows_path(place: Path, number: int) -> Path:
-    return place / f"rows_{number:04d}.npz"
-
-
-def _joined(parts: list[ErrorSeries]) -> ErrorSeries:
-    return ErrorSeries(
-        **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ErrorSeries)}
-    )
+    Raises
+    ------
+    InputError
+    """
+    for path in (p for p in sorted(place.rglob("*")) if not p.is_dir()):
+        if path.name == _PROGRESS:
+            claim_checkpoint(path)
+        elif path.name in (_ERROR_ROWS, _PACE_ROWS):
+            claim_rows(path)
+        elif not re.fullmatch(r"\.(progress\.bin|(errors|pace)\.rows)\.\d+", path.name):
+            raise InputError(f"{path}: is not of an unfinished drift run and is kept; move it away")

@@ -1,72 +1,52 @@
 """The job that finds attitudes from the Earth's field: a log in, a table of angles out."""
 
+from __future__ import annotations
+
 import datetime
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.fixes.matching import (
-    THREE_ANGLES,
-    Matches,
-    match_roll,
-    match_roll_pitch,
-    match_with_gravity,
-    wrap,
-)
-from magfusion.fixes.matching_database import (
-    angles_about,
-    match_interpolated,
-    match_nearest,
-    prepare,
-)
-from magfusion.job import Job, claim, named, read_job
-from magfusion.jobs.attitude_database import MAX_GAP, TABLE, Sampling, Steady, steady
-from magfusion.physics.earth import earth_field_world
-from magfusion.plots.match import write_match_plot
-from magfusion.records.attitude_table import read_database, write_attitudes
-from magfusion.records.samples import Log
-from magfusion.report import Figures, write_report
-from magfusion.site import Site
-from magfusion.strapdown import resting
-from magfusion.trajectory import Trajectory, interpolate
+from magfusion.jobs.attitude_database import Sampling
+from magfusion.jobs.settings import Command, LogSettings, option
+from magfusion.model.site import Site
 from magfusion.units import DEGREE, Array, BoolArray
+
+if TYPE_CHECKING:
+    from magfusion.jobs.attitude_database import Steady
+    from magfusion.jobs.inputs import Job
+    from magfusion.model.samples import Log
+    from magfusion.model.trajectory import Trajectory
+    from magfusion.papers.p001_magnetometer.matching import Matches
+    from magfusion.results.figures import Figure, Figures
+
 
 Method = Literal["nearest", "interpolated", "closed-form"]
 _NAMES = ("roll", "pitch", "yaw")
 _BY = " (--yaw-deg; --gravity; magfusion smooth)"
 
 
-@dataclass(frozen=True)
-class MatchSettings:
-    """How attitudes are found, and what is given for it.
+@dataclass(frozen=True, kw_only=True)
+class MatchSettings(LogSettings, Sampling):
+    """How attitudes are found, and what is given for it."""
 
-    Parameters
-    ----------
-    database : Path, optional
-        File, or the result's directory; without one the site's Earth field is the model.
-    method : {"nearest", "interpolated", "closed-form"}, optional
-        Default: interpolated with a database, the closed form without.
-    angles : str, optional
-        What is asked: "roll", "roll-pitch" or "roll-pitch-yaw"; default: what the database tells,
-        or what is not given.
-    pitch_deg, yaw_deg : float, optional
-        Given, where there is no database.
-    gravity : bool
-        Take the specific force of a body at rest as the second vector.
-    sampling : Sampling
-    """
-
-    database: Path | None = None
-    method: Method | None = None
-    angles: str | None = None
-    pitch_deg: float | None = None
-    yaw_deg: float | None = None
-    gravity: bool = False
-    sampling: Sampling = field(default_factory=Sampling)
+    database: Path | None = option(
+        None,
+        "Result of calibrate attitude-database",
+        note="default: the site's Earth field, exactly",
+    )
+    method: Method | None = option(
+        None, "Default: interpolated in the database; the closed form without one"
+    )
+    angles: Literal["roll", "roll-pitch", "roll-pitch-yaw"] | None = option(
+        None, "What is asked", note="default: all that can be determined"
+    )
+    yaw_deg: float | None = option(None, "Yaw of the platform, known", unit="degrees")
+    pitch_deg: float | None = option(None, "Pitch, where that is known too", unit="degrees")
+    gravity: bool = option(False, "All three angles, by the accelerometer, at rest")
 
 
 class _Found(NamedTuple):
@@ -75,56 +55,67 @@ class _Found(NamedTuple):
     angles: tuple[int, ...]  # found, of roll, pitch, yaw
 
 
-def run_match(job: Job, settings: MatchSettings) -> Figures:
+def run_match(settings: MatchSettings, output: Path) -> Figures:
     """Find the attitude of every epoch from the Earth's field: table, picture and report.
-
-    Returns
-    -------
-    dict
-        The figures of ``report.json``, with the errors against the log's truth if it has one.
 
     Raises
     ------
     InputError
-        Where more angles are asked than the vectors tell, in one sentence that says what is
+        Where more angles are asked than the vectors determine, in one sentence that says what is
         lacking; where a file cannot be read, or ``output`` is in the way.
     """
+    from magfusion.files.attitude_table import write_attitudes
+    from magfusion.jobs.attitude_database import steady
+    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.jobs.match_trust import judged
+    from magfusion.results.figures import Figure, Figures, heading
+    from magfusion.results.plots.match import write_match_plot
+    from magfusion.results.report import write_report
+    from magfusion.results.verdict import trust_figures
+
     _check(settings)
-    claimed = claim(job.output, "match")
+    job, claimed = settings.job(output), claim(output, "match")
     log, site = read_job(job)
     with named(job.log_path):
-        taken = steady(log, site, settings.sampling)
+        taken = steady(log, site, settings)
     found = _match(job, log, site, taken, settings)
+    known = None if settings.database is not None else _earth_field(job, site)
+    matches, trust = judged(found.matches, found.angles, known, taken, site, log)
+    found = found._replace(matches=matches)
     first = found.matches.determined[:, 0]
-    figures: Figures = {
-        "job": "match",
-        "log": log.name,
-        "method": found.method,
-        "angles": "-".join(_NAMES[k] for k in found.angles),
-        "epochs": len(taken.time),
-        "epochs_with_two_pitches": int(np.sum(found.matches.ambiguous)),
-        "epochs_not_determined": int(np.sum(~first)),
-        "window_s": taken.length,
-    }
+    figures = [
+        Figure("method", found.method),
+        Figure("angles", "-".join(_NAMES[k] for k in found.angles)),
+        Figure("epochs", len(taken.time)),
+        Figure("epochs_with_two_pitches", int(np.sum(found.matches.ambiguous))),
+        Figure("epochs_not_determined", int(np.sum(~first))),
+        Figure("window_s", taken.length, "s"),
+    ]
     for k in range(3):
         if k not in found.angles:
-            figures[f"given_{_NAMES[k]}_deg"] = float(found.matches.rpy[0, 0, k] / DEGREE)
+            given = float(found.matches.rpy[0, 0, k] / DEGREE)
+            figures.append(Figure(f"given_{_NAMES[k]}_deg", given, "deg"))
         elif np.any(first):
-            sigma = float(np.median(found.matches.sigma[first, 0, k]))
-            figures[f"{_NAMES[k]}_sigma_median_deg"] = sigma / DEGREE
+            sigma = float(np.median(found.matches.sigma[first, 0, k])) / DEGREE
+            figures.append(Figure(f"{_NAMES[k]}_sigma_median_deg", sigma, "deg"))
     true_rpy, compared = _compared(log, taken.time, found)
-    with claimed as directory:
+    shown = heading("match", log.name) | trust_figures(trust) | Figures(*figures) | compared
+    with claimed as whole:
+        directory = found_in(whole, trust)
         parts = (found.matches.rpy, found.matches.sigma, found.matches.residual)
         path = directory / "attitude.parquet"
         write_attitudes(path, log.epoch_ns, taken.time, *parts, found.matches.determined)
         picture = directory / "attitude.png"
         write_match_plot(picture, taken.time, found.matches, found.angles, true_rpy)
-        write_report(directory, figures | compared)
-    return figures | compared
+        write_report(whole, shown)
+    refuse_failed(job.log_path, output, trust)
+    return shown
 
 
 def _check(settings: MatchSettings) -> None:
-    """Refuse what cannot be asked together, and more than the vectors tell."""
+    """Refuse what cannot be asked together, and more than the vectors determine."""
+    from magfusion.papers.p001_magnetometer.matching import THREE_ANGLES
+
     if settings.gravity:
         _check_gravity(settings)
         return
@@ -141,14 +132,16 @@ def _check(settings: MatchSettings) -> None:
 def _check_gravity(settings: MatchSettings) -> None:
     if settings.angles not in (None, "roll-pitch-yaw") or _given(settings):
         raise InputError(
-            "--gravity tells all three angles; leave out --angles, --pitch-deg, --yaw-deg,"
+            "--gravity determines all three angles; leave out --angles, --pitch-deg, --yaw-deg,"
             " --database and --method"
         )
-    if settings.sampling.raw:
+    if settings.raw:
         raise InputError("--gravity needs the specific force of each epoch; leave out --raw")
 
 
 def _check_given(settings: MatchSettings) -> None:
+    from magfusion.papers.p001_magnetometer.matching import THREE_ANGLES
+
     for name, value, limit in (
         ("--pitch-deg", settings.pitch_deg, 90.0),
         ("--yaw-deg", settings.yaw_deg, 360.0),
@@ -172,6 +165,14 @@ def _given(settings: MatchSettings) -> bool:
 
 
 def _match(job: Job, log: Log, site: Site, taken: Steady, settings: MatchSettings) -> _Found:
+    from magfusion.jobs.inputs import named
+    from magfusion.papers.p001_magnetometer.matching import (
+        match_roll,
+        match_roll_pitch,
+        match_with_gravity,
+        wrap,
+    )
+
     if settings.database is not None:
         return _by_database(settings.database, taken, settings)
     field_world = _earth_field(job, site)
@@ -196,17 +197,29 @@ def _match(job: Job, log: Log, site: Site, taken: Steady, settings: MatchSetting
 
 def _resting(log: Log, site: Site, time: Array) -> BoolArray:
     """Tell at which times the platform rests: else its acceleration passes for gravity."""
+    from magfusion.model.strapdown import resting
+
     stamps = log.imu.time + site.platform.imu.time_offset
-    still = resting(stamps, log.imu.gyro_body, log.imu.accel_body)
+    still = resting(stamps, log.imu.gyro_body, log.imu.accel_body, motion=site.platform.motion)
     return still[np.minimum(np.searchsorted(stamps, time), len(stamps) - 1)]
 
 
 def _by_database(place: Path, taken: Steady, settings: MatchSettings) -> _Found:
+    from magfusion.files.attitude_table import read_database
+    from magfusion.jobs.attitude_database import TABLE
+    from magfusion.jobs.inputs import named
+    from magfusion.papers.p001_magnetometer.matching import match_roll, match_roll_pitch
+    from magfusion.papers.p001_magnetometer.matching_database import (
+        match_interpolated,
+        match_nearest,
+        prepare,
+    )
+
     path = place / TABLE if place.is_dir() else place
     database = read_database(path)
     if settings.angles not in (None, database.angles):
         raise InputError(
-            f"--angles {settings.angles}: {path} tells {database.angles}; build another by"
+            f"--angles {settings.angles}: {path} holds {database.angles}; build another by"
             " magfusion calibrate attitude-database"
         )
     with named(path):
@@ -226,13 +239,15 @@ def _by_database(place: Path, taken: Steady, settings: MatchSettings) -> _Found:
 
 
 def _earth_field(job: Job, site: Site) -> Array:
+    from magfusion.model.physics.earth import earth_field_world
+
     if site.earth_field_world is not None:
         return site.earth_field_world
     place = site.location
     if place is None:
         name = job.log_path / "site.yaml" if job.site_path is None else job.site_path
         raise InputError(
-            f"{name}: tells no Earth field; add world.earth_field_t or world.location, or give a"
+            f"{name}: gives no Earth field; add world.earth_field_t or world.location, or give a"
             " database by --database"
         )
     day = datetime.date.fromisoformat(place.date)
@@ -241,37 +256,57 @@ def _earth_field(job: Job, site: Site) -> Array:
 
 def _compared(log: Log, time: Array, found: _Found) -> tuple[Array | None, Figures]:
     """Return the true angles (NaN where there are none) and the errors against them."""
+    from magfusion.jobs.attitude_database import MAX_GAP
+    from magfusion.model.trajectory import interpolate
+    from magfusion.papers.p001_magnetometer.matching import wrap
+    from magfusion.results.figures import Figure, Figures, Section
+
     if log.truth is None:
-        return None, {}
+        return None, Figures()
     poses, exists = interpolate(log.truth, time, MAX_GAP)
     used = exists & found.matches.determined[:, 0]
     if not np.any(used):
-        return None, {"not_compared": "the truth covers no epoch whose attitude is determined"}
+        reason = "the truth covers no epoch whose attitude is determined"
+        note = f"There is no comparison with the truth: {reason}"
+        return None, Figures(Figure("not_compared", reason, section=Section.REPORT, note=note))
     rpy = found.matches.rpy
     true_rpy = np.full((len(time), 3), np.nan)
     true_rpy[exists] = _true_angles(poses.world_from_body, rpy[0, 0], found.angles)
-    figures: Figures = {"compared_epochs": int(np.sum(used))}
+    figures = [Figure("compared_epochs", int(np.sum(used)))]
     for k in found.angles:
         either = np.abs(wrap(rpy[..., k] - true_rpy[:, None, k]))[used] / DEGREE
-        figures[f"{_NAMES[k]}_rms_deg"] = float(np.sqrt(np.mean(either[:, 0] ** 2)))
-        figures[f"{_NAMES[k]}_max_deg"] = float(np.max(either[:, 0]))
+        rms = float(np.sqrt(np.mean(either[:, 0] ** 2)))
+        figures += [
+            Figure(f"{_NAMES[k]}_rms_deg", rms, "deg"),
+            Figure(f"{_NAMES[k]}_max_deg", float(np.max(either[:, 0])), "deg"),
+        ]
     if found.matches.ambiguous[used].any():
         worst = np.max(np.abs(wrap(rpy - true_rpy[:, None]))[used], axis=2)
-        figures["max_of_nearer_solution_deg"] = float(np.nanmin(worst, axis=1).max() / DEGREE)
-    figures |= _whole_attitude(poses, rpy[exists, 0], used[exists])
-    return true_rpy, figures
+        nearer = float(np.nanmin(worst, axis=1).max() / DEGREE)
+        figures.append(Figure("max_of_nearer_solution_deg", nearer, "deg"))
+    return true_rpy, Figures(*figures, _whole_attitude(poses, rpy[exists, 0], used[exists]))
 
 
-def _whole_attitude(poses: Trajectory, rpy: Array, used: BoolArray) -> Figures:
+def _whole_attitude(poses: Trajectory, rpy: Array, used: BoolArray) -> Figure:
     """Return the error of the attitude with the angles that were given, and of what was given."""
+    from scipy.spatial.transform import Rotation
+
+    from magfusion.results.figures import Column, Figure, Section
+
     true = Rotation.from_matrix(poses.world_from_body[used])
     turn = true.inv() * Rotation.from_euler("xyz", rpy[used])
-    return {"attitude_rmse_deg": float(np.sqrt(np.mean(turn.magnitude() ** 2)) / DEGREE)}
+    rms = float(np.sqrt(np.mean(turn.magnitude() ** 2)) / DEGREE)
+    return Figure("attitude_rmse_deg", rms, "deg", None, Section.ERRORS, "attitude", Column.RMS)
 
 
 def _true_angles(world_from_body: Array, given: Array, angles: tuple[int, ...]) -> Array:
     """Return the true angles about those that were given."""
+    from magfusion.papers.p001_magnetometer.matching_database import angles_about
+
     if 2 in angles:
         heading = np.arctan2(world_from_body[:, 1, 0], world_from_body[:, 0, 0])
         return angles_about(world_from_body, heading)
     return angles_about(world_from_body, float(given[2]), None if 1 in angles else float(given[1]))
+
+
+COMMAND = Command(MatchSettings, run_match)

@@ -1,14 +1,25 @@
 """A log as the stream that it once was: small pieces in the order of their arrival."""
 
+from __future__ import annotations
+
+import os
+import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from magfusion.fusion.online import Navigator
-from magfusion.records.samples import FieldSamples, ImuSamples, Log, Waveform
+from magfusion.jobs.settings import Command, PartSettings, ReplayedSettings
 from magfusion.units import Array, IntArray
+
+if TYPE_CHECKING:
+    from magfusion.estimation.navigator import Navigator
+    from magfusion.files.stream import Format
+    from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
+
 
 PIECE = 0.05  # s
 
@@ -21,8 +32,6 @@ class Piece:
     ----------
     arrival : float
         When all of it has been measured (s).
-    imu : ImuSamples
-    waveform : Waveform, optional
     fields : tuple of FieldSamples
         One epoch each.
     """
@@ -62,17 +71,19 @@ class Replay:
 
     def piece(self, k: int) -> Piece:
         """Return one piece."""
+        from magfusion.model.samples import ImuSamples, Waveform
+
         imu, waveform = self.log.imu, self.log.waveform
         own = slice(*self._imu[k : k + 2])
         part = slice(*self._waveform[k : k + 2])
-        rows = range(*self._fields[k : k + 2])
+        fields, rows = self.log.fields, range(*self._fields[k : k + 2])
         return Piece(
             arrival=float(self._edges[k + 1]),
             imu=ImuSamples(imu.time[own], imu.gyro_body[own], imu.accel_body[own]),
             waveform=None
             if waveform is None
             else Waveform(waveform.time[part], waveform.measured_sensor[part]),
-            fields=tuple(_epoch(self.log.fields, i) for i in rows),
+            fields=() if fields is None else tuple(fields.rows(slice(i, i + 1)) for i in rows),
         )
 
 
@@ -109,13 +120,52 @@ def _field_arrival(fields: FieldSamples | None) -> Array:
     return np.asarray(np.maximum.accumulate(fields.time + fields.window / 2.0))
 
 
-def _epoch(fields: FieldSamples | None, i: int) -> FieldSamples:
-    assert fields is not None
-    row = slice(i, i + 1)
-    return FieldSamples(
-        fields.time[row],
-        fields.window[row],
-        fields.channels,
-        fields.phasor_sensor[row],
-        fields.phasor_cov[row],
+def run_replay(log: Log, sink: BinaryIO, form: Format, realtime: bool) -> None:
+    """Write a log as the records of a stream, in the order of their arrival."""
+    from magfusion.files.stream import (
+        fields_content,
+        imu_content,
+        magnetometer_content,
+        write_record,
     )
+
+    replay = Replay(log)
+    for _, piece in paced(replay, 0, realtime):
+        if len(piece.imu):
+            write_record(imu_content(piece.imu), sink, form)
+        if piece.waveform is not None and len(piece.waveform):
+            write_record(magnetometer_content(piece.waveform), sink, form)
+        for samples in piece.fields:
+            write_record(fields_content(samples), sink, form)
+        if realtime:
+            sink.flush()
+    sink.flush()
+
+
+@contextmanager
+def until_closed() -> Iterator[None]:
+    """End in peace where the reader of the output has gone."""
+    try:
+        yield
+    except BrokenPipeError:
+        # Python would complain once more when it flushes at its end.
+        with suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplaySettings(PartSettings, ReplayedSettings):
+    """How a log is printed."""
+
+
+def run(settings: ReplaySettings) -> None:
+    """Print a log as records; see `run_replay`."""
+    from magfusion.files.open import open_log
+    from magfusion.jobs.inputs import topics_option
+
+    found = open_log(settings.log, settings.start, settings.end, topics_option(settings.topics))
+    with until_closed():
+        run_replay(found, sys.stdout.buffer, settings.form, settings.realtime)
+
+
+COMMAND = Command(ReplaySettings, run, reports=False)

@@ -1,10 +1,5 @@
 """Navigation in a pipe: records in, a state out at every epoch; and a log as such records."""
 
-import hashlib
-import os
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
@@ -13,27 +8,24 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.fusion.online import Navigator, NavigatorSettings, restored
-from magfusion.fusion.state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY, State
-from magfusion.jobs.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
-from magfusion.jobs.replay import Replay, paced
-from magfusion.records.samples import Log
-from magfusion.records.stream_record import (
+from magfusion.estimation.batch import AMBIGUOUS_CHI_SQUARE
+from magfusion.estimation.integrity.judgement import JudgedState
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
+from magfusion.files.checkpoint import run_key
+from magfusion.files.site import load_site
+from magfusion.files.stream import (
     Format,
     Numbered,
     field_samples,
-    fields_content,
-    imu_content,
     json_line,
-    magnetometer_content,
     read_records,
-    write_record,
 )
-from magfusion.report import AMBIGUOUS_CHI_SQUARE
-from magfusion.site import Site
-from magfusion.site_file import load_site
+from magfusion.jobs.checkpoint import begin, save
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding
+from magfusion.results.recording_live import open_live_view
 from magfusion.units import Array
-from magfusion.view_live import open_live_view
 
 _PLACE = {"json": "line", "msgpack": "record"}
 WAITING = 1.0  # s; before the first state, as often a sign of life
@@ -45,7 +37,6 @@ class StreamSettings:
 
     Parameters
     ----------
-    navigator : NavigatorSettings
     form : {"json", "msgpack"}
         Of the records.
     keep_going : bool
@@ -70,18 +61,16 @@ class StreamSettings:
 
 
 def run_stream(
-    site_path: Path, settings: StreamSettings, source: BinaryIO, sink: BinaryIO, told: TextIO
+    site_path: Path, settings: StreamSettings, source: BinaryIO, sink: BinaryIO, messages: TextIO
 ) -> int:
     """Navigate by the records of a stream; write one line of JSON for each state.
 
     Parameters
     ----------
-    site_path : Path
-    settings : StreamSettings
     source, sink : file
         Binary; each line is written out at once.
-    told : file
-        Where records that are passed over are told of.
+    messages : file
+        Where records that are passed over are reported.
 
     Returns
     -------
@@ -94,10 +83,8 @@ def run_stream(
         Where the site cannot be read, or a record is none and ``keep_going`` is not set.
     """
     site = load_site(site_path)
-    digest = hashlib.sha256(site_path.read_bytes() + repr(settings.navigator).encode())
-    key, place = digest.hexdigest(), settings.checkpoint
-    found = read_checkpoint(place, key) if settings.resume and place is not None else None
-    navigator = Navigator(site, settings.navigator) if found is None else restored(found.navigator)
+    key, place = run_key("stream", site, settings.navigator), settings.checkpoint
+    navigator = begin(place, key, site, settings.navigator, None, resume=settings.resume).navigator
     view = open_live_view(site) if settings.live else None
     refused, saved, reached = 0, -np.inf, -np.inf
     for numbered in read_records(source, settings.form):
@@ -108,22 +95,22 @@ def run_stream(
             if not settings.keep_going:
                 raise InputError(sentence) from error
             refused += 1
-            told.write(f"magfusion: {sentence} (passed over)\n")
+            messages.write(f"magfusion: {sentence} (passed over)\n")
             continue
         for state in navigator.take():
             sink.write(json_line(state_content(navigator, state)))
-            if view is not None:
+            if view is not None and not state.lost:
                 view.show(state, navigator.distortion)
         navigator.take_lagged()
         if not navigator.started and newest >= reached + WAITING:
-            sink.write(json_line({"time": newest, "started": False, "ambiguous": None}))
+            sink.write(json_line(_waiting(navigator, newest)))
             reached = newest
         sink.flush()
         if place is not None and newest >= saved + settings.every:
-            write_checkpoint(Checkpoint(key, numbered.number, 0, navigator.checkpoint()), place)
+            save(navigator, numbered.number, None, place, key)
             saved = newest
     if refused:
-        told.write(f"magfusion: {refused} records were passed over\n")
+        messages.write(f"magfusion: {refused} records were passed over\n")
     return refused
 
 
@@ -148,15 +135,38 @@ def _last(time: Array) -> float:
     return float(np.max(time, initial=-np.inf))
 
 
-def state_content(navigator: Navigator, state: State) -> dict[str, Any]:
-    """Return a state as it is written: SI units, sigmas of position and velocity in world axes."""
+def _waiting(navigator: Navigator, time: float) -> dict[str, Any]:
+    """Return a sign of life before the first state, with the reason why a start was refused."""
+    nothing: dict[str, Any] = {"time": time, "started": False, "lost": False, "verdict": None}
+    return nothing | {"reasons": _said(navigator.why_no_start.trust.reasons), "ambiguous": None}
+
+
+def _said(findings: tuple[Finding, ...]) -> list[dict[str, str]]:
+    return [{"code": finding.code, "text": finding.text} for finding in findings]
+
+
+def state_content(navigator: Navigator, state: JudgedState) -> dict[str, Any]:
+    """Return a state as it is written: SI units, sigmas of position and velocity in world axes.
+
+    Where the platform is lost there is no pose, nor anything that follows from one.
+    """
+    told = {
+        "time": state.time,
+        "started": True,
+        "lost": state.lost,
+        "verdict": str(state.verdict),
+        "reasons": _said(state.judgement.reasons),
+        "excluded": list(state.judgement.excluded),
+        "protection_level_m": state.judgement.protection_level_m,
+        "protection_level_deg": state.judgement.protection_level_deg,
+    }
+    if state.lost:
+        return told | {"ambiguous": None, "distortion": dict(navigator.distortion)}
     world_from_body, cov = state.world_from_body, state.cov
     rival = navigator.rival_chi_square
     position_cov = world_from_body @ cov[POSITION, POSITION] @ world_from_body.T
     quaternion = Rotation.from_matrix(world_from_body).as_quat(scalar_first=True)
-    return {
-        "time": state.time,
-        "started": True,
+    return told | {
         "ambiguous": rival is not None and rival < AMBIGUOUS_CHI_SQUARE,
         "position": state.position_world.tolist(),
         "quaternion": quaternion.tolist(),
@@ -176,29 +186,3 @@ def state_content(navigator: Navigator, state: State) -> dict[str, Any]:
 
 def _sigma(cov: Array) -> list[float]:
     return [float(s) for s in np.sqrt(np.diagonal(cov))]
-
-
-def run_replay(log: Log, sink: BinaryIO, form: Format, realtime: bool) -> None:
-    """Write a log as the records of a stream, in the order of their arrival."""
-    replay = Replay(log)
-    for _, piece in paced(replay, 0, realtime):
-        if len(piece.imu):
-            write_record(imu_content(piece.imu), sink, form)
-        if piece.waveform is not None and len(piece.waveform):
-            write_record(magnetometer_content(piece.waveform), sink, form)
-        for samples in piece.fields:
-            write_record(fields_content(samples), sink, form)
-        if realtime:
-            sink.flush()
-    sink.flush()
-
-
-@contextmanager
-def until_closed() -> Iterator[None]:
-    """End in peace where the reader of the output has gone."""
-    try:
-        yield
-    except BrokenPipeError:
-        # Python would complain once more when it flushes at its end.
-        with suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

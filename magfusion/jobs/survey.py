@@ -1,24 +1,25 @@
 """The job that makes a fingerprint survey: a log and its poses in, a survey out."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.fusion.source import phasors
-from magfusion.job import Job, claim, named, read_estimate, read_job
-from magfusion.plots.survey import write_survey_plot
-from magfusion.records.samples import FieldSamples, Log
-from magfusion.records.survey import Survey, write_survey
-from magfusion.report import Figures, dropped_figures, write_report
-from magfusion.site import Site
-from magfusion.strapdown import resting
-from magfusion.trajectory import Trajectory, interpolate
+from magfusion.jobs.settings import Command, LogSettings, WindowSettings, option
+from magfusion.model.site import Site
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
+
+if TYPE_CHECKING:
+    from magfusion.files.survey import Survey
+    from magfusion.jobs.inputs import Job
+    from magfusion.model.samples import FieldSamples, Log
+    from magfusion.model.trajectory import Trajectory
+    from magfusion.results.figures import Figures
+
 
 Points = Literal["rests", "epochs"]
 MAX_GAP = 1.0  # s; of the poses, across which they are interpolated
@@ -26,23 +27,17 @@ STILL = 0.02  # m; within a stop, by the poses: at constant speed the IMU feels 
 GAP = 1.5  # of the distance of two windows, beyond which they belong to two stops
 
 
-@dataclass(frozen=True)
-class SurveySettings:
-    """What becomes a point of the survey.
+@dataclass(frozen=True, kw_only=True)
+class SurveySettings(LogSettings, WindowSettings):
+    """What becomes a point of the survey; of points too near each other, the first."""
 
-    Parameters
-    ----------
-    points : {"rests", "epochs"}
-        One point a stop of the platform, or one an epoch.
-    spacing : float
-        Least distance of two points (m); of those that are nearer the first is kept.
-    trajectory : Path, optional
-        Poses in place of the log's truth: a result's directory, TUM file or table.
-    """
-
-    points: Points = "rests"
-    spacing: float = 0.0
-    trajectory: Path | None = None
+    trajectory: Path | None = option(
+        None,
+        "Result, TUM file or table with the poses",
+        note="default: the log's truth",
+    )
+    points: Points = option("rests", "One point a stop, or one an epoch")
+    spacing: float = option(0.0, "Least distance of two points", unit="m", least=0.0)
 
 
 class _Point(NamedTuple):
@@ -52,27 +47,29 @@ class _Point(NamedTuple):
     sigma: Array  # (channels,)
 
 
-def run_survey(job: Job, settings: SurveySettings) -> Figures:
+def run_survey(settings: SurveySettings, output: Path) -> Figures:
     """Make a survey of the fields at known poses: table, picture and report.
-
-    Returns
-    -------
-    dict
-        The figures of ``report.json``.
 
     Raises
     ------
     InputError
         Where the log has no pose, none of its epochs can be a point, or ``output`` is in the way.
     """
-    if not 0.0 <= settings.spacing < np.inf:
-        raise InputError(f"--spacing must be at least 0 m; got {settings.spacing:g}")
-    claimed = claim(job.output, "survey")
+    from magfusion.estimation.demodulation import phasors
+    from magfusion.files.survey import write_survey
+    from magfusion.jobs.inputs import claim, named, read_job
+    from magfusion.results.plots.survey import write_survey_plot
+    from magfusion.results.report import dropped_figures, write_report
+
+    job, claimed = settings.job(output), claim(output, "survey")
+    lockin = settings.lockin(job)
     log, site = read_job(job)
     poses = _poses(job, settings, log)
     with named(job.log_path):
-        samples, windows_dropped = phasors(log, site, job.lockin)
-    survey, dropped = make_survey(samples, poses, log, site, settings)
+        samples, windows_dropped = phasors(log, site, lockin)
+    survey, dropped = make_survey(
+        samples, poses, log, site, points=settings.points, spacing=settings.spacing
+    )
     if len(survey) == 0:
         reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
         raise InputError(
@@ -88,6 +85,8 @@ def run_survey(job: Job, settings: SurveySettings) -> Figures:
 
 
 def _poses(job: Job, settings: SurveySettings, log: Log) -> Trajectory:
+    from magfusion.jobs.inputs import read_estimate
+
     if settings.trajectory is not None:
         return read_estimate(settings.trajectory, log.epoch_ns)
     if log.truth is None:
@@ -99,34 +98,43 @@ def _poses(job: Job, settings: SurveySettings, log: Log) -> Trajectory:
 
 
 def make_survey(
-    samples: FieldSamples, poses: Trajectory, log: Log, site: Site, settings: SurveySettings
+    samples: FieldSamples,
+    poses: Trajectory,
+    log: Log,
+    site: Site,
+    *,
+    points: Points = "rests",
+    spacing: float = 0.0,
 ) -> tuple[Survey, dict[str, int]]:
     """Return the survey, and how many epochs were dropped for each reason.
 
     A stop's phasors are averaged with the pose over its windows; those of an unsynchronised beacon
     are first turned to one drive phase, which drifts.  ``sigma`` counts overlapping windows once.
     """
+    from magfusion.files.survey import Survey
+    from magfusion.model.trajectory import interpolate
+
     known, exists = interpolate(poses, samples.time, MAX_GAP)
-    heard = samples.valid.any(axis=1)
+    detected = samples.valid.any(axis=1)
     still = np.ones(len(samples), dtype=bool)
-    if settings.points == "rests":
+    if points == "rests":
         still = _at_rest(samples, log, site)
-    used = np.flatnonzero(exists & heard & still)
+    used = np.flatnonzero(exists & detected & still)
     dropped = {
         "outside the trajectory": int(np.sum(~exists)),
-        "no beacon heard": int(np.sum(exists & ~heard)),
-        "moving": int(np.sum(exists & heard & ~still)),
+        "no beacon heard": int(np.sum(exists & ~detected)),
+        "moving": int(np.sum(exists & detected & ~still)),
     }
     at = np.searchsorted(np.flatnonzero(exists), used)
     position, attitude = known.position_world[at], known.world_from_body[at]
     stop = np.arange(len(used))
-    if settings.points == "rests":
+    if points == "rests":
         stop = _stops(samples.time[used], position)
     found = [
         _mean(samples, site, used[stop == s], position[stop == s], attitude[stop == s])
         for s in range(int(np.max(stop, initial=-1)) + 1)
     ]
-    kept = _spaced(np.array([p.position_world for p in found]).reshape(-1, 3), settings.spacing)
+    kept = _spaced(np.array([p.position_world for p in found]).reshape(-1, 3), spacing)
     dropped["too close to another point"] = int(np.sum(~np.isin(stop, kept)))
     chosen = [found[k] for k in kept]
     shape = (len(chosen), len(samples.channels))
@@ -143,8 +151,11 @@ def make_survey(
 
 def _at_rest(samples: FieldSamples, log: Log, site: Site) -> BoolArray:
     """Return during which windows every inertial sample is at rest."""
+    from magfusion.model.strapdown import resting
+
     time = log.imu.time + site.platform.imu.time_offset
-    moving = ~resting(time, log.imu.gyro_body, log.imu.accel_body)
+    motion = site.platform.motion
+    moving = ~resting(time, log.imu.gyro_body, log.imu.accel_body, motion=motion)
     total = np.concatenate([[0], np.cumsum(moving)])
     half = samples.window / 2.0
     first = np.searchsorted(time, samples.time - half)
@@ -169,6 +180,8 @@ def _mean(
     samples: FieldSamples, site: Site, rows: IntArray, position: Array, attitude: Array
 ) -> _Point:
     """Return the mean of the windows of one stop."""
+    from scipy.spatial.transform import Rotation
+
     valid = samples.valid[rows]
     phasor = np.where(valid[..., None], samples.phasor_sensor[rows], 0.0)
     free = [not b.synchronised for b in site.beacons for _ in b.tones]
@@ -196,6 +209,8 @@ def _windows_beside(samples: FieldSamples, rows: IntArray) -> float:
 
 def _spaced(position: Array, spacing: float) -> IntArray:
     """Return the points, in their order, that no earlier one is nearer to than the spacing."""
+    from scipy.spatial import KDTree
+
     if spacing == 0.0 or len(position) == 0:
         return np.arange(len(position))
     keep = np.ones(len(position), dtype=bool)
@@ -207,20 +222,40 @@ def _spaced(position: Array, spacing: float) -> IntArray:
 
 
 def _figures(log: Log, site: Site, survey: Survey, dropped: dict[str, int]) -> Figures:
-    heard = np.isfinite(survey.sigma)
+    from magfusion.estimation.integrity.recording import passed_on
+    from magfusion.results.figures import Figure, Figures, heading
+    from magfusion.results.report import dropped_figures
+    from magfusion.results.verdict import trust_figures
+
+    detected = np.isfinite(survey.sigma)
     own = np.array([name for name, _ in survey.channels])
-    by_beacon = {b.name: heard[:, own == b.name].any(axis=1) for b in site.beacons}
+    by_beacon = {b.name: detected[:, own == b.name].any(axis=1) for b in site.beacons}
     beacons = np.sum(list(by_beacon.values()), axis=0)
-    figures: Figures = {
-        "job": "survey",
-        "log": log.name,
-        "points": len(survey),
-        "beacons_per_point_least": int(np.min(beacons)),
-        "beacons_per_point_mean": float(np.mean(beacons)),
-        "epochs_dropped": sum(dropped.values()),
-    }
-    figures |= {f"points_hearing_{name}": int(np.sum(h)) for name, h in by_beacon.items()}
-    figures["noise_of_a_phasor_t"] = float(np.nanmedian(survey.sigma))
-    for reason, count in dropped.items():
-        figures["epochs_dropped_" + reason.replace(" ", "_")] = count
-    return figures
+    figures = (
+        heading("survey", log.name)
+        | trust_figures(passed_on(log, site))
+        | Figures(
+            Figure("points", len(survey)),
+            Figure(
+                "beacons_per_point_least", int(np.min(beacons)), label="beacons per point, least"
+            ),
+            Figure(
+                "beacons_per_point_mean", float(np.mean(beacons)), label="beacons per point, mean"
+            ),
+            *(
+                Figure(
+                    "points_hearing_{beacon}",
+                    int(np.sum(own)),
+                    "",
+                    name,
+                    label="points in reach of",
+                )
+                for name, own in by_beacon.items()
+            ),
+            Figure("noise_of_a_phasor_t", float(np.nanmedian(survey.sigma)), "T"),
+        )
+    )
+    return figures | dropped_figures(dropped, "epochs")
+
+
+COMMAND = Command(SurveySettings, run_survey)

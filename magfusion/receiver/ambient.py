@@ -13,8 +13,10 @@ import numpy as np
 from magfusion.units import Array, ComplexArray, IntArray
 
 Removal = Literal["none", "subtract", "interpolate", "state"]
-LEAST_TURNS = 1.2  # of an alias of the mains in the span of the state, which tells it from a ramp
-STRETCH = 4  # at most so many times longer a state, where that tells them apart
+LEAST_TURNS = (
+    1.2  # of an alias of the mains in the span of the state, which distinguishes it from a ramp
+)
+STRETCH = 4  # at most so many times longer a state, where that separates them
 
 
 def subtraction_gain(frequency_hz: float, duration: float, slots_apart: int) -> float:
@@ -22,7 +24,6 @@ def subtraction_gain(frequency_hz: float, duration: float, slots_apart: int) -> 
 
     Parameters
     ----------
-    frequency_hz : float
     duration : float
         Of a slot (s).
     slots_apart : int
@@ -52,9 +53,9 @@ def ambient_weights(
     removal : {"none", "subtract", "interpolate", "state"}
         Nothing; the mean of the silent slots of the same cycle; straight lines between the nearest
         silent slots before and after; least squares of a constant, a ramp and, where they can be
-        told apart, the mains over the nearest silent slots.
+        separated, the mains over the nearest silent slots.
     cycles : int
-        Length of the state (cycles); up to four times longer where that tells the mains from a
+        Length of the state (cycles); up to four times longer where that separates the mains from a
         drift.
     mains_turns : float
         Turns of the mains in a slot; zero for none.
@@ -143,4 +144,4 @@ def removed(
     """Return the driven slots (n, 3) freed of the ambient field that silent ones (m, 3) tell."""
     if len(silent) == 0:
         return driven + weight
-    return np.asarray(driven - np.einsum("nk,nkx->nx", weight, silent[index]))
+    return driven - np.einsum("nk,nkx->nx", weight, silent[index])

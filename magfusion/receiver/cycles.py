@@ -3,11 +3,10 @@
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.model.samples import FieldSamples, ImuSamples
+from magfusion.model.site import Site
 from magfusion.receiver.slots import schedule
-from magfusion.records.samples import FieldSamples, ImuSamples
-from magfusion.site import Site
-from magfusion.strapdown import attitude_at, attitude_from_gyro
-from magfusion.units import Array
+from magfusion.receiver.turn import on_clock, turn_of
 
 
 def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSamples:
@@ -20,7 +19,6 @@ def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSam
     ----------
     samples : FieldSamples
         Channels in the site's order.
-    imu : ImuSamples
     site : Site
         With a schedule.
 
@@ -38,16 +36,18 @@ def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSam
     _, cycle = np.unique(slots.running(samples.time) // slots.count, return_inverse=True)
     row, channel = np.nonzero(samples.valid)
     number = int(cycle[-1]) + 1
-    held = np.zeros((number, len(samples.channels)), dtype=bool)
-    held[cycle[row], channel] = True
-    whole = held.all(axis=1)
+    seen = np.zeros((number, len(samples.channels)), dtype=bool)
+    seen[cycle[row], channel] = True
+    whole = seen.all(axis=1)
     if not np.any(whole):
         raise InputError(
             f"no cycle of {slots.count} slots holds all of {len(samples.channels)} coils; record"
             " longer, or give the site in which the log was recorded"
         )
     time = np.bincount(cycle, samples.time) / np.bincount(cycle)
-    turn = _measured_at(imu, site, samples.time[row], time[cycle[row]])
+    measured_from_still = turn_of(on_clock(imu, site.platform.imu.time_offset), site)
+    still_from_measured = np.linalg.inv(measured_from_still(samples.time[row]))
+    turn = measured_from_still(time[cycle[row]]) @ still_from_measured
     phasor = np.full((number, *samples.phasor_sensor.shape[1:]), np.nan, dtype=np.complex128)
     phasor[cycle[row], channel] = (turn @ samples.phasor_sensor[row, channel][..., None])[..., 0]
     cov = np.full((number, *samples.phasor_cov.shape[1:]), np.nan)
@@ -59,14 +59,3 @@ def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSam
         phasor_sensor=phasor[whole],
         phasor_cov=cov[whole],
     )
-
-
-def _measured_at(imu: ImuSamples, site: Site, time: Array, wanted: Array) -> Array:
-    """Return what turns a field as measured at each time into one as measured at another."""
-    stamps = imu.time + site.platform.imu.time_offset
-    attitude = attitude_from_gyro(stamps, imu.gyro_body)
-    there, here = (attitude_at(attitude, stamps, imu.gyro_body, t) for t in (wanted, time))
-    sensor = site.platform.magnetometer
-    measured_from_body = sensor.matrix @ sensor.body_from_sensor.T
-    turn = (there.inv() * here).as_matrix()
-    return np.asarray(measured_from_body @ turn @ np.linalg.inv(measured_from_body))

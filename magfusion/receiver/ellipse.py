@@ -73,20 +73,3 @@ def rms_amplitude(phasor: ComplexArray) -> Array:
         (T)
     """
     return np.asarray(np.sqrt(0.5 * np.sum(np.abs(phasor) ** 2, axis=-1)))
-
-
-def phase_free(phasor: ComplexArray) -> ComplexArray:
-    """Return ``Y Y^H``, all that a phasor says where its drive phase is unknown.
-
-    Parameters
-    ----------
-    phasor : complex ndarray, shape (..., 3)
-        (T), in any axes.
-
-    Returns
-    -------
-    complex ndarray, shape (..., 3, 3)
-        (T^2), Hermitian.  The eigenvalues of the real part, ``Bc Bc^T + Bs Bs^T``, are the squared
-        semi-axes and zero; the imaginary part maps a vector v to ``v x k``, k the normal.
-    """
-    return np.asarray(phasor[..., :, None] * np.conj(phasor[..., None, :]))

@@ -1,28 +1,29 @@
 """Lock-in: raw waveform to phasors, one least-squares design a window.
 
 The window is long against the motion, so that a plain lock-in leaks the Earth field and the other
-beacons into each tone.  Each sample is therefore first turned by the gyro into the axes of the
-window's centre, and the design holds a linear ramp for each tone.
+beacons into each tone.  Each sample is therefore first turned by the gyro into axes that stand
+still, what is found back into those of the window's centre, and the design holds a linear ramp for
+each tone.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import starmap
 
 import numpy as np
 
-from magfusion.receiver.noise import noise_beside_tones, smoothed_over_windows
-from magfusion.receiver.windows import (
-    LockinSettings,
-    Windows,
-    channel_frequencies_hz,
-    sample_rate_hz,
-)
-from magfusion.records.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
-from magfusion.site import Magnetometer, Site
-from magfusion.strapdown import attitude_at, attitude_from_gyro
+from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
+from magfusion.model.site import Site
+from magfusion.receiver.admission import Windows, sample_rate_hz
+from magfusion.receiver.noise import FittedWindows, noise_beside_tones, smoothed_over_windows
+from magfusion.receiver.turn import on_clock, turn_of
+from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
-CHUNK = 1000  # windows demodulated at once
+CHUNK = 1000  # windows demodulated at once: they fit in memory
+MOST_COMPARED = 50  # windows by which two clocks are compared
+LEAST_COMPARED = 0.8  # of the samples of the fullest
+WORST_CONDITION = 1e8  # of a normal matrix; beyond, the samples do not tell its columns apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,16 +32,15 @@ class WindowOperator:
 
     Parameters
     ----------
-    settings : LockinSettings
     channels : tuple of (str, int)
     frequencies_hz, nuisance_hz : ndarray
         Tones, and lines that are fitted beside them (Hz).
     time : ndarray, shape (samples,)
         (s)
-    windows : Windows
-    turn : callable
-        Gives, for sample indices (n, m) and the window centres, the matrices (n, m, 3, 3) that turn
-        a measured field into the axes of the window's centre.
+    still_from_measured : ndarray, shape (samples, 3, 3)
+        Takes each sample to axes that do not turn with the body.
+    measured_from_still : ndarray, shape (windows, 3, 3)
+        Takes the fields back at the centre of each window.
     """
 
     settings: LockinSettings
@@ -49,7 +49,8 @@ class WindowOperator:
     nuisance_hz: Array
     time: Array
     windows: Windows
-    turn: Callable[[IntArray, Array], Array]
+    still_from_measured: Array
+    measured_from_still: Array
 
     def apply(self, measured_sensor: Array) -> ComplexArray:
         """Return the phasors of a waveform given at the same sample times.
@@ -64,29 +65,76 @@ class WindowOperator:
         complex ndarray, shape (n, channels, 3)
             (T), measured axes at the centre of the window.
         """
-        out = np.empty((len(self.windows.centre), len(self.frequencies_hz), 3), dtype=np.complex128)
-        for rows in chunks(len(self.windows.centre)):
-            part = fit_windows(self, rows, measured_sensor)
-            out[rows] = part.phasor
-        return out
+        return np.concatenate(list(starmap(self._phasor, self._fitted(measured_sensor))))
 
+    def demodulate(self, measured_sensor: Array) -> tuple[FieldSamples, SteadyFields]:
+        """Turn raw samples into phasors and the steady field beside them, each with covariance.
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    phasor: ComplexArray
-    unit_variance: Array
-    constant: Array
-    constant_variance: Array
-    elapsed: Array
-    weight: BoolArray
-    design: Array
-    inverse: Array
-    turned: Array
+        Parameters
+        ----------
+        measured_sensor : ndarray, shape (samples, 3)
+            (T).  Where a prediction has been taken off, the noise is measured without what motion
+            leaks beside the tones.  For the steady field the known offset, or a prediction, should
+            have been taken off: the gyro turns with the samples what does not turn with the
+            platform.
+        """
+        n, parts = len(self.frequencies_hz), []
+        for rows, fit in self._fitted(measured_sensor):
+            turn = self.measured_from_still[rows]
+            noise = noise_beside_tones(self.frequencies_hz, self.nuisance_hz, fit)
+            own = np.einsum("nii->ni", fit.inverse)
+            parts.append(
+                (
+                    self._phasor(rows, fit),
+                    0.5 * (own[:, 2 : 2 + n] + own[:, 2 + n : 2 + 2 * n]),
+                    turn[:, None] @ noise @ np.swapaxes(turn, 1, 2)[:, None],
+                    (turn @ fit.coefficients[:, 0, :, None])[..., 0],
+                    own[:, 0],
+                )
+            )
+        phasor, unit, noise, constant, constant_unit = (
+            np.concatenate(part) for part in zip(*parts, strict=True)
+        )
+        centre, settings = self.windows.centre, self.settings
+        smooth = smoothed_over_windows(noise, centre, settings.step, settings.noise_windows)
+        samples = FieldSamples(
+            time=centre,
+            window=np.full(len(centre), settings.window),
+            channels=self.channels,
+            phasor_sensor=phasor,
+            phasor_cov=unit[..., None, None] * smooth,
+        )
+        beside = constant_unit[:, None, None] * np.mean(smooth, axis=1)
+        return samples, SteadyFields(centre, constant, beside)
 
+    def _fitted(self, measured_sensor: Array) -> Iterator[tuple[slice, FittedWindows]]:
+        """Yield the windows in pieces, each with the design fitted to a waveform."""
+        still = (self.still_from_measured @ measured_sensor[..., None])[..., 0]
+        for begin in range(0, len(self.windows), CHUNK):
+            rows = slice(begin, begin + CHUNK)
+            some = self.windows.rows(rows)
+            index, weight, elapsed = _padded(some, self.time)
+            design = _design(elapsed, self.settings.window, self.frequencies_hz, self.nuisance_hz)
+            design *= weight[..., None]
+            field, projected = still[index] * weight[..., None], np.swapaxes(design, -1, -2)
+            inverse = np.asarray(np.linalg.inv(projected @ design))
+            fitted = inverse @ (projected @ field)
+            yield rows, FittedWindows(elapsed, weight, design, inverse, field, fitted)
 
-def chunks(n: int) -> list[slice]:
-    """Cut n windows into pieces that fit in memory."""
-    return [slice(i, min(i + CHUNK, n)) for i in range(0, n, CHUNK)]
+    def unexplained(self, measured_sensor: Array) -> Array:
+        """Return the power that the design leaves of each window, shape (n,) (T^2)."""
+        out = []
+        for _, fit in self._fitted(measured_sensor):
+            left = fit.field - fit.design @ fit.coefficients
+            out.append(np.sum(left**2, axis=(1, 2)) / np.sum(fit.weight, axis=1))
+        return np.concatenate(out)
+
+    def _phasor(self, rows: slice, fit: FittedWindows) -> ComplexArray:
+        n, centre = len(self.frequencies_hz), self.windows.centre[rows]
+        cosine, sine = fit.coefficients[:, 2 : 2 + n], fit.coefficients[:, 2 + n : 2 + 2 * n]
+        reference = np.exp(-2j * np.pi * self.frequencies_hz * centre[:, None])
+        still = (cosine - 1j * sine) * reference[..., None]
+        return still @ np.swapaxes(self.measured_from_still[rows], 1, 2)
 
 
 def _nuisances_hz(settings: LockinSettings, frequencies: Array, nyquist_hz: float) -> Array:
@@ -94,44 +142,25 @@ def _nuisances_hz(settings: LockinSettings, frequencies: Array, nyquist_hz: floa
         return np.zeros(0)
     lines = np.arange(settings.mains_hz, 0.95 * nyquist_hz, settings.mains_hz)[:6]
     apart = np.min(np.abs(lines[:, None] - frequencies), axis=1) * settings.window
-    return np.asarray(lines[apart > 0.8])
+    return lines[apart > 0.8]
 
 
 def window_operator(
-    waveform: Waveform,
-    imu: ImuSamples,
-    site: Site,
-    settings: LockinSettings,
-    windows: Windows,
-    *,
-    gyro_bias_body: Array | None = None,
-    time_offset: float | None = None,
+    waveform: Waveform, imu: ImuSamples, site: Site, settings: LockinSettings, windows: Windows
 ) -> WindowOperator:
     """Return the map from a waveform to phasors, with the gyro's turn of each sample.
 
     Parameters
     ----------
-    waveform : Waveform
     imu : ImuSamples
-        Its gyro turns each sample into the axes of its window's centre.
+        As from `magfusion.receiver.turn.on_clock`.
     site : Site
         Tones, magnetometer matrix and mounting.
-    settings : LockinSettings
     windows : Windows
-        From `choose_windows`.
-    gyro_bias_body : ndarray, shape (3,) or (len(imu), 3), optional
-        (rad/s)
-    time_offset : float, optional
-        IMU time offset (s); the site's where it is not given.
-
-    Returns
-    -------
-    WindowOperator
+        That were admitted.
     """
-    offset = site.platform.imu.time_offset if time_offset is None else time_offset
-    imu_time = imu.time + offset
-    gyro = imu.gyro_body - (0.0 if gyro_bias_body is None else gyro_bias_body)
     frequencies = channel_frequencies_hz(site)
+    measured_from_still = turn_of(imu, site)
     return WindowOperator(
         settings=settings,
         channels=site.channels,
@@ -139,128 +168,70 @@ def window_operator(
         nuisance_hz=_nuisances_hz(settings, frequencies, sample_rate_hz(waveform) / 2.0),
         time=waveform.time,
         windows=windows,
-        turn=_turner(waveform.time, imu_time, gyro, site.platform.magnetometer),
+        still_from_measured=np.asarray(np.linalg.inv(measured_from_still(waveform.time))),
+        measured_from_still=measured_from_still(windows.centre),
     )
 
 
-def demodulate(operator: WindowOperator, measured_sensor: Array) -> FieldSamples:
-    """Turn raw samples into phasors with covariance.
+def _padded(windows: Windows, time: Array) -> tuple[IntArray, BoolArray, Array]:
+    """Return the samples of windows, which of them are no padding, and their times (s)."""
+    reach = np.arange(int(np.max(windows.count)))
+    weight = reach < windows.count[:, None]
+    index = np.minimum(windows.first[:, None] + reach, len(time) - 1)
+    return index, weight, np.where(weight, time[index] - windows.centre[:, None], 0.0)
+
+
+def unexplained(log: Log, site: Site, settings: LockinSettings) -> Array:
+    """Return the power that tones and turn leave of some windows in a row, shape (windows,) (T^2).
 
     Parameters
     ----------
-    operator : WindowOperator
-    measured_sensor : ndarray, shape (samples, 3)
-        At the operator's times (T).  Where a prediction has been taken off, the noise is measured
-        without what motion leaks beside the tones.
-
-    Returns
-    -------
-    FieldSamples
+    log : Log
+        With a waveform.
     """
-    return demodulate_with_steady(operator, measured_sensor)[0]
+    waveform, half = log.waveform, 0.5 * settings.window
+    assert waveform is not None
+    first, last = waveform.time[0] + half, waveform.time[-1] - half
+    centre = np.linspace(first, max(first, last), MOST_COMPARED)
+    begin = np.searchsorted(waveform.time, centre - half)
+    count = np.searchsorted(waveform.time, centre + half) - begin
+    rows = count > LEAST_COMPARED * np.max(count)
+    windows = Windows(np.arange(len(centre)), centre, begin, count).rows(rows)
+    imu = on_clock(log.imu, site.platform.imu.time_offset)
+    operator = window_operator(waveform, imu, site, settings, windows)
+    return operator.unexplained(waveform.measured_sensor - site.platform.magnetometer.offset)
 
 
-def demodulate_with_steady(
-    operator: WindowOperator, measured_sensor: Array
-) -> tuple[FieldSamples, SteadyFields]:
-    """Turn raw samples into phasors and the steady field beside them, each with covariance.
+def variance_growth(
+    windows: Windows, time: Array, step: float, settings: LockinSettings, frequencies_hz: Array
+) -> Array:
+    """Return how many times the variance of a window's phasors is that of a whole window.
+
+    By the conditioning of the design at the samples that are there, the worst tone.
 
     Parameters
     ----------
-    operator, measured_sensor
-        As in `demodulate`.  For the steady field the known offset, or a prediction, should have
-        been taken off: the gyro turns with the samples what does not turn with the platform.
-
-    Returns
-    -------
-    FieldSamples, SteadyFields
+    time : ndarray
+        Of all samples (s).
+    step : float
+        Between two samples of a whole window (s).
     """
-    phasor, unit, noise, constant, constant_variance = _fit_all(operator, measured_sensor)
-    centre, settings = operator.windows.centre, operator.settings
-    smooth = smoothed_over_windows(noise, centre, settings.step, settings.noise_windows)
-    samples = FieldSamples(
-        time=centre,
-        window=np.full(len(centre), settings.window),
-        channels=operator.channels,
-        phasor_sensor=phasor,
-        phasor_cov=unit[..., None, None] * smooth,
-    )
-    beside = constant_variance[:, None, None] * np.mean(smooth, axis=1)
-    return samples, SteadyFields(centre, constant, beside)
+    nuisance_hz = _nuisances_hz(settings, frequencies_hz, 0.5 / step)
 
+    def variance(elapsed: Array, weight: BoolArray) -> Array:
+        design = _design(elapsed, settings.window, frequencies_hz, nuisance_hz) * weight[..., None]
+        normal = np.swapaxes(design, -1, -2) @ design
+        good = np.linalg.cond(normal) < WORST_CONDITION
+        normal[~good] = np.eye(normal.shape[-1])
+        own = np.diagonal(np.linalg.inv(normal), axis1=-2, axis2=-1)
+        return np.where(good[:, None], own[:, 2 : 2 + 2 * len(frequencies_hz)], np.inf)
 
-def _turner(
-    time: Array, imu_time: Array, gyro_body: Array, magnetometer: Magnetometer
-) -> Callable[[IntArray, Array], Array]:
-    attitude = attitude_from_gyro(imu_time, gyro_body)
-    at_samples = attitude_at(attitude, imu_time, gyro_body, time).as_matrix()
-    mounting, matrix = magnetometer.body_from_sensor, magnetometer.matrix
-    measured_from_body = matrix @ mounting.T
-    body_from_measured = np.linalg.inv(measured_from_body)
-
-    def turn(index: IntArray, centre: Array) -> Array:
-        body_from_start = attitude_at(attitude, imu_time, gyro_body, centre).as_matrix()
-        to_centre = np.swapaxes(body_from_start, -1, -2)[:, None] @ at_samples[index]
-        return np.asarray(measured_from_body @ to_centre @ body_from_measured)
-
-    return turn
-
-
-def _fit_all(
-    operator: WindowOperator, measured: Array
-) -> tuple[ComplexArray, Array, Array, Array, Array]:
-    shape = (len(operator.windows.centre), len(operator.frequencies_hz))
-    phasor = np.empty((*shape, 3), dtype=np.complex128)
-    unit = np.empty(shape)
-    noise = np.empty((*shape, 3, 3))
-    constant, constant_variance = np.empty((shape[0], 3)), np.empty(shape[0])
-    for rows in chunks(len(operator.windows.centre)):
-        fit = fit_windows(operator, rows, measured)
-        phasor[rows], unit[rows] = fit.phasor, fit.unit_variance
-        constant[rows], constant_variance[rows] = fit.constant, fit.constant_variance
-        noise[rows] = noise_beside_tones(
-            operator.frequencies_hz,
-            operator.nuisance_hz,
-            fit.elapsed,
-            fit.weight,
-            fit.design,
-            fit.inverse,
-            fit.turned,
-        )
-    return phasor, unit, noise, constant, constant_variance
-
-
-def fit_windows(operator: WindowOperator, rows: slice, measured_sensor: Array) -> _Fit:
-    """Fit the design of some windows to a waveform, all at once."""
-    settings, f, windows = operator.settings, operator.frequencies_hz, operator.windows
-    centre, first, count = windows.centre[rows], windows.first[rows], windows.count[rows]
-    reach = np.arange(int(np.max(count)))
-    weight = reach < count[:, None]
-    index = np.minimum(first[:, None] + reach, len(operator.time) - 1)
-    elapsed = np.where(weight, operator.time[index] - centre[:, None], 0.0)
-    design = _design(elapsed, settings.window, f, operator.nuisance_hz) * weight[..., None]
-    turned = (operator.turn(index, centre) @ measured_sensor[index][..., None])[..., 0]
-    turned *= weight[..., None]
-    normal = np.swapaxes(design, -1, -2) @ design
-    inverse = np.linalg.inv(normal)
-    coefficients = inverse @ (np.swapaxes(design, -1, -2) @ turned)
-    n = len(f)
-    cosine, sine = coefficients[:, 2 : 2 + n], coefficients[:, 2 + n : 2 + 2 * n]
-    reference = np.exp(-2j * np.pi * f * centre[:, None])
-    phasor = (cosine - 1j * sine) * reference[..., None]
-    diagonal = np.einsum("nii->ni", inverse)
-    unit = 0.5 * (diagonal[:, 2 : 2 + n] + diagonal[:, 2 + n : 2 + 2 * n])
-    return _Fit(
-        phasor=phasor,
-        unit_variance=np.asarray(unit),
-        constant=np.asarray(coefficients[:, 0]),
-        constant_variance=np.asarray(diagonal[:, 0]),
-        elapsed=elapsed,
-        weight=weight,
-        design=np.asarray(design),
-        inverse=np.asarray(inverse),
-        turned=np.asarray(turned),
-    )
+    whole = np.arange(-0.5 * settings.window + 0.5 * step, 0.5 * settings.window, step)[None]
+    usual, out = variance(whole, np.ones_like(whole, dtype=bool)), []
+    for begin in range(0, len(windows), CHUNK):
+        _, weight, elapsed = _padded(windows.rows(slice(begin, begin + CHUNK)), time)
+        out.append(np.max(variance(elapsed, weight) / usual, axis=1))
+    return np.concatenate(out)
 
 
 def _design(elapsed: Array, window: float, frequencies: Array, nuisances: Array) -> Array:

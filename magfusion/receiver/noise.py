@@ -1,8 +1,36 @@
 """The noise that a window holds, measured beside the tones rather than taken from a data sheet."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from magfusion.units import Array, BoolArray
+
+
+class FittedWindows(NamedTuple):
+    """A design fitted to the samples of n windows, padded to m samples each.
+
+    Parameters
+    ----------
+    elapsed : ndarray, shape (n, m)
+        Sample times from the centre of the window (s).
+    weight : bool ndarray, shape (n, m)
+        False where a row is padding.
+    design : ndarray, shape (n, m, k)
+    inverse : ndarray, shape (n, k, k)
+        Inverse of its normal matrix.
+    field : ndarray, shape (n, m, 3)
+        Samples in axes that stand still (T).
+    coefficients : ndarray, shape (n, k, 3)
+        (T)
+    """
+
+    elapsed: Array
+    weight: BoolArray
+    design: Array
+    inverse: Array
+    field: Array
+    coefficients: Array
 
 
 def _probe_frequencies(
@@ -13,19 +41,11 @@ def _probe_frequencies(
     apart = np.abs(lines - frequencies_hz[tone])
     nearest = float(np.min(apart[apart > 0]))
     shift = min(0.5 * nearest, 2.0 / window)
-    return np.asarray(frequencies_hz[tone] + shift * np.array([-1.0, 1.0]))
+    return frequencies_hz[tone] + shift * np.array([-1.0, 1.0])
 
 
-def noise_beside_tones(
-    frequencies_hz: Array,
-    nuisance_hz: Array,
-    elapsed: Array,
-    weight: BoolArray,
-    design: Array,
-    inverse: Array,
-    turned: Array,
-) -> Array:
-    """Return the covariance per sample of the noise around each tone.
+def noise_beside_tones(frequencies_hz: Array, nuisance_hz: Array, fit: FittedWindows) -> Array:
+    """Return the covariance per sample of the noise around each tone, in the axes of the fit.
 
     Probe tones are fitted to what the design leaves of the window; the power in them, divided by
     what the design left of the probes themselves, is unbiased for white noise.
@@ -34,32 +54,23 @@ def noise_beside_tones(
     ----------
     frequencies_hz, nuisance_hz : ndarray
         Lines in the design (Hz).
-    elapsed : ndarray, shape (n, m)
-        Sample times from the centre of the window (s).
-    weight : bool ndarray, shape (n, m)
-        False where a row is padding.
-    design : ndarray, shape (n, m, k)
-    inverse : ndarray, shape (n, k, k)
-        Inverse of its normal matrix.
-    turned : ndarray, shape (n, m, 3)
-        Samples in the axes of the window's centre (T).
 
     Returns
     -------
     ndarray, shape (n, tones, 3, 3)
         (T^2)
     """
-    window = float(np.max(elapsed) - np.min(elapsed))
-    projected = np.swapaxes(design, -1, -2)
-    fitted = inverse @ (projected @ turned)
-    noise = np.empty((len(elapsed), len(frequencies_hz), 3, 3))
+    window = float(np.max(fit.elapsed) - np.min(fit.elapsed))
+    projected = np.swapaxes(fit.design, -1, -2)
+    noise = np.empty((len(fit.elapsed), len(frequencies_hz), 3, 3))
     for tone in range(len(frequencies_hz)):
         probes = _probe_frequencies(tone, frequencies_hz, nuisance_hz, window)
-        angle = 2.0 * np.pi * elapsed[..., None] * probes
-        probe = np.concatenate([np.cos(angle), np.sin(angle)], axis=-1) * weight[..., None]
+        angle = 2.0 * np.pi * fit.elapsed[..., None] * probes
+        probe = np.concatenate([np.cos(angle), np.sin(angle)], axis=-1) * fit.weight[..., None]
         mixed = projected @ probe
-        left = np.swapaxes(probe, -1, -2) @ probe - np.swapaxes(mixed, -1, -2) @ inverse @ mixed
-        power = np.swapaxes(probe, -1, -2) @ turned - np.swapaxes(mixed, -1, -2) @ fitted
+        across, removed = np.swapaxes(probe, -1, -2), np.swapaxes(mixed, -1, -2)
+        left = across @ probe - removed @ fit.inverse @ mixed
+        power = across @ fit.field - removed @ fit.coefficients
         degrees = probe.shape[-1]
         noise[:, tone] = np.swapaxes(power, -1, -2) @ np.linalg.solve(left, power) / degrees
     return noise

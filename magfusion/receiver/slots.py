@@ -6,20 +6,20 @@ samples are turned by the gyro into axes that do not turn with the body, in whic
 of a silent slot is the one of its neighbours, and back into those of the slot's own time.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.receiver.ambient import Removal, ambient_weights, removed
+from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
+from magfusion.model.site import Site, Slots
+from magfusion.receiver.admission import Windows
+from magfusion.receiver.ambient import STRETCH, Removal, ambient_weights, removed
 from magfusion.receiver.noise import smoothed_over_windows
-from magfusion.receiver.windows import LockinSettings, sample_rate_hz, usable_stretches
-from magfusion.records.samples import FieldSamples, ImuSamples, Waveform
-from magfusion.site import Site, Slots
-from magfusion.strapdown import attitude_at, attitude_from_gyro
-from magfusion.units import Array, ComplexArray, IntArray
+from magfusion.receiver.turn import turn_of
+from magfusion.receiver.windows import LockinSettings
+from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 LEAST_SAMPLES = 8  # in a slot; its noise is measured three cycles a slot beside the carrier
 LEAST_CYCLES = 1.0  # of a carrier in a slot
@@ -50,16 +50,6 @@ class SlotSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class _Stretches:
-    """The slots of a waveform that are usable; ``number`` counts on from the schedule's start."""
-
-    number: IntArray
-    first: IntArray
-    count: IntArray
-    begin: Array
-
-
-@dataclass(frozen=True, eq=False)
 class _Sums:
     """What least squares makes of each slot."""
 
@@ -69,7 +59,7 @@ class _Sums:
 
 
 def has_schedule(site: Site) -> bool:
-    """Tell whether a beacon of the site declares time slots."""
+    """Return whether a beacon of the site declares time slots."""
     return any(beacon.slots is not None for beacon in site.beacons)
 
 
@@ -111,7 +101,7 @@ def schedule(site: Site) -> Slots:
 def default_slot_settings(site: Site, mains_hz: float = 50.0) -> SlotSettings:
     """Choose how to demodulate: the ambient state for pulses, tapered carriers without it.
 
-    Beside a carrier the silent slots tell nothing and cost noise.
+    Beside a carrier the silent slots determine nothing and cost noise.
     """
     pulsed = any(np.any(beacon.tone_frequencies_hz == 0.0) for beacon in site.beacons)
     if pulsed:
@@ -120,7 +110,7 @@ def default_slot_settings(site: Site, mains_hz: float = 50.0) -> SlotSettings:
 
 
 def slot_lockin(site: Site, mains_hz: float = 50.0) -> LockinSettings:
-    """Return what stands for window and step of a site with a schedule: its slots.
+    """Return window and step for a site with a schedule: its slots.
 
     Raises
     ------
@@ -150,67 +140,69 @@ def slot_settings_of(site: Site, lockin: LockinSettings | None) -> SlotSettings:
     return default_slot_settings(site, lockin.mains_hz)
 
 
+def is_pulsed(site: Site) -> bool:
+    """Return whether the coils are driven by pulses of direct current, without a carrier."""
+    return all(np.all(beacon.tone_frequencies_hz == 0.0) for beacon in site.beacons)
+
+
+def history_of(site: Site, settings: SlotSettings) -> int:
+    """Return for how many cycles a slot tells later ones of the noise and the ambient field."""
+    return max(NOISE_CYCLES, settings.cycles * (STRETCH if is_pulsed(site) else 1))
+
+
+def driven_slots(site: Site, number: IntArray) -> BoolArray:
+    """Tell in which slots, counted on, a coil is driven."""
+    slots = schedule(site)
+    return _owners(site, slots)[number % slots.count] >= 0
+
+
 def demodulate_slots(
     waveform: Waveform,
     imu: ImuSamples,
     site: Site,
     settings: SlotSettings,
-    *,
-    gyro_bias_body: Array | None = None,
-    time_offset: float | None = None,
-) -> tuple[FieldSamples, Mapping[str, int]]:
+    windows: Windows,
+    rate_hz: float,
+) -> tuple[FieldSamples, IntArray]:
     """Turn the raw samples of a slotted tracker into one phasor for each slot.
 
     Pulses of direct current give a real phasor, the field itself.
 
     Parameters
     ----------
-    waveform : Waveform
     imu : ImuSamples
+        As from `magfusion.receiver.turn.on_clock`.
     site : Site
         Whose beacons share one schedule.
-    settings : SlotSettings
-    gyro_bias_body : ndarray, shape (3,) or (len(imu), 3), optional
-        (rad/s)
-    time_offset : float, optional
-        IMU time offset (s); the site's where it is not given.
+    windows : Windows
+        The slots that were admitted, numbered from the start of the schedule.
+    rate_hz : float
+        Usual sampling rate.
 
     Returns
     -------
     samples : FieldSamples
-        A row for each driven slot, at the mean time of its samples, with one channel.  The
-        covariance holds the noise of the slot and of what was taken off, not what hum leaves.
-    dropped : mapping
-        Reason to number of slots.
-
-    Raises
-    ------
-    InputError
-        Where the schedule does not fit the sampling rate or the settings, or no slot is usable.
+        A row for each driven slot with silent ones beside it, at the mean time of its samples, with
+        one channel.  The covariance holds the noise of the slot and of what was taken off, not what
+        hum leaves.
+    number : int ndarray, shape (n,)
+        The slot of each row.
     """
     slots = schedule(site)
-    carrier = _carriers_hz(site, slots, sample_rate_hz(waveform), settings)
-    pulsed = not np.any(carrier)
-    stretches, dropped = _stretches(waveform, imu, site, slots, pulsed=pulsed)
-    offset = site.platform.imu.time_offset if time_offset is None else time_offset
-    gyro = imu.gyro_body - (0.0 if gyro_bias_body is None else gyro_bias_body)
-    imu_time = imu.time + offset
-    attitude = attitude_from_gyro(imu_time, gyro)
-    magnetometer = site.platform.magnetometer
-    measured_from_body = magnetometer.matrix @ magnetometer.body_from_sensor.T
-    field_body = (waveform.measured_sensor - magnetometer.offset) @ np.linalg.inv(
-        measured_from_body
-    ).T
-    still = attitude_at(attitude, imu_time, gyro, waveform.time).apply(field_body)
+    carrier, pulsed = _carriers_hz(site, slots), is_pulsed(site)
+    measured_from_still = turn_of(imu, site)
+    clean = waveform.measured_sensor - site.platform.magnetometer.offset
+    turned = np.linalg.solve(measured_from_still(waveform.time), clean[..., None])
+    still = np.asarray(turned[..., 0])
 
-    place = stretches.number % slots.count
-    sums = _slot_sums(waveform.time, still, stretches, slots, carrier[place], settings)
-    noise = _noise(waveform.time, still, stretches, slots, carrier[place])
+    place = windows.number % slots.count
+    sums = _slot_sums(waveform.time, still, windows, slots, carrier[place], settings, rate_hz)
+    noise = _noise(waveform.time, still, windows, slots, carrier[place], rate_hz)
     owner = _owners(site, slots)
     driven, silent = np.flatnonzero(owner[place] >= 0), np.flatnonzero(owner[place] < 0)
     index, weight = ambient_weights(
-        stretches.number[driven],
-        stretches.number[silent],
+        windows.number[driven],
+        windows.number[silent],
         slots.count,
         settings.removal,
         cycles=settings.cycles,
@@ -218,32 +210,37 @@ def demodulate_slots(
     )
     value = removed(sums.value[driven], sums.value[silent], index, weight)
     usable = np.isfinite(value).all(axis=1)
-    if not np.any(usable):
-        raise InputError(
-            f"magnetometer: no slot of {slots.duration:g} s has silent ones beside it; record"
-            " longer, or mend the schedule"
-        )
     kept, weight = driven[usable], weight[usable]
     # Slots share what was taken off them, and no number of slots averages that out.
-    shared = 0.0 if settings.removal == "none" else 1.0 / len(np.unique(place[silent]))
+    shared = 0.0 if settings.removal == "none" else 1.0 / max(len(np.unique(place[silent])), 1)
     variance = sums.variance[kept] * (1.0 + np.maximum(np.sum(weight**2, axis=1), shared))
-    body_from_still = attitude_at(attitude, imu_time, gyro, sums.time[kept]).inv().as_matrix()
-    turn = measured_from_body @ body_from_still
+    turn = measured_from_still(sums.time[kept])
     phasor = (turn @ value[usable][..., None])[..., 0]
     found = _rows(site, slots, sums.time[kept], owner[place[kept]], phasor)
     cov = variance[:, None, None] * (turn @ noise[kept] @ np.swapaxes(turn, 1, 2))
     found.phasor_cov[np.arange(len(kept)), owner[place[kept]]] = cov
-    lost = int(np.sum(~usable))
-    return found, dict(dropped) | ({"no silent slot beside it": lost} if lost else {})
+    return found, windows.number[kept]
 
 
-def _carriers_hz(site: Site, slots: Slots, rate_hz: float, settings: SlotSettings) -> Array:
+def _carriers_hz(site: Site, slots: Slots) -> Array:
     """Return the carrier of each slot of a cycle (Hz); that of the first coil in silent ones."""
     tones = [(slot, f) for beacon in site.beacons for f, slot in beacon.tones]
     carrier = np.full(slots.count, tones[0][1])
     for slot, frequency in tones:
         assert slot is not None
         carrier[slot] = frequency
+    return carrier
+
+
+def check_carriers(site: Site, rate_hz: float, settings: SlotSettings) -> None:
+    """Refuse slots and carriers that the sampling rate or the settings do not suit.
+
+    Raises
+    ------
+    InputError
+    """
+    slots = schedule(site)
+    carrier = _carriers_hz(site, slots)
     if slots.duration * rate_hz < LEAST_SAMPLES * (1.0 - 1e-6):
         raise InputError(
             f"magnetometer: sampled at {rate_hz:.4g} Hz, too slow for slots of"
@@ -264,79 +261,51 @@ def _carriers_hz(site: Site, slots: Slots, rate_hz: float, settings: SlotSetting
     apart = settings.removal != "none"
     if apart and highest > lowest:
         raise InputError(
-            "silent slots cannot tell the ambient field at several carriers; demodulate without"
-            " them, or drive all coils at one frequency"
+            "silent slots cannot determine the ambient field at several carriers; demodulate"
+            " without them, or drive all coils at one frequency"
         )
-    if (apart or highest == 0.0) and len(tones) == slots.count:
+    if (apart or highest == 0.0) and np.all(_owners(site, slots) >= 0):
         raise InputError(
-            f"all {slots.count} time slots are driven and none tells the ambient field; leave one"
-            " silent, or drive the coils with a carrier"
+            f"all {slots.count} time slots are driven and none determines the ambient field; leave"
+            " one silent, or drive the coils with a carrier"
         )
-    return carrier
 
 
-def _stretches(
-    waveform: Waveform, imu: ImuSamples, site: Site, slots: Slots, *, pulsed: bool
-) -> tuple[_Stretches, Mapping[str, int]]:
-    rate = sample_rate_hz(waveform)
-    running = slots.running(waveform.time)
-    first = np.flatnonzero(np.diff(running, prepend=running[0] - 1))
-    count = np.diff(first, append=len(running))
-    number = running[first]
-    begin = slots.start + slots.duration * number.astype(np.float64)
-    # The plateau of a pulse is no saturation.
-    usable, dropped = usable_stretches(
-        waveform,
-        imu,
-        site,
-        (begin - 0.5 / rate, begin + slots.duration - 0.5 / rate),
-        count,
-        0.9 * slots.duration * rate,
-        clips=not pulsed,
-    )
-    if not np.any(usable):
-        told = "; ".join(f"{k}: {v}" for k, v in dropped.items()) or "the log is too short"
-        raise InputError(
-            f"magnetometer: no slot of {slots.duration:g} s is usable ({told}); record longer"
-        )
-    found = _Stretches(number[usable], first[usable], count[usable], begin[usable])
-    return found, dropped
-
-
-def _samples_of(stretches: _Stretches) -> tuple[IntArray, IntArray, IntArray]:
+def _samples_of(windows: Windows) -> tuple[IntArray, IntArray, IntArray]:
     """Return all samples in slots, the slot of each, and where each slot begins among them."""
-    owner = np.repeat(np.arange(len(stretches.count)), stretches.count)
-    begins = np.concatenate([[0], np.cumsum(stretches.count)[:-1]])
-    sample = np.arange(len(owner)) - begins[owner] + stretches.first[owner]
+    owner = np.repeat(np.arange(len(windows.count)), windows.count)
+    begins = np.concatenate([[0], np.cumsum(windows.count)[:-1]])
+    sample = np.arange(len(owner)) - begins[owner] + windows.first[owner]
     return sample, owner, begins
 
 
 def _hann(time: Array, begin: Array, slots: Slots, rate_hz: float) -> Array:
-    return np.asarray(1.0 - np.cos(2.0 * np.pi * (time - begin + 0.5 / rate_hz) / slots.duration))
+    return 1.0 - np.cos(2.0 * np.pi * (time - begin + 0.5 / rate_hz) / slots.duration)
 
 
 def _slot_sums(
     time: Array,
     still: Array,
-    stretches: _Stretches,
+    windows: Windows,
     slots: Slots,
     carrier_hz: Array,
     settings: SlotSettings,
+    rate_hz: float,
 ) -> _Sums:
     """Fit a constant, and beside a carrier its two quadratures, to each slot."""
-    sample, owner, begins = _samples_of(stretches)
-    rate = 1.0 / float(np.median(np.diff(time)))
-    begin, at = stretches.begin[owner], time[sample]
+    sample, owner, begins = _samples_of(windows)
+    slot_begin = windows.centre - 0.5 * slots.duration
+    begin, at = slot_begin[owner], time[sample]
     weight = np.ones(len(at))
     if settings.taper == "hann":
-        weight = _hann(at, begin, slots, rate)
+        weight = _hann(at, begin, slots, rate_hz)
     columns = [np.ones(len(at))]
     if np.any(carrier_hz):
         angle = 2.0 * np.pi * carrier_hz[owner] * (at - begin)
         columns += [np.cos(angle), np.sin(angle)]
 
     def total(values: Array) -> Array:
-        return np.asarray(np.add.reduceat(values, begins, axis=0))
+        return np.add.reduceat(values, begins, axis=0)
 
     size = len(columns)
     normal, spread = np.empty((2, len(begins), size, size))
@@ -352,34 +321,33 @@ def _slot_sums(
     centre = total(weight * at) / total(weight)
     if size == 1:
         return _Sums(centre, fitted[:, 0].astype(np.complex128), cov[:, 0, 0])
-    reference = np.exp(-2j * np.pi * carrier_hz * stretches.begin)
+    reference = np.exp(-2j * np.pi * carrier_hz * slot_begin)
     value = (fitted[:, 1] - 1j * fitted[:, 2]) * reference[:, None]
     return _Sums(centre, value, 0.5 * (cov[:, 1, 1] + cov[:, 2, 2]))
 
 
 def _noise(
-    time: Array, still: Array, stretches: _Stretches, slots: Slots, carrier_hz: Array
+    time: Array, still: Array, windows: Windows, slots: Slots, carrier_hz: Array, rate_hz: float
 ) -> Array:
     """Return the covariance per sample of the noise beside the carrier, (n, 3, 3), still axes.
 
     It is the power three cycles a slot away, tapered so that neither carrier nor hum leaks there.
     """
-    sample, owner, begins = _samples_of(stretches)
-    rate = 1.0 / float(np.median(np.diff(time)))
-    at = time[sample] - stretches.begin[owner]
-    weight = _hann(time[sample], stretches.begin[owner], slots, rate)
+    sample, owner, begins = _samples_of(windows)
+    slot_begin = windows.centre - 0.5 * slots.duration
+    at = time[sample] - slot_begin[owner]
+    weight = _hann(time[sample], slot_begin[owner], slots, rate_hz)
     away = 3.0 / slots.duration
-    above = carrier_hz + away < 0.5 * rate
+    above = carrier_hz + away < 0.5 * rate_hz
     probe = np.where(above, carrier_hz + away, carrier_hz - away)
     turned = weight * np.exp(-2j * np.pi * probe[owner] * at)
     seen = np.add.reduceat(turned[:, None] * still[sample], begins, axis=0)
     power = np.add.reduceat(weight**2, begins)
     cov = np.einsum("nx,ny->nxy", seen, np.conj(seen)).real / power[:, None, None]
-    centre = stretches.begin + 0.5 * slots.duration
     number = NOISE_CYCLES * slots.count
-    smooth = smoothed_over_windows(cov[:, None], centre, slots.cycle, number)[:, 0]
+    smooth = smoothed_over_windows(cov[:, None], windows.centre, slots.cycle, number)[:, 0]
     least = 1e-12 * np.max(np.abs(still))
-    return np.asarray(smooth + least**2 * np.eye(3))
+    return smooth + least**2 * np.eye(3)
 
 
 def _owners(site: Site, slots: Slots) -> IntArray:

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.site import (
+from magfusion.model.site import (
     Beacon,
     BeaconSigma,
     Coil,

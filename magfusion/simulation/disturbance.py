@@ -6,7 +6,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from magfusion.errors import InputError
-from magfusion.physics.disturbance import induced_field, sphere_polarizability
+from magfusion.model.physics.disturbance import induced_field, sphere_polarizability
 from magfusion.units import Array, ComplexArray
 
 DAY = 86_400.0  # s
@@ -98,8 +98,6 @@ def draw_spheres(
 
     Parameters
     ----------
-    rng : Generator
-    count : int
     box_world : ndarray, shape (2, 3)
         Lower and upper corner (m) of where the body moves.
     beacons_world : ndarray, shape (beacons, 3)
@@ -139,7 +137,7 @@ def draw_spheres(
 def _farther(point: Array, others: Array, least: Array) -> np.ndarray:
     """Tell which points are farther from all others than the least distance of each."""
     between = np.linalg.norm(point[:, None] - others, axis=-1)
-    return np.asarray((between > least).all(axis=1))
+    return (between > least).all(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +162,7 @@ class SmoothField:
     def __call__(self, place: Array) -> Array:
         """Return the functions' values, shape (n, functions), at places (n, dimension)."""
         angle = place @ self.wave.T
-        return np.asarray(np.cos(angle) @ self.cosine + np.sin(angle) @ self.sine)
+        return np.cos(angle) @ self.cosine + np.sin(angle) @ self.sine
 
 
 def draw_smooth(
@@ -174,12 +172,10 @@ def draw_smooth(
 
     Parameters
     ----------
-    rng : Generator
     rms : float
         Of each function's value at a place, over draws.
     length : float
         Of correlation, in the unit of the places.
-    functions, dimension : int
     """
     wave = rng.standard_normal((_FEATURES, dimension)) / length
     amplitude = rng.standard_normal((2, _FEATURES, functions)) * rms / np.sqrt(_FEATURES)
@@ -205,7 +201,7 @@ class DayNight:
     def density(self, time: Array) -> Array:
         """Return the one-sided density (T/sqrt(Hz)) at the times, shape (n,)."""
         share = 0.5 + 0.5 * np.cos(2.0 * np.pi * (time - self.loudest_time) / DAY)
-        return np.asarray(self.night + (self.day - self.night) * share)
+        return self.night + (self.day - self.night) * share
 
 
 @dataclass(frozen=True)
@@ -226,14 +222,7 @@ class FieldDrift:
 
 @dataclass(frozen=True, eq=False)
 class Ambient:
-    """Everything in the room beside beacons, Earth and mains; what is None is not there.
-
-    Parameters
-    ----------
-    spheres : Spheres, optional
-    day_night : DayNight, optional
-    drift : FieldDrift, optional
-    """
+    """Everything in the room beside beacons, Earth and mains; what is None is not there."""
 
     spheres: Spheres | None = None
     day_night: DayNight | None = None
@@ -246,8 +235,6 @@ class Ambient:
         ----------
         time : ndarray, shape (n,)
             (s)
-        rate_hz : float
-        rng : Generator
 
         Returns
         -------
@@ -270,4 +257,4 @@ def _drift_world(drift: FieldDrift, time: Array, rng: np.random.Generator) -> Ar
     knots = np.linspace(time[0], time[-1], 4 + int(np.ceil(50.0 * span / drift.time)))
     if len(knots) >= len(time):
         return smooth(time[:, None])
-    return np.asarray(CubicSpline(knots, smooth(knots[:, None]))(time))
+    return CubicSpline(knots, smooth(knots[:, None]))(time)

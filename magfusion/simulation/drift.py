@@ -33,7 +33,7 @@ class WarmUp:
 
     def temperature(self, time: Array) -> Array:
         """Return the temperature above that of the epoch (K) at times since then (s)."""
-        return np.asarray(-self.rise * np.expm1(-time / self.time_constant))
+        return -self.rise * np.expm1(-time / self.time_constant)
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class DailySwing:
     def temperature(self, time: Array) -> Array:
         """Return the temperature above the day's mean (K) at times (s)."""
         turns = (time - self.warmest_time) / DAY
-        return np.asarray(self.amplitude * np.cos(2.0 * np.pi * turns))
+        return self.amplitude * np.cos(2.0 * np.pi * turns)
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,6 @@ class Wander:
         ----------
         time : ndarray, shape (n,)
             Increasing (s).
-        functions : int
-        rng : Generator
 
         Returns
         -------
@@ -118,7 +116,6 @@ class Clock:
         ----------
         time : ndarray, shape (n,)
             Seconds since the log's epoch, increasing.
-        rng : Generator
 
         Raises
         ------
@@ -129,7 +126,7 @@ class Clock:
         if np.any(elapsed < 0.0):
             raise ValueError("times must increase from the log's epoch")
         steps = self.walk * np.sqrt(elapsed) * rng.standard_normal(len(time))
-        return np.asarray(self.rate * time + np.cumsum(steps))
+        return self.rate * time + np.cumsum(steps)
 
 
 @dataclass(frozen=True)
@@ -181,7 +178,7 @@ class DriftSeries:
 
     def phase(self, frequencies_hz: Array) -> Array:
         """Return the drive phase beyond what is declared (rad), shape (n, tones)."""
-        return np.asarray(2.0 * np.pi * self.lead[:, None] * frequencies_hz)
+        return 2.0 * np.pi * self.lead[:, None] * frequencies_hz
 
 
 def draw_drift(drift: Drift, time: Array, beacons: int, rng: np.random.Generator) -> DriftSeries:
@@ -189,10 +186,8 @@ def draw_drift(drift: Drift, time: Array, beacons: int, rng: np.random.Generator
 
     Parameters
     ----------
-    drift : Drift
     time : ndarray, shape (n,)
         Seconds since the log's epoch, increasing.
-    beacons : int
     rng : Generator
         Gains and clock have generators of their own, spawned from it, so that runs which differ in
         one of them share the other.

@@ -10,7 +10,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 from magfusion.errors import InputError
-from magfusion.records.samples import FieldSamples, ImuSamples
+from magfusion.model.samples import FieldSamples, ImuSamples
+from magfusion.model.site import ImuModel, Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD
 from magfusion.simulation.disturbance import DayNight
 from magfusion.simulation.drift import (
@@ -23,10 +25,8 @@ from magfusion.simulation.drift import (
     draw_drift,
 )
 from magfusion.simulation.inertial import BiasInstability
-from magfusion.simulation.log import draw_drives, perturb_site, simulate_fields
+from magfusion.simulation.log import draw_drives, interpolate, perturb_site, simulate_fields
 from magfusion.simulation.motion import Motion, Rests, random_walk_motion
-from magfusion.site import ImuModel, Site
-from magfusion.trajectory import Trajectory
 from magfusion.units import NANOTESLA, Array, BoolArray, ComplexArray
 
 BLOCK = 60.0  # s
@@ -67,7 +67,6 @@ class EnduranceConfig:
 
     Parameters
     ----------
-    hours : float
     drift : Drift
         Of moments and sensor, and of the clock that all drives have in common; beacons that are not
         synchronised part from it besides, each at a rate of its own.
@@ -77,7 +76,6 @@ class EnduranceConfig:
         Where the platform goes (m).
     speed : float
         (m/s)
-    imu_rate_hz : float
     instability : BiasInstability, optional
         Of the IMU, beside its bias walk.
     noise : DayNight
@@ -122,7 +120,7 @@ class EnduranceConfig:
         cycle = rests.move + rests.pause
         since = (time - rests.start + MARGIN) % cycle
         walks = time >= rests.start - MARGIN
-        return np.asarray(walks & (since <= rests.move + 2.0 * MARGIN))
+        return walks & (since <= rests.move + 2.0 * MARGIN)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,8 +142,6 @@ class Stretch:
     ----------
     first : int
         First block.
-    imu : ImuSamples
-    fields : FieldSamples
     gyro_bias_body, accel_bias_body : ndarray, shape (n, 3)
         At the inertial samples (rad/s, m/s^2).
     after : Biases
@@ -166,11 +162,8 @@ class World:
 
     Parameters
     ----------
-    config : EnduranceConfig
     site : Site
         As the estimator knows it.
-    true_site : Site
-    motion : Motion
     log_gain : ndarray, shape (blocks + 1, beacons)
         Of the moments, at the blocks' edges.
     phase : ndarray, shape (blocks + 1, channels)
@@ -221,7 +214,7 @@ class World:
         return Stretch(
             first=first,
             imu=ImuSamples(time, gyro, accel),
-            fields=_joined(fields),
+            fields=FieldSamples.joined(fields),
             gyro_bias_body=gyro_bias,
             accel_bias_body=accel_bias,
             after=before,
@@ -229,13 +222,12 @@ class World:
 
     def truth(self, stretch: Stretch, time: Array) -> Trajectory:
         """Return what was true at times within a stretch."""
-        biases = (
-            np.stack([np.interp(time, stretch.imu.time, axis) for axis in stream.T], axis=1)
-            for stream in (stretch.gyro_bias_body, stretch.accel_bias_body)
+        known = stretch.imu.time
+        return replace(
+            self.motion.trajectory(time),
+            gyro_bias_body=interpolate(time, known, stretch.gyro_bias_body),
+            accel_bias_body=interpolate(time, known, stretch.accel_bias_body),
         )
-        gyro_bias, accel_bias = biases
-        poses = self.motion.trajectory(time)
-        return replace(poses, gyro_bias_body=gyro_bias, accel_bias_body=accel_bias)
 
     def _inertial(
         self, block: int, before: Biases
@@ -302,11 +294,10 @@ class World:
     def _field_times(self, block: int) -> Array:
         config = self.config
         count = round(BLOCK / config.walk_interval)
-        within = np.arange(count, dtype=float) * config.walk_interval
-        often = block * BLOCK + within
+        often = block * BLOCK + np.arange(count, dtype=float) * config.walk_interval
         every = round(config.rest_interval / config.walk_interval)
         seldom = np.arange(len(often)) % every == 0
-        return np.asarray(often[config.active(often) | seldom])
+        return often[config.active(often) | seldom]
 
 
 def draw_endurance(site: Site, config: EnduranceConfig, seed: tuple[int, ...]) -> World:
@@ -316,7 +307,6 @@ def draw_endurance(site: Site, config: EnduranceConfig, seed: tuple[int, ...]) -
     ----------
     site : Site
         As the estimator knows it; the true calibration is drawn from its sigmas.
-    config : EnduranceConfig
     seed : tuple of int
 
     Raises
@@ -365,7 +355,7 @@ def _wander_sigma(instability: BiasInstability | None) -> Array:
     """Return the standard deviation of the Gauss-Markov parts, (2, 1)."""
     if instability is None:
         return np.zeros((2, 1))
-    return np.asarray(instability.sigma[:, None])
+    return instability.sigma[:, None]
 
 
 def _carried_on(
@@ -392,14 +382,4 @@ def _carried_on(
 
 def _between(known: Array, share: Array) -> Array:
     after = share[:, None]
-    return np.asarray((1.0 - after) * known[0] + after * known[1])
-
-
-def _joined(parts: list[FieldSamples]) -> FieldSamples:
-    return FieldSamples(
-        time=np.concatenate([p.time for p in parts]),
-        window=np.concatenate([p.window for p in parts]),
-        channels=parts[0].channels,
-        phasor_sensor=np.concatenate([p.phasor_sensor for p in parts]),
-        phasor_cov=np.concatenate([p.phasor_cov for p in parts]),
-    )
+    return (1.0 - after) * known[0] + after * known[1]

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.physics.solenoid import solenoid_field
+from magfusion.model.physics.solenoid import solenoid_field
+from magfusion.model.site import Beacon, Coil, Site
 from magfusion.simulation.disturbance import Spheres
-from magfusion.site import Beacon, Coil, Site
 from magfusion.units import Array, ComplexArray
 
 
@@ -34,13 +34,12 @@ def synchronised_drives(site: Site) -> Drives:
 def coil_field(offset: Array, coil: Coil) -> Array:
     """Return the flux density of a coil at its peak current, in the axes of its arguments.
 
-    See `magfusion.physics.solenoid.solenoid_field` for the shapes and their accuracy.
+    See `magfusion.model.physics.solenoid.solenoid_field` for the shapes and their accuracy.
 
     Parameters
     ----------
     offset : ndarray, shape (n, 3)
         From the beacon's origin (m).
-    coil : Coil
 
     Returns
     -------
@@ -54,7 +53,7 @@ def beacon_fields_world(beacon: Beacon, point_world: Array) -> Array:
     """Return the field of each coil at its peak current (T), shape (n, coils, 3)."""
     offset_beacon = (point_world - beacon.position_world) @ beacon.world_from_beacon
     fields_beacon = np.stack([coil_field(offset_beacon, coil) for coil in beacon.coils], axis=1)
-    return np.asarray(fields_beacon @ beacon.world_from_beacon.T)
+    return fields_beacon @ beacon.world_from_beacon.T
 
 
 def phasors_world(

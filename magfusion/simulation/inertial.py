@@ -7,9 +7,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 from magfusion.errors import InputError
-from magfusion.records.samples import ImuSamples
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import ImuModel
 from magfusion.simulation.motion import Motion
-from magfusion.site import ImuModel
 from magfusion.units import Array
 
 # A first-order Gauss-Markov process of standard deviation s and correlation time T has its largest
@@ -72,15 +72,12 @@ def simulate_imu(
 
     Parameters
     ----------
-    motion : Motion
     imu : ImuModel
         Its noise; its ``time_offset`` is not used.
     gravity : float
         (m/s^2)
-    rate_hz : float
     duration : float
         (s); stamps run from 0 to less than this.
-    rng : Generator
     time_offset : float
         The sample stamped t is taken at t + time_offset on the log's clock (s).
     instability : BiasInstability, optional
@@ -117,11 +114,11 @@ def _bias_walk(
     """Return a random walk from a random start, shape (count, 3)."""
     steps = rng.normal(0.0, walk / np.sqrt(rate_hz), (count, 3))
     steps[0] = rng.normal(0.0, initial_sigma, 3)
-    return np.asarray(np.cumsum(steps, axis=0))
+    return np.cumsum(steps, axis=0)
 
 
 def _instability(rng: np.random.Generator, count: int, sigma: float, decay: float) -> Array:
     """Return a stationary first-order Gauss-Markov process, shape (count, 3)."""
     drive = rng.normal(0.0, sigma * np.sqrt(1.0 - decay**2), (count, 3))
     drive[0] = rng.normal(0.0, sigma, 3)
-    return np.asarray(lfilter([1.0], [1.0, -decay], drive, axis=0))
+    return lfilter([1.0], [1.0, -decay], drive, axis=0)

@@ -8,10 +8,12 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.correlation import Correlation, Parameter
 from magfusion.errors import InputError
-from magfusion.physics.earth import earth_field_world
-from magfusion.records.samples import FieldSamples, Log
+from magfusion.model.correlation import Component, Correlation
+from magfusion.model.physics.earth import earth_field_world
+from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.site import Beacon, Magnetometer, Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.disturbance import Ambient, Spheres, draw_spheres
 from magfusion.simulation.field import Drives, phasors_world, synchronised_drives
 from magfusion.simulation.inertial import BiasInstability, simulate_imu
@@ -23,12 +25,9 @@ from magfusion.simulation.motion import (
     turning_motion,
 )
 from magfusion.simulation.waveform import Mains, simulate_waveform
-from magfusion.site import Beacon, Magnetometer, Site
-from magfusion.trajectory import Trajectory
 from magfusion.units import Array
 
 Draw = Callable[[str, str, str, Array], Array]
-DRIFT_SIGMA = 2e-5  # relative; ordinary crystal oscillators
 EPOCH_NS = 1_700_000_000_000_000_000
 
 MotionKind = Literal["walk", "turn", "static"]
@@ -47,7 +46,6 @@ class SimulationConfig:
     motion : {"walk", "turn", "static"}
     speed : float
         Mean speed while moving (m/s), about.
-    rests : Rests
     imu_rate_hz, magnetometer_rate_hz : float
         The latter more than 2.5 times the highest tone.
     time_offset : float, optional
@@ -56,7 +54,6 @@ class SimulationConfig:
         Whether the true calibration is drawn from the site's prior, or is as declared.
     noise_scale : float
         True white noise of all instruments, relative to the declared.
-    mains : Mains, optional
     quantisation : float, optional
         Step of the magnetometer (T).
     instability : BiasInstability, optional
@@ -158,8 +155,8 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
     taken = stamp + true_site.platform.imu.time_offset
     truth = replace(
         motion.trajectory(stamp),
-        gyro_bias_body=_interpolate(stamp, taken, imu.gyro_bias_body),
-        accel_bias_body=_interpolate(stamp, taken, imu.accel_bias_body),
+        gyro_bias_body=interpolate(stamp, taken, imu.gyro_bias_body),
+        accel_bias_body=interpolate(stamp, taken, imu.accel_bias_body),
     )
     log = Log(
         name=f"simulated_{config.motion}",
@@ -191,17 +188,12 @@ def simulate_fields(
         One epoch each (time and pose).
     sigma : float
         Standard deviation of each component's real, and imaginary, part (T).
-    rng : Generator
     drives : Drives, optional
         As the site declares where there is none.
     window : float
-        Length that the samples claim (s); the field is that of the instant.
+        Length that the samples declare (s); the field is that of the instant.
     spheres : Spheres, optional
         Iron in the room.
-
-    Returns
-    -------
-    FieldSamples
     """
     drives = drives or synchronised_drives(site)
     time = trajectory.time
@@ -246,12 +238,12 @@ def draw_drives(site: Site, rng: np.random.Generator) -> Drives:
     free = np.array([not beacon.synchronised for beacon in site.beacons], dtype=bool)
     tones = [len(beacon.tones) for beacon in site.beacons]
     phase = rng.uniform(-np.pi, np.pi, sum(tones)) * np.repeat(free, tones)
-    return Drives(phase, rng.normal(0.0, DRIFT_SIGMA, len(free)) * free)
+    return Drives(phase, rng.normal(0.0, site.clock.drift_sigma, len(free)) * free)
 
 
 def _draws(correlation: Correlation | None, rng: np.random.Generator) -> Draw:
     """Return a function that draws the error of a parameter, in unison with its relatives."""
-    own: dict[Parameter, float] = {}
+    own: dict[Component, float] = {}
     if correlation is not None:
         unit = rng.standard_normal(len(correlation.parameters))
         drawn = np.linalg.cholesky(correlation.coefficients) @ unit
@@ -260,7 +252,7 @@ def _draws(correlation: Correlation | None, rng: np.random.Generator) -> Draw:
     def draw(group: str, owner: str, kind: str, sigma: Array) -> Array:
         error = rng.normal(0.0, sigma)
         for i, at in enumerate(np.ndindex(sigma.shape)):
-            known = own.get(Parameter(group, owner, kind, i))
+            known = own.get(Component(group, owner, kind, i))
             error[at] = error[at] if known is None else sigma[at] * known
         return error
 
@@ -343,5 +335,6 @@ def _motion(config: SimulationConfig, rng: np.random.Generator) -> Motion:
     raise InputError(f"motion: found {config.motion!r}; give walk, turn or static")
 
 
-def _interpolate(time: Array, known_time: Array, values: Array) -> Array:
+def interpolate(time: Array, known_time: Array, values: Array) -> Array:
+    """Return columns of values (n, k) at other times."""
     return np.column_stack([np.interp(time, known_time, column) for column in values.T])

@@ -12,7 +12,7 @@ from scipy.interpolate import BPoly, BSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from magfusion.errors import InputError
-from magfusion.trajectory import Trajectory
+from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
 ATTITUDE_KNOT = 1.0  # s of moving
@@ -22,7 +22,7 @@ _DEGREE = 5
 
 @dataclass(frozen=True)
 class Rests:
-    """When a motion stands still (s): first ``start``, then ``pause`` after every ``move``."""
+    """When a motion is at rest (s): first ``start``, then ``pause`` after every ``move``."""
 
     start: float = 5.0
     move: float = 20.0
@@ -58,28 +58,28 @@ class Motion:
 
     def position_world(self, time: Array) -> Array:
         """Return the body's position (m), shape (n, 3)."""
-        return np.asarray(self.position(self._progress(time)[0]))
+        return self.position(self._progress(time)[0])
 
     def velocity_world(self, time: Array) -> Array:
         """Return the body's velocity (m/s), shape (n, 3)."""
         parameter, rate, _ = self._progress(time)
-        return np.asarray(self.position(parameter, nu=1) * rate)
+        return self.position(parameter, nu=1) * rate
 
     def acceleration_world(self, time: Array) -> Array:
         """Return the body's acceleration (m/s^2), shape (n, 3)."""
         parameter, rate, change = self._progress(time)
         curvature = self.position(parameter, nu=2) * rate**2
-        return np.asarray(curvature + self.position(parameter, nu=1) * change)
+        return curvature + self.position(parameter, nu=1) * change
 
     def rate_body(self, time: Array) -> Array:
         """Return the angular rate (rad/s), shape (n, 3)."""
         parameter, rate, _ = self._progress(time)
-        return np.asarray(self.attitude(parameter, 1) * rate)
+        return self.attitude(parameter, 1) * rate
 
     def specific_force_body(self, time: Array, gravity: float) -> Array:
         """Return what an ideal accelerometer measures (m/s^2), shape (n, 3)."""
         force_world = self.acceleration_world(time) + np.array([0.0, 0.0, gravity])
-        return np.asarray(self.world_from_body(time).inv().apply(force_world))
+        return self.world_from_body(time).inv().apply(force_world)
 
     def trajectory(self, time: Array) -> Trajectory:
         """Return poses and velocities at the times, shape (n,)."""
@@ -104,7 +104,6 @@ def random_walk_motion(
 
     Parameters
     ----------
-    rng : Generator
     duration : float
         (s)
     box_world : ndarray, shape (2, 3)
@@ -115,16 +114,13 @@ def random_walk_motion(
         Of the angle between the body's z axis and the vertical (rad), about.
     heading_rate_rms : float
         (rad/s), about.
-    rests : Rests, optional
 
     Raises
     ------
     InputError
         If the box, the duration or the speed cannot be.
     """
-    rate = _rate(duration, rests or Rests())
-    moving = _moving(rate)
-    knots = _attitude_knots(moving)
+    rate, moving, knots = _progress(duration, rests or Rests())
     tilt = rng.normal(0.0, tilt_rms / np.sqrt(2.0), (len(knots), 3)) * [1.0, 1.0, 0.0]
     steps = rng.normal(0.0, heading_rate_rms * ATTITUDE_KNOT, len(knots))
     heading = rng.uniform(-np.pi, np.pi) + np.cumsum(steps)
@@ -155,9 +151,7 @@ def turning_motion(
     InputError
         If the box, the duration or the speed cannot be.
     """
-    rate = _rate(duration, rests or Rests())
-    moving = _moving(rate)
-    knots = _attitude_knots(moving)
+    rate, moving, knots = _progress(duration, rests or Rests())
     attitudes = [Rotation.random(rng=rng)]
     for step in rng.normal(0.0, rate_rms * ATTITUDE_KNOT / np.sqrt(3.0), (len(knots) - 1, 3)):
         attitudes.append(attitudes[-1] * Rotation.from_rotvec(step))
@@ -166,7 +160,7 @@ def turning_motion(
 
 
 def static_motion(position_world: Array, world_from_body: Rotation) -> Motion:
-    """Return a body that stands still for ever."""
+    """Return a body that is always at rest."""
     still = BSpline(np.array([0.0, 1.0]), np.asarray(position_world, dtype=float)[None], 0)
     attitude = RotationSpline([0.0, 1.0], Rotation.concatenate([world_from_body] * 2))
     return Motion(still, attitude, BPoly(np.zeros((1, 1)), np.array([0.0, 1.0])))
@@ -195,13 +189,11 @@ def _rate(duration: float, rests: Rests) -> BPoly:
     return BPoly.from_derivatives(knots, [[value, 0.0, 0.0] for value in values])
 
 
-def _moving(rate: BPoly) -> float:
-    """Return the path parameter at the end: the seconds of moving."""
-    return float(rate.integrate(rate.x[0], rate.x[-1]))
-
-
-def _attitude_knots(moving: float) -> Array:
-    return np.arange(np.ceil(moving / ATTITUDE_KNOT) + 2) * ATTITUDE_KNOT
+def _progress(duration: float, rests: Rests) -> tuple[BPoly, float, Array]:
+    """Return the rate of progress, the seconds of moving, and the knots of attitude over them."""
+    rate = _rate(duration, rests)
+    moving = float(rate.integrate(rate.x[0], rate.x[-1]))
+    return rate, moving, np.arange(np.ceil(moving / ATTITUDE_KNOT) + 2) * ATTITUDE_KNOT
 
 
 def _path_in_box(

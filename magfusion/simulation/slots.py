@@ -3,7 +3,7 @@
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.site import Beacon
+from magfusion.model.site import Beacon
 from magfusion.units import Array
 
 LEAST_SAMPLES_PER_SLOT = 4

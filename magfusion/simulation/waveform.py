@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.records.samples import Waveform
+from magfusion.model.samples import Waveform
+from magfusion.model.site import Site
 from magfusion.simulation.disturbance import Ambient, Spheres
 from magfusion.simulation.field import Drives, phasors_world
 from magfusion.simulation.motion import Motion
 from magfusion.simulation.slots import check_slots, slot_gates
-from magfusion.site import Site
 from magfusion.units import Array
 
 LEAST_SAMPLES_PER_CYCLE = 2.5
@@ -28,7 +28,6 @@ class Mains:
     ----------
     amplitude : float
         Of the fundamental (T).
-    frequency_hz : float
     harmonics : tuple of float
         Amplitude of the second, third, ... harmonic relative to the fundamental.
     direction_world : ndarray, shape (3,)
@@ -55,15 +54,12 @@ def simulate_waveform(
 
     Parameters
     ----------
-    motion : Motion
     site : Site
         The true one.  Its Earth field is none where it is not declared.
-    drives : Drives
     rate_hz : float
         More than 2.5 samples in the fastest cycle.
     duration : float
         (s)
-    rng : Generator
     mains : Mains, optional
         Its phases are drawn.  Harmonics beyond half the rate alias, as in an instrument that
         does not filter.
@@ -138,4 +134,4 @@ def _mains_world(mains: Mains, time: Array, rng: np.random.Generator) -> Array:
     orders = 1 + np.arange(len(amplitudes))
     angles = 2.0 * np.pi * mains.frequency_hz * time[:, None] * orders + phases
     direction = mains.direction_world / np.linalg.norm(mains.direction_world)
-    return np.asarray((np.cos(angles) @ amplitudes)[:, None] * direction)
+    return (np.cos(angles) @ amplitudes)[:, None] * direction

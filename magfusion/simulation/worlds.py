@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.records.samples import FieldSamples
-from magfusion.records.survey import Survey
+from magfusion.files.survey import Survey
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Beacon, BeaconSigma, Coil, MagnetometerSigma, Platform, Site
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.disturbance import SmoothField, Spheres, draw_smooth, draw_spheres
 from magfusion.simulation.field import phasors_world
-from magfusion.site import Beacon, BeaconSigma, Coil, MagnetometerSigma, Platform, Site
 from magfusion.units import NANOTESLA, Array, ComplexArray
 
 MOMENT = 65.0  # A m^2, peak: paper 004's lines where their amplitude is the root mean square
@@ -102,7 +102,6 @@ class Receiver:
         In an epoch.
     quantisation : float
         Step of the instrument (T), far below the noise, so that its error is white as well.
-    rate_hz : float
     """
 
     sample_sigma: float = 3.0 * NANOTESLA
@@ -123,7 +122,6 @@ class Scenario:
 
     Parameters
     ----------
-    name : str
     gain_rms, gain_length : float
         Smooth random logarithm of each beacon's gain, and its correlation length (m).
     matrix_rms, matrix_length : float
@@ -187,9 +185,6 @@ class World:
     ----------
     site : Site
         What an estimator may know.
-    layout : Layout
-    scenario : Scenario
-    receiver : Receiver
     true_beacons : tuple of Beacon
         With their sizes.
     log_gain : SmoothField
@@ -200,7 +195,6 @@ class World:
         Error of the intercept of each beacon's amplitude line (natural logarithm): what changed
         between the campaign in which the lines were fitted and this one.  No measurement of this
         world holds it; a method by lines adds it to its intercepts.
-    spheres : Spheres, optional
     """
 
     site: Site
@@ -221,7 +215,7 @@ class World:
         matrix = np.eye(3) + self.matrix(position_world).reshape(n, count, 3, 3)
         undisturbed = np.concatenate(fields, axis=1)
         bent = (matrix @ undisturbed[..., None])[..., 0]
-        return np.asarray(gain[..., None] * bent)
+        return gain[..., None] * bent
 
     def measure(
         self, position_world: Array, world_from_body: Array, rng: np.random.Generator
@@ -233,7 +227,6 @@ class World:
         position_world : ndarray, shape (n, 3)
             (m)
         world_from_body : ndarray, shape (n, 3, 3) or (3, 3)
-        rng : Generator
         """
         n, count = len(position_world), len(self.true_beacons)
         turn = np.broadcast_to(world_from_body, (n, 3, 3))
@@ -254,17 +247,16 @@ class World:
 
         Parameters
         ----------
-        rng : Generator
         position_sigma : float
-            By how much each axis of the true places misses the grid points that it claims (m).
+            Standard deviation of the true places about the grid points, each axis (m).
         """
-        claimed_world = self.layout.grid_world()
-        true_world = claimed_world + position_sigma * rng.standard_normal(claimed_world.shape)
-        level = np.tile(np.eye(3), (len(claimed_world), 1, 1))
+        grid_world = self.layout.grid_world()
+        true_world = grid_world + position_sigma * rng.standard_normal(grid_world.shape)
+        level = np.tile(np.eye(3), (len(grid_world), 1, 1))
         samples = self.measure(true_world, level, rng)
         return Survey(
-            point=np.arange(len(claimed_world)),
-            position_world=claimed_world,
+            point=np.arange(len(grid_world)),
+            position_world=grid_world,
             world_from_body=level,
             channels=samples.channels,
             sigma=np.sqrt(samples.phasor_cov[..., 0, 0]),
@@ -283,11 +275,8 @@ def draw_world(
 
     Parameters
     ----------
-    scenario : Scenario
     rng : Generator
         Gain, matrix, line bias and spheres have generators of their own, spawned from it.
-    layout : Layout
-    receiver : Receiver, optional
     model_error : float
         That the site declares.
     """

@@ -1,0 +1,5 @@
+"""``python -m magfusion``."""
+
+from magfusion.cli import main
+
+main()

@@ -1,0 +1,133 @@
+"""The graph of a calibration: uncertain poses or attitudes, and one dense calibration beside them.
+
+GTSAM's own factors hold the poses; what the instruments read at all of them is linearised in one
+batched call and enters as Jacobian factors, because a Python factor is called with a copy of all
+values.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import X
+
+from magfusion.errors import EstimationError
+from magfusion.estimation.solve.bordered import Optimised, eliminate, last_marginal, optimise
+from magfusion.units import Array
+
+CALIBRATION_KEY = gtsam.symbol("c", 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What the loop moves.
+
+    Parameters
+    ----------
+    values : gtsam.Values
+        Pose or attitude X(i) of each reading, and what else the native factors know.
+    calibration : ndarray, shape (k,)
+    """
+
+    values: gtsam.Values
+    calibration: Array
+
+
+Rows = Callable[[Estimate], tuple[Array, Array, Array]]
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationGraph:
+    """A `magfusion.estimation.solve.bordered.Problem`.
+
+    Parameters
+    ----------
+    rows : callable
+        Returns whitened residuals (n, m) with derivatives by pose (n, m, d) and by calibration
+        (n, m, k).
+    native : gtsam.NonlinearFactorGraph
+        What is known of the poses, linearised by GTSAM.
+    declared, cov : ndarray, shape (k,) and (k, k)
+        Prior of the calibration.
+    steps : dict of int to ndarray
+        Each key of the values, in the order of elimination, with the step that a damping of one
+        holds back.
+    """
+
+    rows: Rows
+    native: gtsam.NonlinearFactorGraph
+    declared: Array
+    cov: Array
+    steps: dict[int, Array]
+
+    @property
+    def ordering(self) -> gtsam.Ordering:
+        """Of elimination: the calibration last."""
+        out = gtsam.Ordering()
+        for key in (*self.steps, CALIBRATION_KEY):
+            out.push_back(key)
+        return out
+
+    def _prior(self, estimate: Estimate) -> tuple[Array, Array]:
+        sqrt_information = np.linalg.inv(np.linalg.cholesky(self.cov))
+        return sqrt_information, sqrt_information @ (estimate.calibration - self.declared)
+
+    def cost(self, estimate: Estimate) -> float:
+        """Return half the sum of squared whitened residuals, priors included."""
+        error, (_, step) = self.rows(estimate)[0], self._prior(estimate)
+        return float(0.5 * (np.sum(error**2) + step @ step) + self.native.error(estimate.values))
+
+    def linearized(self, estimate: Estimate) -> gtsam.GaussianFactorGraph:
+        """Return the linear graph at an estimate."""
+        graph = self.native.linearize(estimate.values)
+        error, by_pose, by_calibration = self.rows(estimate)
+        unit = gtsam.noiseModel.Unit.Create(error.shape[1])
+        for i, (rest, own, shared) in enumerate(zip(error, by_pose, by_calibration, strict=True)):
+            graph.push_back(gtsam.JacobianFactor(X(i), own, CALIBRATION_KEY, shared, -rest, unit))
+        sqrt_information, step = self._prior(estimate)
+        unit = gtsam.noiseModel.Unit.Create(len(step))
+        graph.push_back(gtsam.JacobianFactor(CALIBRATION_KEY, sqrt_information, -step, unit))
+        return graph
+
+    def moved(self, estimate: Estimate, step: gtsam.VectorValues) -> Estimate:
+        """Return the estimate moved by a step of every variable."""
+        return Estimate(
+            estimate.values.retract(step), estimate.calibration + step.at(CALIBRATION_KEY)
+        )
+
+    def damping_scales(self) -> list[tuple[int, Array]]:
+        """Return, for each key, the step that a damping of one holds back."""
+        return [*self.steps.items(), (CALIBRATION_KEY, np.sqrt(np.diag(self.cov)))]
+
+
+def solve(
+    graph: CalibrationGraph, start: Estimate, name: str, iterations: int, tolerance: float
+) -> tuple[Optimised[Estimate], Array]:
+    """Return the best estimate, and the covariance of its calibration, shape (k, k).
+
+    Parameters
+    ----------
+    name : str
+        Of what is calibrated, for the messages.
+    iterations, tolerance
+        As in `magfusion.estimation.solve.bordered.optimise`.
+
+    Raises
+    ------
+    EstimationError
+        Where the loop does not converge, or the graph leaves something open.
+    """
+    found = optimise(graph, start, iterations=iterations, tolerance=tolerance)
+    if not found.converged:
+        raise EstimationError(
+            f"the calibration of the {name} does not converge in {iterations} steps: readings and"
+            " priors disagree by far more than their sigmas allow"
+        )
+    linear, ordering = graph.linearized(found.estimate), graph.ordering
+    try:
+        return found, last_marginal(eliminate(linear, ordering), linear, ordering)
+    except (RuntimeError, np.linalg.LinAlgError) as failure:
+        raise EstimationError(
+            f"the calibration of the {name} cannot be solved: its poses are not determined"
+        ) from failure

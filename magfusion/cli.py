@@ -1,0 +1,269 @@
+"""The command line: one command a job, its options made of the fields of the job's settings."""
+
+import errno
+import inspect
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import MISSING, Field
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any, Literal, NoReturn, get_type_hints
+
+import typer
+from typer.core import TyperGroup
+from typer.main import get_command
+
+from magfusion.errors import EstimationError, InputError
+from magfusion.jobs import GROUPS, JOBS
+from magfusion.jobs.settings import Command, Option, options
+from magfusion.model.progress import Report, quiet
+from magfusion.results.figures import Figures
+
+_NAMED_BY_LOG = "; default: the log's name and the job's"
+_NOT_WRITTEN = "; default: nothing is written"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line.
+
+    Exits with 0 and the result; with 2 and one sentence for bad input or usage; with 1 and one
+    sentence for an estimator that failed; with 130 where the user interrupted.
+    """
+    given = sys.argv[1:] if arguments is None else arguments
+    try:
+        status = application()(
+            args=given or ["--help"], prog_name="magfusion", standalone_mode=False
+        )
+    except typer.TyperException as error:
+        context = getattr(error, "ctx", None)
+        command = "magfusion" if context is None else context.command_path
+        _fail(2, f"{error.format_message().rstrip('.')}; see {command} --help")
+    except InputError as error:
+        _fail(2, str(error))
+    except EstimationError as error:
+        _fail(1, str(error))
+    except OSError as error:
+        _fail(2, _file_refusal(error))
+    except MemoryError:
+        _fail(2, "the memory does not suffice; use a shorter part, by --start and --end")
+    raise SystemExit(status)
+
+
+def _file_refusal(error: OSError) -> str:
+    place = error.filename if error.filename is not None else "a file"
+    remedy = "free some space" if error.errno == errno.ENOSPC else "allow it, or give another path"
+    return f"{place}: cannot be read or written ({error.strerror or error}); {remedy}"
+
+
+def _fail(status: int, sentence: str) -> NoReturn:
+    sys.stderr.write(f"magfusion: {' '.join(sentence.split())}\n")
+    raise SystemExit(status) from None
+
+
+class _Jobs(TyperGroup):
+    """Commands of which only name and help are known until one is asked for."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command, made of its job's file."""
+        name, listed, rest = super().resolve_command(ctx, args)
+        path = name if ctx.parent is None else f"{ctx.info_name} {name}"
+        return name, _command(path) if path in JOBS else listed, rest
+
+
+def application() -> typer.Typer:
+    """Return the application: a command for each of `JOBS`."""
+    app = typer.Typer(
+        cls=_Jobs,
+        help="Navigation from magnetic beacons and inertial sensors where there is no GNSS.",
+        pretty_exceptions_enable=False,
+    )
+    app.callback()(_options)
+    groups = {name: typer.Typer(cls=_Jobs, help=text) for name, text in GROUPS.items()}
+    for path, (_, text) in JOBS.items():
+        group, _, name = path.rpartition(" ")
+        (groups[group] if group else app).command(name, help=text)(lambda: None)
+    for name, commands in groups.items():
+        app.add_typer(commands, name=name)
+    return app
+
+
+def _command(path: str) -> Any:
+    """Return the command of a job, with all its options."""
+    module, text = JOBS[path]
+    name = path.split()[-1]
+    only = typer.Typer(add_completion=False)
+    command: Command = import_module(f"magfusion.jobs.{module}").COMMAND
+    only.command(name, help=text)(_callback(path, command))
+    return get_command(only)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        sys.stdout.write(f"magfusion {version('magfusion')}\n")
+        raise typer.Exit
+
+
+def _options(
+    _version: Annotated[
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=_print_version, help="Print the version."
+        ),
+    ] = False,
+) -> None:
+    """Navigate by magnetic beacons and inertial sensors where there is no GNSS."""
+
+
+def _callback(path: str, command: Command) -> Callable[..., None]:
+    """Return the function of a command, with the parameters of which typer makes its options."""
+    wanted = inspect.signature(command.run).parameters
+    asked = {field.name: option for field, option in options(command.settings)}
+
+    def run(context: typer.Context, **values: Any) -> None:
+        output, as_json = values.pop("output", None), values.pop("as_json", False)
+        own = {field: _value(asked[field], value) for field, value in values.items()}
+        settings = command.settings(**own)
+        if output is None and "output" in wanted and not command.output_optional:
+            # A log's name as the user sees it, even where it was given as ".".
+            log = Path(own["log"]).resolve().name if "log" in own else ""
+            output = Path(command.output or f"{log}_{path.split()[-1].replace('-', '_')}")
+        earlier = _stamp(output)
+        with _progress() as report:
+            offered = {"output": output, "report": report, "given": _given(context)}
+            try:
+                figures = command.run(settings, **{k: v for k, v in offered.items() if k in wanted})
+            except EstimationError as error:
+                if output is not None:
+                    from magfusion.jobs.failure import failed_figures
+
+                    log = Path(next((v for v in own.values() if isinstance(v, Path)), output)).stem
+                    _show_failed(
+                        failed_figures(path, log, output, error, _stamp(output) != earlier), as_json
+                    )
+                raise
+        if figures is not None:
+            _show_result(figures, output, as_json)
+            _refuse_failed(figures)
+        if command.after is not None:
+            command.after(settings, output)
+
+    parameters = [_keyword("context", typer.Context)]
+    parameters += _parameters(command, "output" in wanted)
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {p.name: p.annotation for p in parameters}
+    return run
+
+
+def _parameters(command: Command, writes: bool) -> list[inspect.Parameter]:
+    hints = get_type_hints(command.settings)
+    found = [_parameter(f, option, hints[f.name]) for f, option in options(command.settings)]
+    if writes:
+        note = "" if command.output or command.output_required else _NAMED_BY_LOG
+        note = _NOT_WRITTEN if command.output_optional else note
+        info = typer.Option("--output", "-o", help=f"Directory of the results{note}.")
+        default: Any = Path(command.output) if command.output else None
+        if command.output_required:
+            default = inspect.Parameter.empty
+        hint: Any = Path | None if default is None else Path
+        output = _keyword("output", Annotated[hint, info], default)
+        found.insert(0, output)
+    if command.reports:
+        flag = typer.Option("--json", help="Print the report as the last line.")
+        found.append(_keyword("as_json", Annotated[bool, flag], False))
+    return found
+
+
+def _parameter(field: Field[Any], option: Option, hint: Any) -> inspect.Parameter:
+    """Return what typer is to make an argument or an option of."""
+    default = field.default
+    if option.words is not None:
+        hint = Literal[tuple(option.words)]
+        default = next((w for w, value in option.words.items() if value == default), default)
+    elif hint == tuple[str, ...]:
+        hint, default = list[str], []
+    if default is None:
+        hint = hint | None
+    if option.positional:
+        info = typer.Argument(help=option.sentence)
+    else:
+        name = option.name or field.name.replace("_", "-")
+        switch = f"--{name}/--no-{name}" if default is True else f"--{name}"
+        info = typer.Option(switch, help=option.sentence, metavar=option.metavar)
+    default = inspect.Parameter.empty if default is MISSING else default
+    return _keyword(field.name, Annotated[hint, info], default)
+
+
+def _keyword(
+    name: str, annotation: Any, default: Any = inspect.Parameter.empty
+) -> inspect.Parameter:
+    kind = inspect.Parameter.KEYWORD_ONLY
+    return inspect.Parameter(name, kind, default=default, annotation=annotation)
+
+
+def _value(option: Option, typed: Any) -> Any:
+    """Return the value of a field for what was typed."""
+    if option.words is not None:
+        return option.words.get(typed)
+    return tuple(typed) if isinstance(typed, list) else typed
+
+
+def _given(context: typer.Context) -> set[str]:
+    """Return the fields that the user gave, rather than leave them at their defaults."""
+    sources = {name: context.get_parameter_source(name) for name in context.params}
+    return {name for name, source in sources.items() if source and source.name == "COMMANDLINE"}
+
+
+@contextmanager
+def _progress() -> Iterator[Report]:
+    """Yield a progress reporter: a bar on a terminal, nothing otherwise."""
+    if not sys.stderr.isatty():
+        yield quiet
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+
+    def report(stage: str, done: int, total: int) -> None:
+        if not bar.tasks:
+            bar.add_task(stage)
+            bar.start()
+        bar.update(bar.tasks[0].id, description=stage, completed=done, total=total)
+
+    try:
+        yield report
+    finally:
+        bar.stop()
+
+
+def _stamp(output: Path | None) -> int | None:
+    """Return when a report was written; None where there is none."""
+    report = Path() if output is None else output / "report.json"
+    return report.stat().st_mtime_ns if report.is_file() else None
+
+
+def _show_failed(figures: Figures | None, as_json: bool) -> None:
+    if figures is not None:
+        _show_result(figures, None, as_json)
+
+
+def _refuse_failed(figures: Figures) -> None:
+    """End with the first reason where a verdict that has been shown is failed."""
+    reasons = figures.get("reasons")
+    if figures.get("verdict") == "failed" and isinstance(reasons, list):
+        first = reasons[0]
+        raise EstimationError(f"failed: {first['text'] if isinstance(first, dict) else first}")
+
+
+def _show_result(figures: Figures, output: Path | None, as_json: bool) -> None:
+    """Show the figures of a job as a table, and as the last line in JSON where that is asked."""
+    from magfusion.results.screen import show
+
+    show(figures, output)
+    if as_json:
+        sys.stdout.write(json.dumps(dict(figures), default=float) + "\n")

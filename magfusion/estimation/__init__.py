@@ -1,0 +1,1 @@
+"""From phasors and inertial data to poses: one epoch, a whole log, or as the data arrive."""

@@ -1,0 +1,398 @@
+"""The whole offline estimate of one log: start, passes over the waveform, posterior."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from gtsam.symbol_shorthand import V
+
+from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.convergence import last_move, refuse_open, settled_at
+from magfusion.estimation.demodulation import demodulated
+from magfusion.estimation.graph import Estimate, Graph, initial_estimate, marginals, read_states
+from magfusion.estimation.initialization.chain import Start
+from magfusion.estimation.initialization.offline import begin, carried, with_rest_bias
+from magfusion.estimation.integrity.detection import detected, only
+from magfusion.estimation.integrity.mending import mended
+from magfusion.estimation.log_graph import PreparedLog, graph_of
+from magfusion.estimation.measurements.earth import EarthField, check_earth, disturbed
+from magfusion.estimation.measurements.measurement import Measurement
+from magfusion.estimation.measurements.phasors import FieldPhasors, alone
+from magfusion.estimation.measurements.pose_fix import survey_response
+from magfusion.estimation.measurements.zero_velocity import may_stand, quiet_before
+from magfusion.estimation.noise_tuning import Tuned, noise_of, with_noise
+from magfusion.estimation.noise_tuning import settled as same_noise
+from magfusion.estimation.settings import EstimatorSettings
+from magfusion.estimation.solve.bordered import Optimised, eliminate, marginal, optimise
+from magfusion.model.parameters import Block, Calibration, initial_calibration
+from magfusion.model.progress import Report, quiet
+from magfusion.model.samples import FieldSamples, ImuSamples, Log
+from magfusion.model.site import MotionModel, Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.receiver.cycles import whole_cycles
+from magfusion.receiver.slots import has_schedule
+from magfusion.units import Array, BoolArray, IntArray
+
+LONGEST_STEP = 5.0  # s; without any field a state is made after so long
+REST_STEP = 2.0  # s; and so long at rest, where each has a zero velocity
+SPARSE = 2.5  # intervals; a longer one than so many usual ones is a gap
+AMBIGUOUS_CHI_SQUARE = 20.0  # below this a mirrored trajectory explains the data nearly as well
+QUIET = 0.3  # sigmas; a last pass that moved the poses by less has converged all the same
+TUNINGS = 3  # passes after which the noise is found anew; then it stays as it is
+
+
+@dataclass(frozen=True)
+class SmootherSettings(EstimatorSettings):
+    """How a log is smoothed; the Earth field is measured with tight coupling only.
+
+    Parameters
+    ----------
+    coupling : {'tight', 'loose'}
+        Whether the phasors or the fixes made of them enter the graph.
+    loss : {None, 'huber', 'cauchy'}
+        Robust loss of the field measurements: a false beacon is nothing that sums of squares
+        expect, and where all are true it costs nothing.
+    passes : int
+        At most so many predictions of the waveform.
+    tune : bool
+        Whether noise and model error are found from the residuals, their declared values being a
+        prior; with tight coupling.
+    measurements : tuple of (ndarray, Measurement)
+        Anything else that was measured, with the times of its rows (s), at which states are made.
+    """
+
+    coupling: str = "tight"
+    loss: str | None = "cauchy"
+    passes: int = 10
+    tune: bool = True
+    measurements: tuple[tuple[Array, Measurement], ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.earth and self.coupling == "loose":
+            raise ValueError("the Earth field is measured with tight coupling only")
+        if self.passes < 1:
+            raise ValueError(f"passes must be at least 1; got {self.passes}")
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """The posterior of one log.
+
+    Parameters
+    ----------
+    states : Trajectory
+        With velocity, biases and pose covariance, on the log's clock: at the fields, in gaps of
+        them, and where anything else was measured.
+    epoch : int ndarray, shape (n,)
+        States at which the fields are.
+    fields : FieldSamples
+        The phasors of the last pass.
+    declared, calibration : Calibration
+        Before and after.
+    blocks : tuple of Block
+        What was estimated.
+    considered : tuple of Block
+        What else is uncertain, and in the covariance.
+    calibration_cov : ndarray, shape (dimension, dimension)
+    residual : ndarray, shape (n, channels, 6)
+        Whitened; NaN where a channel is missing, or with loose coupling.
+    graph : Graph
+        As it was last optimised.
+    estimate : Estimate
+        In it: the states, and the calibration of every segment of a long log.
+    rival_chi_square : float, optional
+        How much worse the best trajectory from another chain of hypotheses is, after its first
+        pass: a small figure means that the log leaves a mirrored trajectory possible.  None where
+        there was no other chain.
+    converged : bool
+        Whether the last pass moved nothing, or little in units of its sigma.
+    last_move : float
+        Root mean square of what the last pass moved the poses by, in sigmas: the gauge of the
+        survey has a large one.
+    rival : Trajectory, optional
+        That trajectory.
+    dropped : mapping
+        Reason to number of windows.
+    bridged : int
+        Intervals with a gap in the inertial stream.
+    earth_residual : ndarray, shape (n, 3), optional
+        Whitened; None where the Earth field was not measured.
+    earth_disturbed : bool ndarray, shape (n,), optional
+        Where the motion contradicts it.
+    fix_response : ndarray, shape (states, 6, parameters), optional
+        What one sigma of the survey does to every pose alike, with loose coupling.
+    noise : tuple of Tuned
+        What was found of noise and model error; the site of ``calibration`` has it.
+    """
+
+    states: Trajectory
+    epoch: IntArray
+    fields: FieldSamples
+    declared: Calibration
+    calibration: Calibration
+    blocks: tuple[Block, ...]
+    considered: tuple[Block, ...]
+    calibration_cov: Array
+    residual: Array
+    start: Start
+    graph: Graph
+    estimate: Estimate
+    rival_chi_square: float | None
+    dropped: Mapping[str, int]
+    bridged: int
+    cost: float
+    passes: int
+    iterations: int
+    converged: bool
+    last_move: float = 0.0
+    rival: Trajectory | None = None
+    earth_residual: Array | None = None
+    earth_disturbed: BoolArray | None = None
+    fix_response: Array | None = None
+    noise: tuple[Tuned, ...] = ()
+
+
+def smooth(
+    log: Log, site: Site, settings: SmootherSettings | None = None, report: Report = quiet
+) -> Smoothed:
+    """Estimate the best trajectory of a log, with the calibration in the same solution.
+
+    Parameters
+    ----------
+    log : Log
+        With a waveform, or with phasors in the site's channel order.
+    report : callable, optional
+        Called with stage, steps done and steps in all.
+
+    Raises
+    ------
+    InputError
+        Where the log holds nothing usable.
+    EstimationError
+        Where the graph cannot be solved.
+    """
+    settings = SmootherSettings() if settings is None else settings
+    for beacon in site.beacons:
+        if beacon.unknown is not None:
+            raise InputError(
+                f"the {beacon.unknown} of beacon {beacon.name} is unknown; place it by"
+                " magfusion.estimation.self_survey.smooth_and_place"
+            )
+    if settings.earth:
+        check_earth(site)
+    known = mended(log, site)
+    return _solved(_prepared(known, site, settings, report), settings, report)
+
+
+def _prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) -> PreparedLog:
+    report("demodulating", 0, settings.passes + 3)
+    loose, demodulation = settings.coupling == "loose", demodulated(log, site, settings.lockin)
+    samples = demodulation.fields
+    if loose and has_schedule(site):
+        samples = whole_cycles(samples, log.imu, site)
+    if len(samples) < 2:
+        raise EstimationError(
+            f"log {log.name} has {len(samples)} field epoch; at least 2 are needed"
+        )
+    report("finding a start", 1, settings.passes + 3)
+    calibration = initial_calibration(site, float(np.mean(samples.time)))
+    offset, steady = calibration.time_offset, None
+    if settings.earth:
+        steady, samples = demodulation.steady(calibration), only(samples, detected(samples))
+    between = _in_gaps(samples.time, log.imu, offset, site.platform.motion)
+    others = [time for time, _ in settings.measurements]
+    time = np.unique(np.concatenate([samples.time, between, *others]))
+    blocks, considered = ((), ()) if loose else settings.blocks(site)
+    starts = [
+        PreparedLog(
+            demodulation=demodulation,
+            samples=samples,
+            steady=steady,
+            epoch=np.searchsorted(time, samples.time),
+            fixes=beginning.fixes if loose else None,
+            start=beginning.start,
+            states=with_rest_bias(
+                carried(beginning.start.states, log.imu, offset, time), log.imu, calibration
+            ),
+            declared=beginning.declared,
+            blocks=blocks,
+            considered=considered,
+            loss=settings.loss,
+            others=settings.measurements,
+        )
+        for beginning in begin(samples, steady, log, calibration)
+    ]
+    return starts[0] if len(starts) == 1 else _likeliest(starts)
+
+
+def _in_gaps(time: Array, imu: ImuSamples, time_offset: float, motion: MotionModel) -> Array:
+    """Return when states are made where no field comes (s), more of them where the IMU is quiet.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Of the fields (s).
+    time_offset : float
+        (s)
+    """
+    step, out = np.diff(time), [np.zeros(0)]
+    for k in np.flatnonzero(step > max(LONGEST_STEP, SPARSE * float(np.median(step)))):
+        inner = np.linspace(time[k], time[k + 1], int(np.ceil(step[k] / REST_STEP)) + 1)[1:-1]
+        every = np.arange(1, len(inner) + 1) % int(LONGEST_STEP / REST_STEP) == 0
+        out.append(inner[every | quiet_before(imu, inner - time_offset, motion)])
+    return np.concatenate(out)
+
+
+def _likeliest(starts: list[PreparedLog]) -> PreparedLog:
+    """Let the motion decide between chains that single epochs cannot distinguish."""
+    found = []
+    for log in starts:
+        graph, _ = graph_of(log, log.states, log.declared)
+        found.append(optimise(graph, initial_estimate(log.states, log.declared)))
+    best, second = np.argsort([one.cost for one in found])[:2]
+    return replace(
+        starts[best],
+        rival_chi_square=float(2.0 * (found[second].cost - found[best].cost)),
+        rival=read_states(found[second].estimate.values, starts[second].states.time),
+    )
+
+
+def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smoothed:
+    states, calibration, wave = log.states, log.declared, None
+    segments: tuple[Calibration, ...] = ()
+    declared = log.declared.site
+    log = replace(log, apart=settings.tune and log.fixes is None)
+    time, motion = states.time, log.declared.site.platform.motion
+    calm = quiet_before(log.imu, time - calibration.time_offset, motion)
+    standing = np.zeros(len(time), dtype=bool)
+    by_waveform = log.fixes is None and log.demodulation.log.waveform is not None
+    iterations, done, settled = 0, 0, False
+    tuned: tuple[Tuned, ...] = ()
+    while done < settings.passes and not settled:
+        report(f"pass {done + 1}", done + 2, settings.passes + 3)
+        if done > 0 and by_waveform:
+            wave = log.compensated(calibration, states)
+        graph, bridged = graph_of(log, states, calibration, wave, standing)
+        found = optimise(graph, initial_estimate(states, calibration, segments))
+        after = read_states(found.estimate.values, time)
+        stood = _at_rest(graph, found.estimate, after, calm & ~standing, motion)
+        if np.any(stood):  # at once: it costs no preintegration
+            graph = replace(graph, measurements=(*graph.measurements, log.rests(stood)))
+            iterations += found.iterations
+            found = optimise(graph, found.estimate)
+            after = read_states(found.estimate.values, time)
+        settled = (
+            done > 0
+            and not np.any(stood)
+            and settled_at(states, after, calibration, found.estimate.calibration)
+        )
+        before, states = states, after
+        calibration, standing = found.estimate.calibration, standing | stood
+        segments = found.estimate.segments
+        if log.apart and (wave is not None or not by_waveform):
+            latest = noise_of(log, graph, found.estimate, states, wave, declared)
+            log = replace(log, apart=done < TUNINGS and not same_noise(tuned, latest))
+            tuned, settled = latest, False
+            log = replace(log, declared=with_noise(log.declared, tuned))
+            calibration = with_noise(calibration, tuned)
+            segments = tuple(with_noise(segment, tuned) for segment in segments)
+        iterations, done = iterations + found.iterations, done + 1
+    report("posterior", settings.passes + 2, settings.passes + 3)
+    fields = log.samples if wave is None else wave.fields
+    result = _posterior(log, graph, found, fields, bridged)
+    report("done", settings.passes + 3, settings.passes + 3)
+    refuse_open(result.states)
+    move = (
+        0.0
+        if settled and found.converged
+        else last_move(before, result.states, None if found.converged else (graph, found.estimate))
+    )
+    result = replace(result, noise=tuned)
+    return replace(
+        result, passes=done, iterations=iterations, converged=move < QUIET, last_move=move
+    )
+
+
+def solved_again(result: Smoothed, measurements: tuple[Measurement, ...]) -> Smoothed:
+    """Return a posterior with other measurements of the same states, from where it is.
+
+    Raises
+    ------
+    RuntimeError
+        GTSAM's own, of a system that these leave open.
+    """
+    graph = replace(result.graph, measurements=measurements)
+    found = optimise(graph, result.estimate)
+    pose_cov, calibration_cov = marginals(graph, found.estimate, result.considered)
+    states = read_states(found.estimate.values, result.states.time)
+    phasors = next(m for m in measurements if isinstance(m, FieldPhasors))
+    heard = np.any(phasors.sqrt_information != 0.0, axis=(2, 3))
+    error = graph.residual(phasors.alone(), found.estimate)
+    return replace(
+        result,
+        states=replace(states, pose_cov=pose_cov),
+        calibration=found.estimate.calibration,
+        calibration_cov=calibration_cov,
+        residual=np.where(heard[..., None], error, np.nan),
+        graph=graph,
+        estimate=found.estimate,
+        cost=found.cost,
+        iterations=result.iterations + found.iterations,
+    )
+
+
+def _at_rest(
+    graph: Graph, estimate: Estimate, states: Trajectory, asked: BoolArray, motion: MotionModel
+) -> BoolArray:
+    """Return at which of some epochs with a quiet IMU the platform is at rest."""
+    out = np.zeros(len(asked), dtype=bool)
+    if np.any(asked):
+        assert states.velocity_world is not None
+        tree = eliminate(graph.linearized(estimate), graph.ordering)
+        rows = np.flatnonzero(asked)
+        cov = np.array([marginal(tree, V(i), 3) for i in rows.tolist()])
+        out[rows] = may_stand(states.velocity_world[rows], cov, motion)
+    return out
+
+
+def _posterior(
+    log: PreparedLog, graph: Graph, found: Optimised[Estimate], samples: FieldSamples, bridged: int
+) -> Smoothed:
+    estimate = found.estimate
+    pose_cov, calibration_cov = marginals(graph, estimate, log.considered)
+    states, response = read_states(estimate.values, log.states.time), None
+    if log.fixes is not None:
+        here = survey_response(log.declared, log.samples, log.at_fields(states))
+        later = np.searchsorted(log.epoch, np.arange(len(states)))
+        response = here[np.minimum(later, len(here) - 1)]
+        pose_cov = pose_cov + response @ np.swapaxes(response, 1, 2)
+    errors = {type(m): graph.residual(m, estimate) for m in map(alone, graph.measurements)}
+    error = errors.get(FieldPhasors, np.nan)
+    residual = np.where(samples.valid[..., None], error, np.full(6, np.nan))
+    field = next((m for m in graph.measurements if isinstance(m, EarthField)), None)
+    earth = None if field is None else errors[EarthField][:, 0]
+    return Smoothed(
+        states=replace(states, pose_cov=pose_cov),
+        epoch=log.epoch,
+        fields=samples,
+        declared=log.declared,
+        calibration=estimate.calibration,
+        blocks=graph.blocks,
+        considered=log.considered,
+        calibration_cov=calibration_cov,
+        residual=residual,
+        start=log.start,
+        graph=graph,
+        estimate=estimate,
+        rival_chi_square=log.rival_chi_square,
+        rival=log.rival,
+        dropped=log.demodulation.dropped,
+        bridged=bridged,
+        cost=found.cost,
+        passes=1,
+        iterations=found.iterations,
+        converged=found.converged,
+        earth_residual=earth,
+        earth_disturbed=None if earth is None or field is None else disturbed(earth, field.repeats),
+        fix_response=response,
+    )

@@ -1,0 +1,168 @@
+"""The phasors and the first fixes of a log that has a waveform, or a table of phasors."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.integrity.detection import without_silence
+from magfusion.estimation.motion_compensation import MotionCompensated, demodulate_about
+from magfusion.estimation.snapshot.fix import Fixes, Gravity
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.parameters import Calibration
+from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields
+from magfusion.model.site import Site
+from magfusion.model.strapdown import resting
+from magfusion.model.trajectory import Trajectory
+from magfusion.receiver.admission import Windows
+from magfusion.receiver.cycles import whole_cycles
+from magfusion.receiver.lockin import window_operator
+from magfusion.receiver.receiver import LockinReceiver, Receiver
+from magfusion.receiver.slots import has_schedule
+from magfusion.receiver.turn import on_clock
+from magfusion.receiver.windows import LockinSettings
+from magfusion.units import Array
+
+REST_EPOCH = 0.5  # s; over which the specific force at rest is averaged
+
+
+@dataclass(frozen=True, eq=False)
+class Demodulation:
+    """The phasors of a log: a table, or of a waveform that can be demodulated anew.
+
+    Parameters
+    ----------
+    fields : FieldSamples
+        The phasors before anything is known of the motion.
+    dropped : mapping
+        Reason to number of windows.
+    receiver : Receiver, optional
+        Of the waveform; None where the log holds phasors.
+    windows : Windows, optional
+        That it admitted.
+    """
+
+    log: Log
+    fields: FieldSamples
+    dropped: Mapping[str, int]
+    receiver: Receiver | None = None
+    windows: Windows | None = None
+
+    def steady(self, calibration: Calibration) -> SteadyFields:
+        """Return the Earth field and the offset before anything is known of the motion.
+
+        Raises
+        ------
+        InputError
+            Where the log holds only phasors, or is of time slots.
+        """
+        waveform = self.log.waveform
+        if self.receiver is None or waveform is None:
+            if self.log.steady is None:
+                raise InputError(
+                    "the log holds only phasors, which know nothing of the Earth field; give the"
+                    " log with magnetometer.parquet, or leave --earth out"
+                )
+            return self.log.steady
+        assert self.windows is not None
+        site, settings = calibration.site, self.receiver.lockin().settings
+        imu = on_clock(self.log.imu, calibration.time_offset)
+        operator = window_operator(waveform, imu, site, settings, self.windows)
+        offset = site.platform.magnetometer.offset
+        _, steady = operator.demodulate(waveform.measured_sensor - offset)
+        return replace(steady, measured_sensor=steady.measured_sensor + offset)
+
+    def compensated(self, calibration: Calibration, states: Trajectory) -> MotionCompensated:
+        """Return the phasors with the motion inside the windows taken off.
+
+        A slot is too short for more than the gyro's bias to matter.
+
+        Parameters
+        ----------
+        states : Trajectory
+            At the centres of the windows.
+        """
+        waveform, imu, offset = self.log.waveform, self.log.imu, calibration.time_offset
+        assert waveform is not None
+        assert self.receiver is not None
+        assert self.windows is not None
+        assert states.gyro_bias_body is not None
+        time = imu.time + offset
+        bias = [np.interp(time, states.time, b) for b in states.gyro_bias_body.T]
+        known = on_clock(imu, offset, np.stack(bias, axis=1))
+        site, windows = calibration.site, self.windows
+        if not isinstance(self.receiver, LockinReceiver):
+            found, _ = self.receiver.phasors(waveform, known, windows, site)
+            return MotionCompensated.of_slots(found)
+        operator = window_operator(waveform, known, site, self.receiver.settings, windows)
+        return demodulate_about(operator, waveform.measured_sensor, states, imu, calibration)
+
+
+def demodulated(log: Log, site: Site, settings: LockinSettings | None = None) -> Demodulation:
+    """Return the phasors of a log, demodulated where it has a waveform.
+
+    Raises
+    ------
+    InputError
+        Where no window, or no slot, is usable.
+    """
+    if log.waveform is None:
+        if log.fields is None:
+            raise EstimationError(f"log {log.name} has neither waveform nor phasors")
+        return Demodulation(log, without_silence(log.fields), {})
+    receiver = Receiver.of(site, settings)
+    windows, fields = receiver.whole(log.waveform, log.imu)
+    return Demodulation(log, without_silence(fields), receiver.dropped, receiver, windows)
+
+
+def phasors(
+    log: Log, site: Site, settings: LockinSettings | None = None
+) -> tuple[FieldSamples, Mapping[str, int]]:
+    """Return the phasors of a log, and how many windows were dropped; as `demodulated`."""
+    found = demodulated(log, site, settings)
+    return found.fields, found.dropped
+
+
+def gravity_at_rest(imu: ImuSamples, site: Site, time: Array) -> Gravity | None:
+    """Return the direction of gravity where the platform rests; None if it never does.
+
+    Parameters
+    ----------
+    site : Site
+        Its accelerometer bias limits how well the direction is known.
+    time : ndarray, shape (n,)
+        Epochs (s).
+    """
+    stamps = imu.time + site.platform.imu.time_offset
+    still = resting(stamps, imu.gyro_body, imu.accel_body, motion=site.platform.motion)
+    if not np.any(still):
+        return None
+    nearest = np.clip(np.searchsorted(stamps, time), 0, len(stamps) - 1)
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.accel_body, axis=0)])
+    lo = np.searchsorted(stamps, time - REST_EPOCH / 2)
+    hi = np.minimum(np.searchsorted(stamps, time + REST_EPOCH / 2) + 1, len(stamps))
+    lo = np.minimum(lo, hi - 1)
+    mean = (total[hi] - total[lo]) / (hi - lo)[:, None]
+    size = np.linalg.norm(mean, axis=1, keepdims=True)
+    noise = site.platform.imu.accel_noise / np.sqrt(REST_EPOCH)
+    sigma = np.hypot(site.platform.imu.accel_bias_sigma, noise) / site.gravity
+    near = np.abs(stamps[nearest] - time) < REST_EPOCH
+    return Gravity(mean / size, np.where(still[nearest] & near, sigma, np.inf))
+
+
+def first_fixes(
+    samples: FieldSamples, log: Log, calibration: Calibration, free: tuple[str, ...] = ()
+) -> Fixes:
+    """Return the fix of every epoch, with gravity where the platform rests.
+
+    Of coils driven in turn a whole cycle is one epoch.
+    """
+    epochs, gravity = fix_inputs(samples, log, calibration.site)
+    return fix_epochs(epochs, calibration, gravity=gravity, free=free)
+
+
+def fix_inputs(samples: FieldSamples, log: Log, site: Site) -> tuple[FieldSamples, Gravity | None]:
+    """Return the epochs of a fix, and gravity where the platform rests."""
+    epochs = whole_cycles(samples, log.imu, site) if has_schedule(site) else samples
+    return epochs, gravity_at_rest(log.imu, site, epochs.time)

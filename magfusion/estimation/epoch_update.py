@@ -1,0 +1,289 @@
+"""What one epoch does to a running estimate: gate, update, being lost, and what is said of it."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import EstimationError
+from magfusion.estimation.ekf import ErrorStateFilter
+from magfusion.estimation.fixed_lag import SlidingWindow
+from magfusion.estimation.initialization.online import OnlineStart
+from magfusion.estimation.input_queue import Arrivals, Measured
+from magfusion.estimation.integrity.bank import SubsetBank
+from magfusion.estimation.integrity.gate import Gate
+from magfusion.estimation.integrity.judgement import Judgement
+from magfusion.estimation.integrity.online import Heard, OnlineWitness
+from magfusion.estimation.integrity.recovery import (
+    AgreedFix,
+    Attempts,
+    agreed_fix,
+    at_fix,
+    explains,
+    prior_of,
+    restarted,
+)
+from magfusion.estimation.integrity.score_online import OnlineScore
+from magfusion.estimation.measurements.earth import EarthField, EarthWeight, speed_sigma
+from magfusion.estimation.measurements.measurement import Measurement
+from magfusion.estimation.measurements.zero_velocity import zero_velocity
+from magfusion.estimation.propagation import Propagated
+from magfusion.estimation.state import State
+from magfusion.model.parameters import Block
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.units import BoolArray
+
+WIDE_POSITION, WIDE_ROTATION = 0.3, 0.2  # m, rad; beyond, the prediction is no place to linearise
+LOST_POSITION = 10.0  # m; a prediction wider than this is worth nothing
+NOW = np.zeros(1, dtype=np.int64)  # the one epoch of a measurement
+AS_LIKELY = 20.0  # difference of chi square to the best hypothesis
+COMPARED_EVERY, COMPARED_EPOCHS = 30.0, 150  # s, epochs; between fixes that nothing asked for
+
+Estimator = SlidingWindow | ErrorStateFilter
+
+
+class EpochUpdate:
+    """Takes in epochs, one after the other.
+
+    Parameters
+    ----------
+    estimated, blocks : tuple of Block
+        Calibration parameters that are estimated, and all in the states' tangent.
+    earth : bool
+        Whether the steady field is a measurement.
+    bank : SubsetBank, optional
+        Filters without each beacon; without it there are no protection levels.
+    """
+
+    gate: Gate
+    witness: OnlineWitness
+    score: OnlineScore
+    _attempts: Attempts
+    _pointing: Attempts
+    _earth: EarthWeight | None
+    _bank: SubsetBank | None
+    _compared_at: float
+    _since_compared: int
+
+    def __init__(
+        self,
+        site: Site,
+        estimated: tuple[Block, ...],
+        blocks: tuple[Block, ...],
+        earth: bool,
+        bank: SubsetBank | None = None,
+    ) -> None:
+        self.site, self.blocks, self._bank = site, blocks, bank
+        self.gate = Gate(site.channels, blocks)
+        self.witness = OnlineWitness(site, estimated)
+        self.score = OnlineScore(site, estimated, blocks[len(estimated) :], steady=earth)
+        self._attempts, self._pointing = Attempts(), Attempts()
+        self._earth = EarthWeight(blocks) if earth else None
+        self._compared_at, self._since_compared = -np.inf, COMPARED_EPOCHS
+
+    def begin(self, start: OnlineStart) -> Judgement:
+        """Judge a first state."""
+        said = Judgement(start.trust.reasons, turn=start.turn, shift=start.shift)
+        self.witness.begin(start.state.time, said)
+        self.score.begin(start.score, start.state.time)
+        return self._judged(start.state, None)
+
+    def take_in(
+        self,
+        estimator: Estimator,
+        arrived: Arrivals,
+        predicted: Propagated,
+        samples: FieldSamples | None,
+    ) -> Judgement:
+        """Go on to a prediction, take in what was measured there, and judge the state.
+
+        Parameters
+        ----------
+        samples : FieldSamples, optional
+            Of this epoch; None where there may be a window of it.
+        """
+        before, state = estimator.state, predicted.state
+        if predicted.bridged:
+            self.gate.counts["inertial gap bridged"] += 1
+        step = max(state.time - arrived.last_epoch, 1e-6)
+        found = arrived.measured(before, state, samples, step, earth=self._earth is not None)
+        measurements: list[Measurement] = arrived.others_at(state.time)
+        if arrived.rests(state):
+            measurements.append(zero_velocity(NOW, self.site.platform.motion.rest_speed_sigma))
+        point = None
+        if found is None or not np.any(found.samples.valid):
+            self.gate.nothing_measured()
+        else:
+            if self._lost(state) and self._found_again(estimator, found, predicted):
+                return self._judged(estimator.state, None)
+            point, refused = self._linearization_point(found.samples, state)
+            explained = state if point is None else point
+            phasors = self.gate.passed(found.phasors, explained, found.samples.valid[0], refused)
+            found = replace(found, phasors=phasors)
+            if self.gate.lost and self._found_again(estimator, found, predicted):
+                return self._judged(estimator.state, None)
+        if found is not None:
+            measurements += self._of_fields(found, replace(point or state, cov=state.cov), step)
+        self._ask(arrived, before, predicted, measurements, point)
+        linear = predicted if point is None else None
+        try:
+            estimator.absorb(predicted, measurements, point)
+        except EstimationError:
+            self.gate.counts["update failed"] += 1
+            self.gate.refused_in_a_row += 1
+            self.witness.uncertain("update_failed", state.time)
+            self.score.end()
+            estimator.replace_state(state)
+            linear = None
+        self._separate(linear, measurements, estimator.state)
+        self._hear(before, predicted, estimator.state, found)
+        if found is not None:
+            self._compare(found.samples, estimator.state)
+        return self._judged(estimator.state, self._lost_since(estimator.state))
+
+    # What was measured
+
+    def _of_fields(self, found: Measured, known: State, step: float) -> list[Measurement]:
+        measurements: list[Measurement] = [found.phasors]
+        if found.earth is not None:
+            measurements.append(self._weighed(found.earth, known))
+            if not np.any(found.phasors.sqrt_information):
+                sigma = speed_sigma(step, self.site.platform.motion)
+                measurements.append(zero_velocity(NOW, sigma))
+        return measurements
+
+    def _weighed(self, field: EarthField, known: State) -> EarthField:
+        assert self._earth is not None
+        weighed, disturbed = self._earth.weighed(field, known)
+        self.gate.counts["Earth field disturbed"] += disturbed
+        return weighed
+
+    # What is said of it
+
+    def _ask(
+        self,
+        arrived: Arrivals,
+        before: State,
+        predicted: Propagated,
+        measurements: list[Measurement],
+        point: State | None,
+    ) -> None:
+        """Let the score hear an epoch; a state that is linearised elsewhere ends it."""
+        if point is not None:
+            self.score.end()
+            return
+        state, offset = predicted.state, arrived.applied_offset
+        imu = arrived.inertial_samples(before.time - offset, state.time - offset)
+        self.score.predict(before, state, predicted.transition, imu)
+        self.score.measured(measurements, state)
+
+    def _hear(
+        self, before: State, predicted: Propagated, state: State, found: Measured | None
+    ) -> None:
+        elapsed, accel = predicted.state.time - before.time, None
+        if elapsed > 0.0 and not predicted.bridged:
+            gained = predicted.state.velocity_world - before.velocity_world
+            accel = gained / elapsed + before.world_from_body @ before.accel_bias_body
+        steady = None if found is None else found.steady
+        repeats = 1.0 if found is None else found.repeats
+        self.witness.hear(state, self.gate, Heard(accel, steady, repeats))
+
+    def _separate(
+        self, predicted: Propagated | None, measurements: list[Measurement], state: State
+    ) -> None:
+        """Carry the filters without each beacon on; from None they begin anew."""
+        if self._bank is None:
+            return
+        if predicted is None:
+            self._bank.forget()
+        else:
+            self._bank.absorb(predicted, measurements, state)
+
+    def _judged(self, state: State, since: float | None) -> Judgement:
+        held = self.score.said_of(state)
+        said = self.witness.judgement(state, self.gate, since, held)
+        return said if self._bank is None else self._bank.heard(said, state)
+
+    def _compare(self, samples: FieldSamples, state: State) -> None:
+        """See from time to time whether a fix finds the platform where the state says."""
+        self._since_compared += 1
+        due = state.time >= self._compared_at + COMPARED_EVERY
+        due = due and self._since_compared >= COMPARED_EPOCHS
+        if not (due or self.witness.asks_for_a_fix):
+            return
+        self._compared_at, self._since_compared = state.time, 0
+        fix = agreed_fix(samples, state.calibration)
+        if fix is not None and explains(fix, samples, state.calibration):
+            self.witness.compared(*_apart(state, fix))
+
+    # Being lost, and found again
+
+    def _lost(self, state: State) -> bool:
+        return self.gate.lost or state.position_sigma > LOST_POSITION
+
+    def _linearization_point(
+        self, samples: FieldSamples, state: State
+    ) -> tuple[State | None, BoolArray]:
+        """Return where to linearise if a prediction is too wide for it, and what disagrees."""
+        nothing = np.zeros(len(samples.channels), dtype=bool)
+        if state.position_sigma <= WIDE_POSITION and state.rotation_sigma <= WIDE_ROTATION:
+            self._pointing.over()
+            return None, nothing
+        if not self._pointing.due(state.time):
+            return None, samples.valid[0]
+        fix = agreed_fix(samples, state.calibration, prior_of(state))
+        if fix is None:
+            return None, nothing
+        if not explains(fix, samples, state.calibration):
+            return None, samples.valid[0]
+        self.gate.counts["found by a fix"] += 1
+        self._pointing.over()
+        return at_fix(state, fix), fix.refused
+
+    def _found_again(self, estimator: Estimator, found: Measured, predicted: Propagated) -> bool:
+        """Give the pose up that explains nothing any more, and start from a fix."""
+        state = predicted.state
+        if not self._attempts.due(state.time):
+            return False
+        fix = agreed_fix(found.samples, state.calibration)
+        if fix is None or not fix.fixes.determined[0, 0]:
+            return False
+        if not explains(fix, found.samples, state.calibration):
+            return False
+        estimator.replace_state(restarted(state, fix))
+        self.witness.forget_motion()
+        self.score.end()
+        self._separate(None, [], estimator.state)
+        self._end_loss(state.time)
+        return True
+
+    def _lost_since(self, state: State) -> float | None:
+        if self._lost(state):
+            return self._attempts.lost_at(state.time)
+        if self._attempts.since is not None:
+            self._end_loss(state.time)
+        return None
+
+    def _end_loss(self, time: float) -> None:
+        self.gate.counts["lost and found again"] += 1
+        self.gate.refused_in_a_row = 0
+        self._attempts.over()
+        self.witness.uncertain("found_again", time)
+
+
+def _apart(state: State, fix: AgreedFix) -> tuple[float, float]:
+    """Return squared distance and offset (m) of a state from the likely hypothesis nearest to it.
+
+    A mirrored pose that explains the epoch as well is no contradiction.
+    """
+    fixes, body_from_world = fix.fixes, state.world_from_body.T
+    best = (np.inf, np.inf)
+    for k in np.flatnonzero(fixes.cost[0] < fixes.cost[0, 0] + AS_LIKELY):
+        turn = Rotation.from_matrix(body_from_world @ fixes.world_from_body[0, k]).as_rotvec()
+        shift = body_from_world @ (fixes.position_world[0, k] - state.position_world)
+        offset = np.concatenate([turn, shift])
+        cov = fix.excess * fixes.pose_cov[0, k] + state.cov[:6, :6]
+        distance = float(offset @ np.linalg.solve(cov, offset))
+        best = min(best, (distance, float(np.linalg.norm(shift))))
+    return best

@@ -1,0 +1,173 @@
+"""One linear factor an epoch of a measurement, on its state and on the calibration.
+
+GTSAM copies all values into every Python callback of a native optimizer, which makes it quadratic.
+Here a measurement is linearised in one call, and each epoch owns one JacobianFactor whose memory is
+rewritten in place at each iteration.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from magfusion.estimation.measurements.measurement import Measurement, Rows
+from magfusion.estimation.state import States
+from magfusion.model.parameters import Block, Calibration
+from magfusion.units import Array, IntArray
+
+CALIBRATION_KEY = gtsam.symbol("c", 0)
+CONSIDERED_KEY = gtsam.symbol("h", 0)
+Key = Callable[[int], int]  # of an epoch's variable
+
+
+def _constant(key: int) -> Key:
+    return lambda _epoch: key
+
+
+class Factors:
+    """One linear factor an epoch of a measurement, on its state and on the calibration.
+
+    Parameters
+    ----------
+    measurement : Measurement
+        Of one segment.
+    blocks : tuple of Block
+        Calibration parameters that are estimated.
+    own : tuple of int and int ndarray, optional
+        Key of the segment's own variable, and which columns of the calibration it holds.
+    """
+
+    def __init__(
+        self,
+        measurement: Measurement,
+        blocks: tuple[Block, ...],
+        segment: int = 0,
+        own: tuple[int, IntArray] | None = None,
+    ) -> None:
+        self.measurement, self.blocks = measurement, blocks
+        self.segment, self.own = segment, own
+        self.graph = gtsam.GaussianFactorGraph()
+        self._views: list[tuple[Array, Array]] = []
+
+    def cost(self, states: States, calibration: Calibration) -> float:
+        """Return half the sum of the losses, without a Jacobian."""
+        error = self.measurement.error(states.rows(self.measurement.epoch), calibration)
+        _, rho = Rows(error).weighed(self.measurement.loss)
+        return 0.5 * float(np.sum(rho))
+
+    def linearize(self, states: States, calibration: Calibration) -> gtsam.GaussianFactorGraph:
+        """Return the factors at a new estimate: those of before, rewritten."""
+        rows = self.rows(states, calibration, self.blocks)
+        parts = self._parts(rows)
+        jacobian = np.concatenate([part for _, part in parts], axis=-1)
+        right = -rows.error.reshape(len(jacobian), -1)
+        if not self._views:
+            keys = [(key, part.shape[-1]) for key, part in parts]
+            for epoch in self.measurement.epoch.tolist():
+                own = [(key(epoch), width) for key, width in keys]
+                factor, size = empty_factor(own, right.shape[1]), right.shape[1]
+                self.graph.push_back(factor)
+                self._views.append((factor.getA()[:size], factor.getb()[:size]))
+        for (by, error), own_by, own_right in zip(self._views, jacobian, right, strict=True):
+            by[...] = own_by
+            error[...] = own_right
+        return self.graph
+
+    def considering(
+        self,
+        states: States,
+        calibration: Calibration,
+        others: tuple[Block, ...],
+        spread: Array,
+        *,
+        explaining: bool = False,
+    ) -> gtsam.GaussianFactorGraph:
+        """Return the factors with other parameters, and nothing to explain.
+
+        With the robust weights of the factors, since an outlier that has little say in the estimate
+        passes little of the others' errors on.
+
+        Parameters
+        ----------
+        others : tuple of Block
+        spread : ndarray, shape (dimension, dimension)
+            What makes a step of them out of unit noise.
+        explaining : bool
+            With the residuals to explain after all.
+        """
+        graph = gtsam.GaussianFactorGraph()
+        rows = self.rows(states, calibration, self.blocks)
+        parts = self._parts(rows)
+        by_other = self.rows(states, calibration, others).by_calibration
+        if by_other is not None:
+            parts.append((_constant(CONSIDERED_KEY), _flat(by_other) @ spread))
+        for i, epoch in enumerate(self.measurement.epoch.tolist()):
+            size = parts[0][1].shape[1]
+            factor = empty_factor([(k(epoch), p.shape[-1]) for k, p in parts], size)
+            factor.getA()[:size] = np.concatenate([p[i] for _, p in parts], axis=1)
+            if explaining:
+                factor.getb()[:size] = -rows.error[i].ravel()
+            graph.push_back(factor)
+        return graph
+
+    def rows(self, states: States, calibration: Calibration, blocks: tuple[Block, ...]) -> Rows:
+        """Return the rows at an estimate, weighed by the robust loss."""
+        own = states.rows(self.measurement.epoch)
+        found = self.measurement.linearize(own, calibration, blocks)
+        return found.weighed(self.measurement.loss)[0]
+
+    def _parts(self, rows: Rows) -> list[tuple[Key, Array]]:
+        """Return key and derivative, shape (n, rows, k), of every variable that it feels."""
+        by_calibration = rows.by_calibration if self.blocks else None
+        every = ((X, rows.by_pose), (V, rows.by_velocity), (B, rows.by_bias))
+        parts: list[tuple[Key, Array]] = [
+            (key, _flat(part)) for key, part in every if part is not None
+        ]
+        if by_calibration is not None:
+            found = calibration_parts(_flat(by_calibration), self.own)
+            parts += [(_constant(key), part) for key, part in found]
+        return parts
+
+
+def calibration_parts(
+    by_calibration: Array, own: tuple[int, IntArray] | None
+) -> list[tuple[int, Array]]:
+    """Return key and derivative of every variable that holds a part of the calibration."""
+    if own is None:
+        return [(CALIBRATION_KEY, by_calibration)]
+    key, columns = own
+    common = by_calibration.copy()
+    common[..., columns] = 0.0
+    return [(CALIBRATION_KEY, common), (key, by_calibration[..., columns])]
+
+
+def _flat(part: Array) -> Array:
+    return part.reshape(len(part), -1, part.shape[-1])
+
+
+def empty_factor(parts: Sequence[tuple[int, int]], rows: int) -> gtsam.JacobianFactor:
+    """Return a factor of zeros, to be filled.
+
+    Parameters
+    ----------
+    parts : sequence of (int, int)
+        Key and width of each variable, in the order of the columns.
+    rows : int
+        That are to be filled; there may be a few more, which stay zero.
+    """
+    unit = gtsam.noiseModel.Unit.Create
+    groups = [parts[i : i + 3] for i in range(0, len(parts), 3)]  # no constructor takes more
+    graph, ordering = gtsam.GaussianFactorGraph(), gtsam.Ordering()
+    for i, group in enumerate(groups):
+        own = max(rows - len(groups) + 1, 1) if i == 0 else 1
+        blank: list[Any] = [x for key, width in group for x in (key, np.zeros((own, width)))]
+        blank += [np.zeros(own), unit(own)]
+        factor = gtsam.JacobianFactor(*blank)
+        if len(groups) == 1:
+            return factor
+        graph.push_back(factor)
+    for key, _ in parts:
+        ordering.push_back(key)
+    return gtsam.JacobianFactor(graph, ordering)

@@ -1,0 +1,254 @@
+"""The fixed-lag smoother: a sliding window of the batch smoother's own factors.
+
+All of the window is linearised anew at each epoch, and what leaves it stays as a prior.  GTSAM's
+`IncrementalFixedLagSmoother` would take a callback for each field factor and relinearise when it
+sees fit; here the time of an update is that of the window, whatever happens.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from magfusion.errors import EstimationError
+from magfusion.estimation.factors import CALIBRATION_KEY, empty_factor
+from magfusion.estimation.graph import Estimate, Graph
+from magfusion.estimation.inertial import Link, inertial_factor
+from magfusion.estimation.measurements.measurement import Measurement, joined
+from magfusion.estimation.process_noise import ProcessNoise
+from magfusion.estimation.propagation import Propagated
+from magfusion.estimation.solve.bordered import eliminate_partial
+from magfusion.estimation.state import (
+    MOTION,
+    State,
+    between,
+    consider_update,
+    moved_to,
+    values_of,
+)
+from magfusion.model.parameters import Block, dimension, retract
+from magfusion.units import Array
+
+ITERATIONS_FAR = 4  # where the prediction is too wide to linearise at
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """One epoch in the window.
+
+    Parameters
+    ----------
+    state : State
+        Its calibration is the window's.
+    measurements : tuple of Measurement
+        Of this epoch.
+    link : Link, optional
+        From the node before; None for the first.
+    """
+
+    state: State
+    measurements: tuple[Measurement, ...]
+    link: Link | None
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """``|sqrt_information @ step - right|^2``, steps from its point to the first node's state."""
+
+    linearization_point: State
+    sqrt_information: Array
+    right: Array
+
+
+class SlidingWindow:
+    """Fixed-lag smoother.
+
+    Parameters
+    ----------
+    state : State
+        The start, with its covariance.
+    blocks : tuple of Block
+        Calibration parameters in its tangent.
+    lag : float
+        Length of the window (s).
+    process_noise : ProcessNoise
+        Of the calibration.
+    considered : int
+        Parameters at the tangent's end that are considered, not estimated.
+    """
+
+    state: State
+    lagged: State
+    left: list[State]  # the window, in order of time
+    nodes: list[Node]
+    prior: Prior
+    _considered_cov: Array
+
+    def __init__(
+        self,
+        state: State,
+        blocks: tuple[Block, ...],
+        lag: float,
+        process_noise: ProcessNoise,
+        considered: int = 0,
+    ) -> None:
+        self.considered, self._considered_cov = considered, state.cov
+        self.blocks, self.lag, self.process_noise = blocks, lag, process_noise
+        self.state = self.lagged = state
+        self.left, self.nodes = [], []
+        self.prior = _prior_of(state)
+
+    def absorb(
+        self,
+        predicted: Propagated,
+        measurements: Sequence[Measurement],
+        linearization_point: State | None = None,
+    ) -> None:
+        """Take in what was measured at the end of an interval.
+
+        Parameters
+        ----------
+        predicted : Propagated
+            From ``state``.
+        measurements : sequence of Measurement
+            Of this epoch.
+        linearization_point : State, optional
+            Where to start the iteration, if the prediction is too wide for it.
+
+        Raises
+        ------
+        EstimationError
+            Where the window cannot be solved; it is then as it was.
+        """
+        kept = (self.nodes, self.prior, self.state, self.lagged, self.left)
+        nodes = self.nodes or [Node(self.state, (), None)]
+        new = predicted.state if linearization_point is None else linearization_point
+        self.nodes = [*nodes, Node(new, tuple(measurements), predicted.link)]
+        try:
+            for _ in range(1 if linearization_point is None else ITERATIONS_FAR):
+                self._iterate()
+            while self.nodes[-1].state.time - self.nodes[0].state.time > self.lag:
+                self._drop_first()
+        except (RuntimeError, np.linalg.LinAlgError) as error:
+            self.nodes, self.prior, self.state, self.lagged, self.left = kept
+            reason = str(error).strip().splitlines()[0]
+            raise EstimationError(f"the window could not be solved ({reason})") from error
+
+    def replace_state(self, state: State) -> None:
+        """Go on from another state, with its covariance for all that was known."""
+        self.left = [*self.left, *(n.state for n in self.nodes if n.state.time < state.time)]
+        self.nodes, self.prior = [], _prior_of(state)
+        self.state = self.lagged = state
+
+    def _iterate(self) -> None:
+        graph = self._linearized(self.nodes)
+        last = len(self.nodes) - 1
+        solved, rest = eliminate_partial(graph, _keys(range(last), None))
+        information, vector = rest.hessian(_keys([last], self.calibration_key))
+        cov = np.asarray(np.linalg.inv(information))
+        step, cov = consider_update(cov @ vector, cov, self._considered_cov, self.considered)
+        if not np.all(np.isfinite(step)):
+            raise EstimationError("the window's step is not finite")
+        given = gtsam.VectorValues()
+        for key, part in _split(step, last, self.calibration_key):
+            given.insert(key, part)
+        steps = solved.optimize(given)
+        calibration = retract(self.nodes[0].state.calibration, self.blocks, step[MOTION:])
+        nodes = []
+        for i, node in enumerate(self.nodes):
+            motion = np.concatenate([steps.at(X(i)), steps.at(V(i)), steps.at(B(i))])
+            nodes.append(replace(node, state=moved_to(node.state, calibration, motion)))
+        self.nodes = nodes
+        self.state = replace(nodes[-1].state, cov=0.5 * (cov + cov.T))
+
+    @property
+    def calibration_key(self) -> int | None:
+        """Key of the calibration; None where none is estimated."""
+        return CALIBRATION_KEY if dimension(self.blocks) else None
+
+    def _linearized(self, nodes: list[Node]) -> gtsam.GaussianFactorGraph:
+        """Return the linear graph of the first nodes of the window."""
+        native, links = gtsam.NonlinearFactorGraph(), [n.link for n in nodes[1:] if n.link]
+        for i, link in enumerate(links):
+            native.add(inertial_factor(i, link.measurement))
+        own = chain.from_iterable((m.at(i) for m in n.measurements) for i, n in enumerate(nodes))
+        acting = tuple(link for link in links if link.by_calibration is not None)
+        graph = Graph(native, tuple(joined(own)), None, self.blocks, len(nodes), acting)
+        states = [n.state for n in nodes]
+        linear = graph.linearized(Estimate(values_of(states), states[0].calibration))
+        linear.push_back(self._prior_factor(states[0]))
+        return linear
+
+    def _prior_factor(self, first: State) -> gtsam.JacobianFactor:
+        prior = self.prior
+        right = prior.right - prior.sqrt_information @ between(
+            prior.linearization_point, first, self.blocks
+        )
+        parts = [(X(0), 6), (V(0), 3), (B(0), 6)]
+        if self.blocks:
+            parts.append((CALIBRATION_KEY, dimension(self.blocks)))
+        factor = empty_factor(parts, len(right))
+        factor.getA()[...] = prior.sqrt_information
+        factor.getb()[...] = right
+        return factor
+
+    def _cov_of_first(self) -> Array:
+        """Return the covariance of the first state, the whole window and its past considered."""
+        later = range(len(self.nodes) - 1, 0, -1)
+        _, rest = eliminate_partial(self._linearized(self.nodes), _keys(later, None))
+        information, _ = rest.hessian(_keys([0], self.calibration_key))
+        cov = np.linalg.inv(information)
+        return np.asarray(0.5 * (cov + cov.T))
+
+    def _drop_first(self) -> None:
+        """Leave the information of the first node as a prior of the second."""
+        first, second = self.nodes[:2]
+        cov = self._cov_of_first()
+        graph = self._linearized([first, replace(second, measurements=())])
+        _, rest = eliminate_partial(graph, _keys([0], None), orthogonal=True)
+        sqrt_information, right = rest.jacobian(_keys([1], self.calibration_key))
+        passed = second.state.time - first.state.time
+        noise = self.process_noise.cov(second.state.calibration, second.state.time, passed)
+        sqrt_information, right = self._carried(sqrt_information, right, noise)
+        self.prior = Prior(second.state, sqrt_information, right)
+        self.lagged = replace(first.state, cov=cov)
+        self.left = [*self.left, self.lagged]
+        self.nodes = self.nodes[1:]
+
+    def _carried(self, sqrt_information: Array, right: Array, noise: Array) -> tuple[Array, Array]:
+        """Return the prior of later: some of the calibration drifts, some is not to be learnt."""
+        triangular = np.asarray(np.linalg.qr(np.column_stack([sqrt_information, right])).R)
+        size = sqrt_information.shape[1]
+        sqrt_information, right = triangular[:size, :size], triangular[:size, size]
+        if not (self.considered or np.any(noise > 0.0)):
+            return sqrt_information, right
+        inverse = np.linalg.inv(sqrt_information)
+        mean, cov = consider_update(
+            inverse @ right, inverse @ inverse.T, self._considered_cov, self.considered
+        )
+        cov[MOTION:, MOTION:] += noise
+        wide = np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
+        return wide, wide @ mean
+
+
+def _prior_of(state: State) -> Prior:
+    sqrt_information = np.linalg.inv(np.linalg.cholesky(state.cov))
+    return Prior(state, sqrt_information, np.zeros(len(sqrt_information)))
+
+
+def _keys(nodes: range | list[int], calibration: int | None) -> gtsam.Ordering:
+    ordering = gtsam.Ordering()
+    for i in nodes:
+        for symbol in (X, V, B):
+            ordering.push_back(symbol(i))
+    if calibration is not None:
+        ordering.push_back(calibration)
+    return ordering
+
+
+def _split(step: Array, node: int, calibration: int | None) -> list[tuple[int, Array]]:
+    parts = [(X(node), step[:6]), (V(node), step[6:9]), (B(node), step[9:15])]
+    return parts if calibration is None else [*parts, (calibration, step[MOTION:])]

@@ -1,0 +1,1 @@
+"""The first state of an estimator, offline and online."""

@@ -1,0 +1,177 @@
+"""A start for the smoother: the chain of hypotheses that the motion joins best."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.parameters import Calibration
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import Site
+from magfusion.model.strapdown import attitude_from_gyro_at, mean_about
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, BoolArray, IntArray
+
+POSITION_SIGMA = 0.1  # m; added to the fixes' own, which calibration errors exceed
+ROTATION_SIGMA = 0.1  # rad
+LEAP_COST = 100.0  # of a jump between unrelated hypotheses: one bad epoch must not break a chain
+RIVAL_COST = 1000.0  # chi square; a chain worse by more is no rival
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """First guess of the states.
+
+    Parameters
+    ----------
+    states : Trajectory
+        With velocity.
+    phase : ndarray, shape (n, channels)
+        Drive phase of the chosen hypotheses (rad).
+    chosen : int ndarray, shape (n,)
+        Hypothesis of each epoch.
+    cost : float
+        Chi square of the chain.
+    determined : bool ndarray, shape (n,)
+        False where the epoch alone leaves a direction of its pose open.
+    """
+
+    states: Trajectory
+    phase: Array
+    chosen: IntArray
+    cost: float
+    determined: BoolArray
+
+
+def choose_chains(
+    fixes: Fixes, imu: ImuSamples, time_offset: float, site: Site
+) -> tuple[Start, ...]:
+    """Choose chains of hypotheses so that gyro, gravity and speed agree (Viterbi).
+
+    Parameters
+    ----------
+    time_offset : float
+        (s)
+    site : Site
+        Its gravity, and how its platform moves.
+
+    Returns
+    -------
+    tuple of Start
+        The best, then those that differ from it at most epochs and are not much worse: the mirrors
+        of a dipole, between which the motion must decide.
+    """
+    time = imu.time + time_offset
+    attitude = attitude_from_gyro_at(time, imu.gyro_body, fixes.time)
+    unary = np.minimum(fixes.cost - np.min(fixes.cost, axis=1, keepdims=True), LEAP_COST)
+    unary = unary + _gravity_cost(fixes, imu, time, site)
+    unary = np.where(np.isfinite(fixes.cost), unary, np.inf)
+    link = _link_cost(fixes, attitude, site.platform.motion.speed_sigma)
+    chains: list[Start] = []
+    left = unary.copy()
+    for _ in range(fixes.cost.shape[1]):
+        chosen, cost = _viterbi(left, link)
+        fresh = all(np.mean(chosen != other.chosen) > 0.5 for other in chains)
+        if not fresh or (chains and cost > chains[0].cost + RIVAL_COST):
+            break
+        chains.append(_start(fixes, chosen, cost))
+        left[np.arange(len(fixes)), chosen] = np.inf
+        spent = ~np.isfinite(left).any(axis=1)
+        left[spent] = unary[spent]
+    return tuple(chains)
+
+
+def _start(fixes: Fixes, chosen: IntArray, cost: float) -> Start:
+    rows = np.arange(len(fixes))
+    position = fixes.position_world[rows, chosen]
+    return Start(
+        states=Trajectory(
+            time=fixes.time,
+            world_from_body=fixes.world_from_body[rows, chosen],
+            position_world=position,
+            velocity_world=_velocity(fixes.time, position),
+        ),
+        phase=fixes.phase[rows, chosen],
+        chosen=chosen,
+        cost=cost,
+        determined=fixes.determined[rows, chosen],
+    )
+
+
+def _gravity_cost(fixes: Fixes, imu: ImuSamples, time: Array, site: Site) -> Array:
+    motion = site.platform.motion
+    mean_body = mean_about(time, imu.accel_body, fixes.time, motion.accel_span)
+    mean_world = (fixes.world_from_body @ mean_body[:, None, :, None])[..., 0]
+    error = mean_world - [0.0, 0.0, site.gravity]
+    # The mean is taken in body axes that turn: a weak vote, enough against a mirrored pose.
+    return np.minimum(np.sum(error**2, axis=-1) / motion.accel_sigma**2, LEAP_COST)
+
+
+def _link_cost(fixes: Fixes, attitude: Rotation, speed_sigma: float) -> Array:
+    """Cost of going from hypothesis i to j between neighbouring epochs, shape (n-1, h, h)."""
+    dt = np.diff(fixes.time)
+    turn = (attitude[:-1].inv() * attitude[1:]).as_matrix()
+    expected = fixes.world_from_body[:-1] @ turn[:, None]
+    between = np.swapaxes(expected[:, :, None], -1, -2) @ fixes.world_from_body[1:, None]
+    angle = Rotation.from_matrix(between.reshape(-1, 3, 3)).magnitude().reshape(between.shape[:3])
+    jump = fixes.position_world[1:, None] - fixes.position_world[:-1, :, None]
+    spread = (speed_sigma * dt) ** 2 + POSITION_SIGMA**2
+    cost = np.sum(jump**2, axis=-1) / spread[:, None, None] + (angle / ROTATION_SIGMA) ** 2
+    return np.minimum(cost, LEAP_COST)
+
+
+def _viterbi(unary: Array, link: Array) -> tuple[IntArray, float]:
+    total = unary[0]
+    back = np.zeros((len(unary), unary.shape[1]), dtype=np.int64)
+    for k in range(1, len(unary)):
+        step = total[:, None] + link[k - 1]
+        back[k] = np.argmin(step, axis=0)
+        total = np.min(step, axis=0) + unary[k]
+    chosen = np.empty(len(unary), dtype=np.int64)
+    chosen[-1] = int(np.argmin(total))
+    for k in range(len(unary) - 1, 0, -1):
+        chosen[k - 1] = back[k, chosen[k]]
+    return chosen, float(np.min(total))
+
+
+def _velocity(time: Array, position: Array) -> Array:
+    if len(time) < 3:
+        return np.zeros_like(position)
+    return np.gradient(position, time, axis=0)
+
+
+def start_phases(calibration: Calibration, time: Array, phase: Array) -> Calibration:
+    """Return the calibration with the drive phase and drift that single-epoch phases suggest.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+    phase : ndarray, shape (n, channels)
+        Beyond the calibration's own (rad).
+    """
+    new_phase, drift = calibration.phase.copy(), calibration.drift.copy()
+    elapsed = time - calibration.reference_time
+    start = 0
+    for i, beacon in enumerate(calibration.site.beacons):
+        rows = slice(start, start + len(beacon.tones))
+        start = rows.stop
+        if beacon.synchronised:
+            continue
+        frequency = float(beacon.tone_frequencies_hz[0])
+        drift[i] += _dominant_drift(
+            elapsed, phase[:, rows.start], frequency, calibration.site.clock.drift_largest
+        )
+        rate = 2.0 * np.pi * beacon.tone_frequencies_hz * (drift[i] - calibration.drift[i])
+        left = np.exp(1j * (phase[:, rows] - elapsed[:, None] * rate))
+        new_phase[rows] += np.angle(np.sum(left, axis=0))
+    return replace(calibration, phase=new_phase, drift=drift)
+
+
+def _dominant_drift(elapsed: Array, phase: Array, frequency_hz: float, largest: float) -> float:
+    """Clock error that lines the phases up best."""
+    reach = max(float(np.ptp(elapsed)), 1e-3)
+    number = int(np.clip(16.0 * largest * frequency_hz * reach, 3, 20_000)) | 1
+    rates = np.linspace(-largest, largest, number) * 2.0 * np.pi * frequency_hz
+    score = [abs(np.sum(np.exp(1j * (phase - rate * elapsed)))) for rate in rates]
+    return float(rates[int(np.argmax(score))] / (2.0 * np.pi * frequency_hz))

@@ -1,0 +1,72 @@
+"""From the smoother of a log's beginning to an estimator that goes on from its last epoch."""
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.factors import CALIBRATION_KEY
+from magfusion.estimation.graph import Estimate
+from magfusion.estimation.solve.bordered import eliminate_partial
+from magfusion.estimation.state import State
+from magfusion.model.parameters import Block
+from magfusion.model.prior import prior_sqrt_covariance
+from magfusion.units import Array
+
+
+def last_state(result: Smoothed, considered: tuple[Block, ...] = ()) -> State:
+    """Return the smoothed state of the last epoch with its covariance, the calibration's included.
+
+    Parameters
+    ----------
+    considered : tuple of Block
+        Uncertain parameters that were not estimated, to be considered from here on.
+
+    Returns
+    -------
+    State
+        In the tangent of ``result.blocks``, then of those considered.
+    """
+    states, last = result.states, len(result.states) - 1
+    estimate = result.estimate
+    graph = result.graph.linearized(estimate)
+    earlier, kept = gtsam.Ordering(), gtsam.Ordering()
+    for i in range(len(states)):
+        for symbol in (X, V, B):
+            (kept if i == last else earlier).push_back(symbol(i))
+    if result.blocks:
+        kept.push_back(CALIBRATION_KEY)
+    _, rest = eliminate_partial(graph, earlier)
+    information, _ = rest.hessian(kept)
+    cov = _with_considered(np.asarray(np.linalg.inv(information)), result, estimate, considered)
+    assert states.velocity_world is not None
+    assert states.accel_bias_body is not None
+    assert states.gyro_bias_body is not None
+    return State(
+        time=float(states.time[last]),
+        world_from_body=states.world_from_body[last],
+        position_world=states.position_world[last],
+        velocity_world=states.velocity_world[last],
+        accel_bias_body=states.accel_bias_body[last],
+        gyro_bias_body=states.gyro_bias_body[last],
+        calibration=result.calibration,
+        cov=0.5 * (cov + cov.T),
+    )
+
+
+def _with_considered(
+    cov: Array, result: Smoothed, estimate: Estimate, considered: tuple[Block, ...]
+) -> Array:
+    """Return the joint covariance with parameters that the estimate took for known."""
+    if not considered:
+        return cov
+    last = len(result.states) - 1
+    spread = prior_sqrt_covariance(result.declared.site, considered)
+    columns = []
+    for step in result.graph.responses(estimate, considered):
+        own = [step.at(X(last)), step.at(V(last)), step.at(B(last))]
+        own += [step.at(CALIBRATION_KEY)] if result.blocks else []
+        columns.append(np.concatenate(own))
+    response = np.stack(columns, axis=1)
+    across = response @ spread.T
+    return np.block([[cov + response @ response.T, across], [across.T, spread @ spread.T]])

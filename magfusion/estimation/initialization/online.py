@@ -1,0 +1,150 @@
+"""The first state of an online estimator: the smoother over the data gathered so far."""
+
+from dataclasses import dataclass, field
+from dataclasses import fields as fields_of
+
+import numpy as np
+
+from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.batch import (
+    AMBIGUOUS_CHI_SQUARE,
+    Smoothed,
+    SmootherSettings,
+    smooth,
+)
+from magfusion.estimation.initialization.handover import last_state
+from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.score import Score, score_of
+from magfusion.estimation.settings import EstimatorSettings
+from magfusion.estimation.state import POSITION, ROTATION, State
+from magfusion.estimation.stream_buffer import Buffer
+from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
+from magfusion.model.site import Site
+from magfusion.model.trust import Trust, Verdict
+from magfusion.receiver.receiver import Receiver
+
+
+@dataclass(frozen=True, eq=False)
+class OnlineStart:
+    """Where an online estimator begins.
+
+    Parameters
+    ----------
+    waveform : Waveform, optional
+        By whose samples the receiver begins; None where phasors come.
+    rival_chi_square : float, optional
+        By how much the data preferred this start to its rival.
+    trust : Trust
+        What the witnesses say of the smoothed beginning.
+    score : Score, optional
+        Of what the smoothed beginning holds.
+    turn, shift : float
+        By how much more attitude (rad) and position (m) may be off for it, one sigma an axis.
+    """
+
+    state: State
+    waveform: Waveform | None
+    rival_chi_square: float | None
+    trust: Trust = field(default_factory=Trust)
+    score: Score | None = None
+    turn: float = 0.0
+    shift: float = 0.0
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether a mirrored start explains the data nearly as well."""
+        rival = self.rival_chi_square
+        return rival is not None and rival < AMBIGUOUS_CHI_SQUARE
+
+
+@dataclass(frozen=True)
+class NoStart:
+    """Why the data lead to no state yet.
+
+    Parameters
+    ----------
+    reason : str
+        A sentence.
+    trust : Trust
+        What the witnesses say of the smoothed beginning, where that is why.
+    """
+
+    reason: str = "Record longer."
+    trust: Trust = field(default_factory=Trust)
+
+
+def find_online_start(
+    site: Site,
+    imu: ImuSamples,
+    waveform: Buffer,
+    fields: list[FieldSamples],
+    steady: list[SteadyFields],
+    until: float,
+    settings: EstimatorSettings,
+) -> OnlineStart | NoStart:
+    """Return the state at the last epoch before a time; or why the data lead to none.
+
+    Parameters
+    ----------
+    fields : list of FieldSamples
+        One epoch each; used where there are any.
+    steady : list of SteadyFields
+        Beside ``fields``.
+    until : float
+        (s)
+    """
+    time, rows = waveform.rows()
+    if not fields:
+        receiver = Receiver.of(site, settings.lockin)
+        receiver.check()
+        if settings.earth:
+            receiver.lockin()
+    whole = [s for s in fields if s.time[0] <= until]
+    log = Log(
+        name="the beginning",
+        epoch_ns=0,
+        source="online",
+        imu=imu,
+        waveform=None if fields else Waveform(time[time <= until], rows[time <= until]),
+        fields=FieldSamples.joined(whole) if whole else None,
+        steady=_joined_steady(steady, whole) if whole and steady else None,
+    )
+    asked = {f.name: getattr(settings, f.name) for f in fields_of(EstimatorSettings)}
+    try:
+        result = smooth(log, site, SmootherSettings(loss="huber", **asked))
+        honest, trust = judged(result, log)
+        score = score_of(result, imu)
+        state = last_state(result, result.considered)
+    except (EstimationError, InputError) as error:
+        return NoStart(f"{error}.")
+    except (RuntimeError, np.linalg.LinAlgError):
+        return NoStart("The measurements leave a direction of the motion open.")
+    if trust.verdict is Verdict.FAILED:
+        return NoStart(trust.reasons[0].text, trust)
+    return OnlineStart(
+        state, log.waveform, result.rival_chi_square, trust, score, *_wider(result, honest)
+    )
+
+
+def _wider(result: Smoothed, honest: Smoothed) -> tuple[float, float]:
+    """Return what the witnesses add to the last state's sigmas of rotation and position."""
+    assert result.states.pose_cov is not None
+    assert honest.states.pose_cov is not None
+    added = honest.states.pose_cov[-1] - result.states.pose_cov[-1]
+    largest = [np.max(np.linalg.eigvalsh(added[part, part])) for part in (ROTATION, POSITION)]
+    turn, shift = np.sqrt(np.maximum(largest, 0.0))
+    return float(turn), float(shift)
+
+
+def _joined_steady(parts: list[SteadyFields], fields: list[FieldSamples]) -> SteadyFields | None:
+    """Return the steady fields of the epochs; None where one has none."""
+    known = {float(part.time[0]): part for part in parts}
+    wanted = [known.get(float(s.time[0])) for s in fields]
+    found = [part for part in wanted if part is not None]
+    if len(found) < len(wanted):
+        return None
+    return SteadyFields(
+        time=np.concatenate([p.time for p in found]),
+        measured_sensor=np.concatenate([p.measured_sensor for p in found]),
+        cov=np.concatenate([p.cov for p in found]),
+    )

@@ -1,0 +1,380 @@
+"""What has arrived for a navigator and is not used up yet.
+
+How far all of it goes, and what of it was measured at an epoch.
+"""
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.estimation.initialization.online import OnlineStart
+from magfusion.estimation.integrity.detection import DetectionFilter
+from magfusion.estimation.measurements.earth import EarthField, earth_measurement
+from magfusion.estimation.measurements.measurement import Measurement
+from magfusion.estimation.measurements.model_error import alike_online
+from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
+from magfusion.estimation.measurements.zero_velocity import (
+    REACH,
+    may_stand,
+    quiet_before,
+)
+from magfusion.estimation.motion_compensation import MotionCompensated, demodulate_predicted
+from magfusion.estimation.preintegration import RATE_SPAN
+from magfusion.estimation.state import MOTION, VELOCITY, State, as_trajectory
+from magfusion.estimation.stream_buffer import Buffer, check_clock
+from magfusion.model.parameters import TIME_OFFSET, Block
+from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
+from magfusion.receiver.receiver import LockinReceiver, Receiver
+from magfusion.units import Array
+
+LONGEST_WAIT = 5.0  # s; the fields go on without an IMU that is silent for longer
+OFFSET_STALE = 1e-4  # s; at a radian a second, six thousandths of a degree
+MARGIN = 0.1  # s; of inertial samples about a window
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What an epoch holds.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        Without the beacons that are not detected.
+    earth : EarthField, optional
+        The steady field as a measurement, where it is one.
+    steady : SteadyFields, optional
+        It as it was measured, where there is a waveform.
+    repeats : float
+        How many epochs hold each sample of overlapping windows.
+    """
+
+    samples: FieldSamples
+    phasors: FieldPhasors
+    earth: EarthField | None
+    steady: SteadyFields | None
+    repeats: float
+
+
+class Arrivals:
+    """Streams in order of time, each on its own clock.
+
+    Parameters
+    ----------
+    receiver : Receiver
+        Of the waveform; it begins with the first state, and not at all where phasors come.
+    applied_offset : float
+        Added to the IMU's stamps (s).
+
+    Attributes
+    ----------
+    imu, waveform : Buffer
+        Rates and specific forces of the body; raw fields.
+    fields : list of FieldSamples
+        One epoch each, the oldest first.
+    steady : dict
+        By the time of the epoch (s), the steady fields with it.
+    others : list of (float, Measurement)
+        Anything else that was measured, and when (s).
+    windows : deque of int
+        Numbers of windows that were admitted and not demodulated yet.
+    usual : float, optional
+        Sampling interval of the IMU (s), once there is a state.
+    last_epoch : float
+        When fields were last measured (s).
+    """
+
+    receiver: Receiver
+    applied_offset: float
+    imu: Buffer
+    waveform: Buffer
+    fields: list[FieldSamples]
+    steady: dict[float, SteadyFields]
+    others: list[tuple[float, Measurement]]
+    windows: deque[int]
+    usual: float | None
+    last_epoch: float
+    _detection: DetectionFilter
+    _window: int | None  # at the state that is to be predicted
+    _noise: list[Array]
+
+    def __init__(self, receiver: Receiver, applied_offset: float) -> None:
+        self.receiver = receiver
+        self.applied_offset = applied_offset
+        self.imu = Buffer("imu", 6)
+        self.waveform = Buffer("magnetometer", 3)
+        self.fields, self.steady, self.others = [], {}, []
+        self.windows = deque()
+        self.usual = self._window = None
+        self.last_epoch = -np.inf
+        self._detection = DetectionFilter()
+        self._noise = []
+
+    # What goes in
+
+    def add_imu(self, time: Array, gyro_body: Array, accel_body: Array) -> None:
+        """Take inertial samples, as `Navigator.add_imu`."""
+        stamps = np.atleast_1d(time)
+        check_clock("imu", stamps, self._newest)
+        self.imu.add(stamps, np.hstack([np.atleast_2d(gyro_body), np.atleast_2d(accel_body)]))
+
+    def add_magnetometer(self, time: Array, measured_sensor: Array) -> None:
+        """Take raw samples of the magnetometer, as `Navigator.add_magnetometer`."""
+        stamps = np.atleast_1d(time)
+        check_clock("magnetometer", stamps, self._newest)
+        self.waveform.add(stamps, np.atleast_2d(measured_sensor))
+
+    def add_fields(self, samples: FieldSamples, steady: SteadyFields | None, after: float) -> int:
+        """Take phasors, as `Navigator.add_fields`; return how many are not after a time (s)."""
+        check_clock("fields", samples.time, self._newest)
+        late = 0
+        for i in range(len(samples)):
+            one = samples.rows(slice(i, i + 1))
+            if one.time[0] <= after:
+                late += 1
+                continue
+            self.fields.append(one)
+            if steady is not None:
+                self.steady[float(one.time[0])] = steady.rows(slice(i, i + 1))
+        self.fields.sort(key=lambda s: float(s.time[0]))
+        return late
+
+    def add_measurement(self, time: float, measurement: Measurement, after: float) -> bool:
+        """Take any other measurement; return whether it is after a time (s)."""
+        check_clock("measurement", np.array([time]), self._newest)
+        if time > after:
+            self.others.append((time, measurement.at(0)))
+            self.others.sort(key=lambda other: other[0])
+        return time > after
+
+    # How far it goes
+
+    @property
+    def next_field(self) -> float:
+        """When the next fields are measured (s), as far as is known."""
+        if self.fields:
+            return float(self.fields[0].time[0])
+        if self.receiver.grid is None:
+            return np.inf
+        number = self.windows[0] if self.windows else self.receiver.next_number
+        return self.receiver.centre_of(number)
+
+    @property
+    def next_other(self) -> float:
+        """When anything else was measured next (s)."""
+        return self.others[0][0] if self.others else np.inf
+
+    @property
+    def _newest(self) -> float:
+        """Newest stamp of all streams (s)."""
+        return max(self.imu.newest, self.waveform.newest, self._newest_field)
+
+    @property
+    def _newest_field(self) -> float:
+        """Newest stamp of the fields (s)."""
+        last = float(self.fields[-1].time[0]) if self.fields else -np.inf
+        return max(last, self.waveform.newest)
+
+    @property
+    def first(self) -> float:
+        """Oldest stamp of the fields (s)."""
+        if self.fields:
+            return float(self.fields[0].time[0])
+        time, _ = self.waveform.rows()
+        return float(time[0]) if len(time) else np.inf
+
+    @property
+    def inertial(self) -> float:
+        """Time of the newest inertial sample (s)."""
+        return self.imu.newest + self.applied_offset
+
+    @property
+    def reached(self) -> float:
+        """Until when everything has come (s)."""
+        return min(self.inertial, self._newest_field)
+
+    @property
+    def awaited(self) -> float:
+        """Until when the inertial samples have come, or are not waited for any more (s)."""
+        return max(self.inertial, self._newest_field - LONGEST_WAIT)
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """What was of no use, with the reason: windows, samples."""
+        late = {f"{b.name} sample too late": b.late for b in (self.imu, self.waveform) if b.late}
+        return {**{f"window: {k}": v for k, v in self.receiver.dropped.items()}, **late}
+
+    # How it goes on
+
+    def forget_before_start(self, kept: float) -> None:
+        """Keep no more than so long (s), whatever it is."""
+        oldest = self.reached - kept
+        for buffer in (self.imu, self.waveform):
+            buffer.forget(oldest, oldest)
+        self.fields = [s for s in self.fields if s.time[0] >= oldest]
+
+    def start(self, start: OnlineStart, delay: float) -> None:
+        """Go on from a first state, and drop what it has used; the delay as of `receive`."""
+        time = start.state.time
+        self.applied_offset = start.state.calibration.time_offset
+        self.usual = float(np.median(np.diff(self.imu.rows()[0])))
+        self.fields = [s for s in self.fields if s.time[0] > time]
+        self.steady = {t: s for t, s in self.steady.items() if t > time}
+        self.others = [other for other in self.others if other[0] > time]
+        self.last_epoch = time
+        if start.waveform is not None:
+            self.receiver.begin(start.waveform, self.inertial_samples())
+            self.receive(start.state, delay)
+        self.forget(time)
+
+    def receive(self, state: State, delay: float) -> None:
+        """Judge the windows that are complete and not too late for a delay (s); demodulate slots.
+
+        Windows wait for a prediction of the motion in them.
+        """
+        until, receiver = min(self.awaited, self.waveform.newest) - delay, self.receiver
+        if not receiver.complete(until):
+            return
+        assert receiver.grid is not None
+        waveform, imu = self._waveform_samples(), self.inertial_samples()
+        # The first state has used windows, too.
+        after = self.last_epoch + 0.25 * receiver.grid.step
+        if isinstance(receiver, LockinReceiver):
+            windows = receiver.admit(waveform, imu, until)
+            self.windows.extend(windows.number[windows.centre > after].tolist())
+        else:
+            offset = self.applied_offset
+            found = receiver.push(waveform, imu, until, state.gyro_bias_body, offset)
+            self.fields += found.rows(found.time > after).epochs()
+
+    def next_window(self) -> float | None:
+        """Go on to the next window that was admitted: return its centre (s); None for none."""
+        if not self.windows:
+            return None
+        self._window = self.windows.popleft()
+        return self.receiver.centre_of(self._window)
+
+    @property
+    def window_to_come(self) -> bool:
+        """Whether the samples of a window are there that awaits its inertial ones."""
+        return self.receiver.complete(self.waveform.newest)
+
+    def apply_offset_anew(self, state: State, blocks: tuple[Block, ...]) -> float:
+        """Cut the inertial stream by the time offset that has been learnt since; return the change.
+
+        A state is the platform's where the IMU's stamp says; under another offset it is the same
+        state, a little earlier or later (s) on the log's clock.
+        """
+        own = [MOTION + b.columns.start for b in blocks if b.parameter == TIME_OFFSET]
+        if not own:
+            return 0.0
+        lag = state.calibration.time_offset - self.applied_offset
+        if abs(lag) < max(OFFSET_STALE, 2.0 * float(np.sqrt(state.cov[own[0], own[0]]))):
+            return 0.0
+        self.applied_offset += lag
+        return lag
+
+    def forget(self, time: float) -> None:
+        """Keep the samples that are needed after a state (s)."""
+        reach = 2.0 + self.receiver.history
+        self.imu.forget(time - reach, time - self.applied_offset - 1.0)
+        self.waveform.forget(time - reach, time - reach)
+
+    # What comes out
+
+    def inertial_samples(self, begin: float = -np.inf, end: float = np.inf) -> ImuSamples:
+        """Return the inertial samples between two stamps of their own, and the next outside."""
+        time, rows = self.imu.between(begin, end)
+        return ImuSamples(time, rows[:, :3], rows[:, 3:])
+
+    def others_at(self, time: float) -> list[Measurement]:
+        """Return anything else that was measured at a time (s), once."""
+        found = [measurement for when, measurement in self.others if when == time]
+        self.others = [other for other in self.others if other[0] > time]
+        return found
+
+    def rests(self, state: State) -> bool:
+        """Return whether the platform is at rest, as far as is known."""
+        stamp = state.time - self.applied_offset
+        motion = state.calibration.site.platform.motion
+        imu = self.inertial_samples(stamp - motion.rest_span - REACH, stamp + REACH)
+        quiet, cov = quiet_before(imu, np.array([stamp]), motion)[0], state.cov[VELOCITY, VELOCITY]
+        return bool(quiet and may_stand(state.velocity_world, cov, motion))
+
+    def measured(
+        self,
+        before: State,
+        predicted: State,
+        samples: FieldSamples | None,
+        step: float,
+        *,
+        earth: bool,
+    ) -> Measured | None:
+        """Return what was detected and measured at a prediction; None where nothing was.
+
+        Parameters
+        ----------
+        before, predicted : State
+            At the epoch before and at this.
+        samples : FieldSamples, optional
+            Of this epoch; None where there may be a window of it.
+        step : float
+            Since fields were last measured (s).
+        earth : bool
+            Whether a steady field is a measurement.
+        """
+        time = predicted.time
+        by_offset, steady = None, self.steady.pop(time, None)
+        if samples is None:
+            wave = self._demodulated(before, predicted)
+            if wave is None:
+                return None  # only the clock went on
+            samples, steady, by_offset = wave.fields, wave.steady, wave.by_time_offset
+        samples = self._detection.of(samples, step)
+        if not np.any(samples.valid) and not (earth and steady is not None):
+            return None
+        self.last_epoch = time
+        now, offset = np.zeros(1, dtype=np.int64), self.applied_offset
+        rate_body = (self._rate_body(time) - predicted.gyro_bias_body)[None]
+        repeats = max(1.0, float(samples.window[0]) / step)
+        speed = float(np.linalg.norm(predicted.velocity_world))
+        phasors = field_phasors(
+            predicted.calibration.site,
+            samples,
+            now,
+            as_trajectory([predicted]),
+            rate_body,
+            offset,
+            repeats,
+            by_offset,
+            alike_online(speed, step, predicted.calibration.site.model_error_length),
+        )
+        field = None
+        if earth and steady is not None:
+            site = predicted.calibration.site
+            field = earth_measurement(site, steady, now, rate_body, offset, step)
+        return Measured(samples, phasors, field, steady, repeats)
+
+    def _demodulated(self, before: State, predicted: State) -> MotionCompensated | None:
+        """Return the window at a prediction; None where there is none."""
+        number, receiver = self._window, self.receiver
+        if number is None or receiver.centre_of(number) != predicted.time:
+            return None
+        assert isinstance(receiver, LockinReceiver)
+        half = receiver.settings.window / 2.0
+        begin, end = min(before.time, predicted.time - half), predicted.time + half
+        imu = self.inertial_samples(begin - MARGIN, end + MARGIN)
+        found = demodulate_predicted(
+            receiver, number, self._waveform_samples(), imu, before, predicted, self.applied_offset
+        )
+        # The mean over neighbouring windows, as far as they are known.
+        self._noise = [*self._noise, found.fields.phasor_cov][-receiver.settings.noise_windows :]
+        return replace(found, fields=replace(found.fields, phasor_cov=np.mean(self._noise, axis=0)))
+
+    def _waveform_samples(self) -> Waveform:
+        return Waveform(*self.waveform.rows())
+
+    def _rate_body(self, time: float) -> Array:
+        stamp = time - self.applied_offset
+        _, rows = self.imu.between(stamp - RATE_SPAN / 2, stamp + RATE_SPAN / 2)
+        return np.asarray(np.mean(rows[:, :3], axis=0)) if len(rows) else np.zeros(3)

@@ -1,0 +1,1 @@
+"""Whether measurements and state agree: innovation gate, detection, recovery."""

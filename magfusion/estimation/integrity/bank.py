@@ -1,0 +1,226 @@
+"""Filters without each beacon beside the running estimate: separation online, at constant cost.
+
+Each is kept as its deviation from the estimate, linearised where that is, with the covariance of
+both: what a false beacon did is in the estimate's prior for long, but never was in the filter
+without it, so that a slow fault is seen too.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.ekf import measured_rows
+from magfusion.estimation.integrity.judgement import Judgement
+from magfusion.estimation.integrity.separation import Separation, protection_levels
+from magfusion.estimation.measurements.measurement import Measurement
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.propagation import Propagated
+from magfusion.estimation.state import MOTION, State, between
+from magfusion.model.parameters import Block
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Risk, Verdict
+from magfusion.units import DEGREE, Array, IntArray
+
+MOST = 6  # filters; of more beacons some share one
+SLACK = 3.0  # sigma; a deviation below it is covered
+# Of what a filter without a beacon does not take over from a start that was made with all.
+WIDE = np.repeat([0.2, 0.3, 0.5], 3)  # rad, m, m/s
+OPEN_ROTATION, OPEN_POSITION = 0.3, 10.0  # rad, m; beyond, nothing else determines the pose
+
+
+class SubsetBank:
+    """Filters without each beacon, or without each of a few groups of them.
+
+    Parameters
+    ----------
+    blocks : tuple of Block
+        Calibration parameters in the states' tangent.
+    considered : int
+        Parameters at the tangent's end that are considered, not estimated.
+    """
+
+    _step: Array | None  # (groups, n); of each filter from the estimate
+    _cov: Array | None  # (1 + groups, n, n); of the filter with all, then of those without
+    _joint: Array | None  # (groups, n, n); of the errors of each with those of the one with all
+
+    def __init__(
+        self, site: Site, blocks: tuple[Block, ...], considered: int, risk: Risk | None = None
+    ) -> None:
+        self.blocks, self.considered = blocks, considered
+        self.risk = Risk() if risk is None else risk
+        self.names = [beacon.name for beacon in site.beacons]
+        self.groups = min(len(self.names), MOST)
+        self._step = self._cov = self._joint = None
+        names = [name for name, _ in site.channels]
+        self._owner = np.array([self.names.index(name) % self.groups for name in names])
+
+    def check(self, size: int) -> None:
+        """See that the filters are of states of a size, as a checkpoint gave them.
+
+        Raises
+        ------
+        ValueError
+            Where they are not.
+        """
+        parts = (self._step, self._cov, self._joint)
+        if all(part is None for part in parts):
+            return
+        shapes = ((self.groups, size), (1 + self.groups, size, size), (self.groups, size, size))
+        for part, shape in zip(parts, shapes, strict=True):
+            if part is None or part.shape != shape or not np.all(np.isfinite(part)):
+                raise ValueError("has filters of another shape, or not finite")
+
+    def forget(self) -> None:
+        """Begin anew: the estimate has."""
+        self._step = self._cov = self._joint = None
+
+    def absorb(
+        self, predicted: Propagated, measurements: Sequence[Measurement], after: State
+    ) -> None:
+        """Go on to where the estimate is now.
+
+        Parameters
+        ----------
+        predicted : Propagated
+            From the estimate before.
+        measurements : sequence of Measurement
+            Of this epoch, as the estimate took them in.
+        after : State
+            The estimate.
+        """
+        if self._step is None or self._step.shape[1] != len(after.cov):
+            self._begin(after)
+            return
+        assert self._cov is not None
+        assert self._joint is not None
+        motion, noise = predicted.transition[:MOTION], predicted.noise
+        step, cov, joint = (part.copy() for part in (self._step, self._cov, self._joint))
+        step[:, :MOTION] = step @ motion.T
+        for part in (cov, joint):
+            part[:, :MOTION] = motion @ part
+            part[:, :, :MOTION] = part @ motion.T
+            part += noise
+        error, jacobian, owner = self._rows(measurements, predicted.state)
+        taken = self._taken(jacobian, owner)
+        crossed = taken @ cov
+        gain = self._gains(taken, crossed)
+        back = np.swapaxes(gain, 1, 2)
+        innovation = error + step @ jacobian.T
+        step = step - (gain[1:] @ innovation[..., None])[..., 0]
+        step -= between(predicted.state, after, self.blocks)
+        # Joseph's form: what is considered is not updated as would be best.
+        half = cov - gain @ crossed
+        whole = half + (gain - half @ np.swapaxes(taken, 1, 2)) @ back
+        half = joint - gain[1:] @ (taken[1:] @ joint)
+        self._joint = half + (gain[1:] - half @ taken[0].T) @ back[0]
+        self._step, self._cov = step, 0.5 * (whole + np.swapaxes(whole, 1, 2))
+
+    def _begin(self, state: State) -> None:
+        size = len(state.cov)
+        self._step = np.zeros((self.groups, size))
+        self._joint = np.repeat(state.cov[None], self.groups, axis=0)
+        self._cov = np.repeat(state.cov[None], 1 + self.groups, axis=0)
+        own = np.arange(len(WIDE))
+        self._cov[1:, own, own] += WIDE**2
+
+    def _rows(
+        self, measurements: Sequence[Measurement], state: State
+    ) -> tuple[Array, Array, IntArray]:
+        """Return error, Jacobian and group of each row; negative of what is no beacon's."""
+        parts = [(measured_rows([], state, self.blocks), np.zeros(0, dtype=np.int64))]
+        for measurement in measurements:
+            rows = measured_rows([measurement], state, self.blocks)
+            of_field = isinstance(measurement, FieldPhasors)
+            owner = np.repeat(self._owner, 6) if of_field else np.full(len(rows[0]), -1)
+            parts.append((rows, owner))
+        error = np.concatenate([rows[0] for rows, _ in parts])
+        jacobian = np.concatenate([rows[1] for rows, _ in parts])
+        return error, jacobian, np.concatenate([owner for _, owner in parts])
+
+    def _taken(self, jacobian: Array, owner: IntArray) -> Array:
+        """Return the rows that every filter takes in, zero of what it leaves out."""
+        others = [owner != group for group in range(self.groups)]
+        kept = np.stack([np.ones(len(owner), dtype=bool), *others])
+        return np.where(kept[:, :, None], jacobian, 0.0)
+
+    def _gains(self, taken: Array, crossed: Array) -> Array:
+        """Return the gain of every filter, shape (1 + groups, n, rows)."""
+        innovation = crossed @ np.swapaxes(taken, 1, 2) + np.eye(taken.shape[1])
+        gain = np.swapaxes(np.linalg.solve(innovation, crossed), 1, 2)
+        if self.considered:
+            gain[:, -self.considered :] = 0.0
+        return np.asarray(gain)
+
+    def heard(self, judgement: Judgement, state: State) -> Judgement:
+        """Return what is said of a state with what the bank says of it, and its levels."""
+        found = self.separation(state)
+        if found is None or judgement.verdict is Verdict.FAILED:
+            return judgement
+        excess = found.excess(self.risk, SLACK)[0]
+        if np.max(excess) <= 1.0:
+            # What the witnesses allow for is beyond what separation knows of.
+            position_m, degrees = self.levels(found)
+            wide, more = np.sqrt(judgement.inflation), SLACK * np.sqrt(3.0)
+            return replace(
+                judgement,
+                protection_level_m=_wider(position_m, wide, more * judgement.shift),
+                protection_level_deg=_wider(degrees, wide, more * judgement.turn / DEGREE),
+            )
+        worst = int(np.argmax(excess))
+        turn, shift = np.max(np.where(found.determined[0, :, None], found.shift[0], 0.0), axis=0)
+        text = (
+            f"The state with and without {self._called(worst)} differs by {1e3 * shift:.3g} mm,"
+            f" {excess[worst]:.3g} times what noise and survey explain: the beacons contradict each"
+            " other. Check their drive, and iron or a screen near one."
+        )
+        return replace(
+            judgement,
+            findings=(
+                *judgement.findings,
+                Finding("separation", text, weight=float(excess[worst])),
+            ),
+            turn=max(judgement.turn, float(turn)),
+            shift=max(judgement.shift, float(shift)),
+        )
+
+    def _called(self, group: int) -> str:
+        names = self.names[group :: self.groups]
+        return f"beacon {names[0]}" if len(names) == 1 else f"beacons {', '.join(names)}"
+
+    def separation(self, state: State) -> Separation | None:
+        """Return how the filters deviate from an estimate; None where there are none yet."""
+        if self._step is None or self._cov is None or self._joint is None:
+            return None
+        pose = np.s_[:, :6, :6]
+        subset, joint = self._cov[1:][pose], self._joint[pose]
+        apart = subset + self._cov[:1][pose] - joint - np.swapaxes(joint, 1, 2)
+        variance = np.einsum("gii->gi", subset)
+        determined = (np.sum(variance[:, :3], axis=1) < OPEN_ROTATION**2) & (
+            np.sum(variance[:, 3:], axis=1) < OPEN_POSITION**2
+        )
+        count = (1, self.groups)
+        return Separation(
+            self._step[None, :, :6],
+            state.cov[None, :6, :6],
+            subset[None],
+            apart[None],
+            determined[None],
+            np.zeros(count),
+            np.full(count, 6),
+        )
+
+    def levels(self, found: Separation) -> tuple[float | None, float | None]:
+        """Return the protection levels of position (m) and attitude (deg), if there are any."""
+        members = np.bincount(np.arange(len(self.names)) % self.groups)
+        prior = np.array(self.risk.fault * members[None], dtype=np.float64)
+        position_m, degrees = protection_levels(found, self.risk, SLACK, prior)
+        return _known(position_m[0]), _known(degrees[0])
+
+
+def _wider(level: float | None, factor: float, more: float) -> float | None:
+    return None if level is None else float(factor * level + more)
+
+
+def _known(level: float) -> float | None:
+    return float(level) if np.isfinite(level) else None

@@ -1,0 +1,327 @@
+"""What may be wrong with one beacon alone: found by leaving each out in turn."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.integrity.explanation import LEAST_FALL, Explanation
+from magfusion.estimation.integrity.field_causes import (
+    LENGTH_FACTORS,
+    MOMENT_FACTORS,
+    coils_exchanged,
+    length_cause,
+    scaled,
+)
+from magfusion.estimation.integrity.field_snapshots import Snapshots
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.parameters import (
+    BEACON_POSITION,
+    BEACON_ROTATION,
+    LOG_MOMENT,
+    MATRIX,
+    PHASE,
+    predict_channels,
+)
+from magfusion.model.site import Beacon, Site
+from magfusion.units import DEGREE, Array, BoolArray
+
+FEWEST = 3  # beacons; of two, none can be told to be the wrong one
+SUSPECTS = 2  # beacons that are looked at
+WORSE = 6.0  # times its sigmas, that a survey may be wrong
+SURVEYED = 0.3  # of chi square's freedom, that a survey leaves: snapshots weigh by its sigmas too
+MISFIT = 1.2  # chi square of snapshots over its freedom, above which fields are not explained
+SILENT = 0.2  # of the field that is expected
+ALIKE = 1.5  # times the chi square without a beacon, that a mistake in it may leave
+STEADY = 0.05  # spread of a gain over time that is none
+WIDE = (0.5, 1.0, 0.7, 3.0)  # sigmas: position (m), rotation (rad), log moment, phase (rad)
+
+
+def beacon_causes(known: Snapshots) -> Iterator[Explanation]:
+    """Yield what would be explained by a mistake in one beacon."""
+    names = [beacon.name for beacon in known.site.beacons]
+    if len(names) < FEWEST:
+        return
+    left = {name: known.without(name) for name in names}
+    ranked = sorted(names, key=lambda name: left[name].chi_square / max(left[name].freedom, 1.0))
+    for name in ranked[:SUSPECTS]:
+        # No mistake in a beacon explains more than to leave it out.
+        if _explained(known, left[name].chi_square, 0, "phase", "", "").clear:
+            yield from _of_one(known, left[name], name)
+
+
+def matrix_causes(known: Snapshots, steady: float | None) -> Iterator[Explanation]:
+    """Yield what iron on the body, or another scale of all fields, would explain.
+
+    Parameters
+    ----------
+    steady : float, optional
+        Usual size of the steady field, relative to the Earth's.
+    """
+    after, found = known.fitted([(MATRIX, MATRIX.owner, 0.3)], known.fixes)
+    magnetometer = known.site.platform.magnetometer
+    change = found.site.platform.magnetometer.matrix - magnetometer.matrix
+    even = 0.5 * (change + change.T)
+    scale = float(np.trace(even)) / 3.0
+    uneven = float(np.max(np.abs(even - scale * np.eye(3))))
+    if uneven < max(0.1 * abs(scale), 0.003):
+        yield from _scales(known, 1.0 + scale, steady)
+        return
+    yield _explained(
+        known,
+        after,
+        9,
+        "magnetometer_matrix",
+        f"the magnetometer's matrix is off by up to {100.0 * float(np.max(np.abs(even))):.2g} %,"
+        " as by iron on the body",
+        "Calibrate the magnetometer on the body (magfusion calibrate magnetometer).",
+    )
+
+
+def survey_causes(known: Snapshots) -> Iterator[Explanation]:
+    """Yield what a survey that is worse than declared, of all beacons, would explain."""
+    if known.chi_square < MISFIT * known.freedom:
+        return
+    free = []
+    for beacon in known.site.beacons:
+        free += [
+            (
+                BEACON_POSITION,
+                beacon.name,
+                WORSE * max(float(np.max(beacon.sigma.position_world)), 0.01),
+            ),
+            (
+                BEACON_ROTATION,
+                beacon.name,
+                WORSE * max(float(np.max(beacon.sigma.rotation_beacon)), 0.01),
+            ),
+            (LOG_MOMENT, beacon.name, WORSE * max(float(np.max(beacon.sigma.log_moment)), 0.005)),
+        ]
+    after, found = known.fitted(free, known.fixes)
+    if after > SURVEYED * known.freedom:
+        return  # beacons elsewhere explain a part of anything
+    steps = [
+        np.linalg.norm(BEACON_POSITION.difference(known.calibration, found, beacon.name))
+        for beacon in known.site.beacons
+    ]
+    yield _explained(
+        known,
+        after,
+        3 * len(steps),
+        "survey_overconfident",
+        "the survey of the beacons is worse than its declared sigmas (they are found"
+        f" {_listed(100.0 * np.array(steps), 2)} cm from where they are declared)",
+        "Declare the sigmas that the survey has, so that the beacons are estimated.",
+    )
+
+
+def _scales(known: Snapshots, scale: float, steady: float | None) -> Iterator[Explanation]:
+    """Yield what fields so many times as large as declared mean."""
+    trial = scale * np.array([0.98, 1.0, 1.02])
+    costs = [known.of(_stronger(known.site, s)).chi_square for s in trial]
+    fit = np.polyfit(trial / scale - 1.0, costs, 2)
+    best = scale * (1.0 + float(np.clip(-0.5 * fit[1] / max(fit[0], 1e-300), -0.02, 0.02)))
+    after = known.of(_stronger(known.site, best)).chi_square
+    # A room that is larger and has stronger beacons has the same fields.
+    units = [w for w, f in LENGTH_FACTORS.items() if abs(best * f**3 - 1.0) < 0.03]
+    if units:
+        yield _explained(known, after, 1, *length_cause(units[0]))
+        return
+    if steady is not None and abs(steady / best - 1.0) < abs(steady - 1.0) / 3.0:
+        code, cause = "field_scale", f"the magnetometer's readings are {best:.4g} times the field"
+        remedy = "Check its unit (T) and platform.magnetometer.matrix."
+    else:
+        sure = [float(np.mean(beacon.sigma.log_moment)) for beacon in known.site.beacons]
+        near = 0.01 + float(np.mean(sure))
+        words = [w for w, factor in MOMENT_FACTORS.items() if abs(best * factor - 1.0) < near]
+        code = "moment_units" if words else "field_scale"
+        cause = f"all moments are {best:.4g} times those declared"
+        cause += f": {words[0]}" if words else " (or the magnetometer's scale is)"
+        remedy = "Give moment_a_m2 as amplitudes in A m^2."
+    yield _explained(known, after, 1, code, cause, remedy)
+
+
+def _stronger(site: Site, factor: float) -> Site:
+    return replace(site, beacons=tuple(scaled(beacon, factor) for beacon in site.beacons))
+
+
+def _of_one(known: Snapshots, left: Snapshots, name: str) -> Iterator[Explanation]:
+    gain = _gains(known, left.fixes, name)
+    silent = _silent(known, left, name, gain)
+    if silent is not None:
+        yield silent
+        return
+    steady = list(_steady_causes(known, left, name))
+    yield from steady
+    fault = _fault(known, left, name, gain)
+    # Whatever is wrong with a beacon, to leave it out explains it.
+    if min(one.after for one in steady) > ALIKE * fault.after + LEAST_FALL / 2.0:
+        yield fault
+
+
+def _steady_causes(known: Snapshots, left: Snapshots, name: str) -> Iterator[Explanation]:
+    """Yield what is wrong with a beacon all the time."""
+    site, fixes = known.site, left.fixes
+    index = [beacon.name for beacon in site.beacons].index(name)
+    beacon = site.beacons[index]
+
+    def trial(other: Beacon) -> Snapshots:
+        beacons = (*site.beacons[:index], other, *site.beacons[index + 1 :])
+        return known.of(replace(site, beacons=beacons))
+
+    rewired = [
+        _explained(
+            known,
+            trial(other).chi_square,
+            0,
+            "coil_reversed",
+            f"of beacon {name} {cause}",
+            "Check the wires of its coils, and the sign of phase_deg.",
+        )
+        for cause, other in _rewired(beacon)
+    ]
+    yield from rewired
+    if any(one.clear for one in rewired):
+        return  # to turn the beacon over, or its phase, says the same in other words
+    after, found = known.fitted([(LOG_MOMENT, name, WIDE[2])], fixes)
+    factors = np.exp(LOG_MOMENT.difference(known.calibration, found, name))
+    yield _explained(
+        known,
+        after,
+        len(factors),
+        "moments",
+        f"the moments of beacon {name} are {_listed(factors, 3)} times those declared",
+        f"Measure the current of beacon {name}, or calibrate it (magfusion calibrate beacon).",
+    )
+    if beacon.synchronised:
+        after, found = known.fitted([(PHASE, name, WIDE[3])], fixes)
+        lag = PHASE.difference(known.calibration, found, name) / DEGREE
+        yield _explained(
+            known,
+            after,
+            len(lag),
+            "phase",
+            f"the drive phase of beacon {name} is {_listed(lag, 3)} degrees beyond the declared",
+            "Check its phase_deg, and that its drive is synchronised.",
+        )
+    yield _moved(known, fixes, beacon, trial)
+
+
+def _moved(
+    known: Snapshots, fixes: Fixes, beacon: Beacon, trial: Callable[[Beacon], Snapshots]
+) -> Explanation:
+    name = beacon.name
+    free = [(BEACON_POSITION, name, WIDE[0]), (BEACON_ROTATION, name, WIDE[1])]
+    best, at = np.inf, known.calibration
+    for turn in _turns():
+        start = trial(replace(beacon, world_from_beacon=beacon.world_from_beacon @ turn))
+        after, found = start.fitted(free, fixes)
+        if after < best:
+            best, at = after, found
+        if best < 2.0 * known.freedom:
+            break
+    step = BEACON_POSITION.difference(known.calibration, at, name)
+    angle = np.linalg.norm(BEACON_ROTATION.difference(known.calibration, at, name)) / DEGREE
+    return _explained(
+        known,
+        best,
+        6,
+        "beacon_pose",
+        f"beacon {name} is not where it was surveyed, but off by"
+        f" ({_listed(100.0 * step, 2)}) cm and {angle:.2g} degrees",
+        "Survey it anew, or declare larger sigmas for it.",
+    )
+
+
+def _silent(known: Snapshots, left: Snapshots, name: str, gain: Array) -> Explanation | None:
+    """Return that a beacon is silent, where it is."""
+    heard = np.isfinite(gain)
+    silent = heard & (np.abs(gain) < SILENT)
+    if np.sum(silent) < max(2, 0.05 * np.sum(heard)):
+        return None
+    whole = np.sum(silent) > 0.9 * np.sum(heard)
+    when = "" if whole else f" {_when(known.samples.time, silent)}"
+    return _explained(
+        known,
+        left.chi_square,
+        0,
+        "silent_beacon",
+        f"beacon {name} is silent{when}",
+        "Check that it is powered, and its frequency_hz.",
+    )
+
+
+def _fault(known: Snapshots, left: Snapshots, name: str, gain: Array) -> Explanation:
+    """Return that a beacon is false, in a part of the log or in some way."""
+    usual = np.nanmedian(gain.real) + 1j * np.nanmedian(gain.imag)
+    false = np.isfinite(gain) & (np.abs(gain - usual) > STEADY)
+    worst = 100.0 * float(np.nanmax(np.abs(gain - 1.0)))
+    size = f"by up to {worst:.2g} %" if worst < 1e3 else "altogether"
+    cause = f"the field of beacon {name} is false {size}"
+    if abs(usual - 1.0) < STEADY and 2 <= np.sum(false) < 0.8 * np.sum(np.isfinite(gain)):
+        cause += f" {_when(known.samples.time, false)}"
+    else:
+        cause += ", in a way that no place and no strength of it explains"
+    return _explained(
+        known,
+        left.chi_square * known.freedom / max(left.freedom, 1.0),
+        3,
+        "beacon_fault",
+        cause,
+        "Check its supply and what is near it; leave it out.",
+    )
+
+
+def _when(time: Array, chosen: BoolArray) -> str:
+    return f"from {time[chosen][0]:.3g} to {time[chosen][-1]:.3g} s"
+
+
+def _gains(known: Snapshots, fixes: Fixes, name: str) -> Array:
+    """Return what a beacon's phasors are of those expected, complex, shape (n,)."""
+    at, place = fixes.world_from_body[:, 0], fixes.position_world[:, 0]
+    expected = predict_channels(known.calibration, known.samples.time, at, place)
+    own = np.array([beacon == name for beacon, _ in known.samples.channels])
+    measured = known.samples.phasor_sensor[:, own]
+    expected = expected[:, own]
+    power = np.sum(np.abs(expected) ** 2, axis=(1, 2))
+    return np.sum(np.conj(expected) * measured, axis=(1, 2)) / power
+
+
+def _rewired(beacon: Beacon) -> Iterator[tuple[str, Beacon]]:
+    def reversed_(which: set[int]) -> Beacon:
+        return replace(
+            beacon,
+            coils=tuple(
+                replace(c, moment_beacon=-c.moment_beacon) if i in which else c
+                for i, c in enumerate(beacon.coils)
+            ),
+        )
+
+    count = len(beacon.coils)
+    for i in range(count if count > 1 else 0):
+        yield (
+            f"the wires of coil {i} (or the sign of a phase) are reversed, that is",
+            reversed_({i}),
+        )
+    yield "the wires of every coil are reversed", reversed_(set(range(count)))
+    if count > 1:
+        yield "the coils are exchanged", coils_exchanged(beacon)
+
+
+def _turns() -> Iterator[Array]:
+    """Yield no turn, then quarter and half turns about each axis."""
+    yield np.eye(3)
+    for angle in (np.pi, 0.5 * np.pi, -0.5 * np.pi):
+        for axis in np.eye(3):
+            yield Rotation.from_rotvec(angle * axis).as_matrix()
+
+
+def _explained(
+    known: Snapshots, after: float, found: int, code: str, cause: str, remedy: str
+) -> Explanation:
+    return Explanation(code, cause, remedy, known.chi_square, after, known.freedom, found)
+
+
+def _listed(values: Array, digits: int) -> str:
+    return ", ".join(f"{value:.{digits}g}" for value in values)

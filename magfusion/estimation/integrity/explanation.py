@@ -1,0 +1,75 @@
+"""What would explain a log that contradicts its declaration, and how well."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+LEAST_FALL = 60.0  # of chi square, that an explanation must bring
+CLEARLY = 2.5  # times smaller than before must chi square be, and than with any other cause
+SIGNIFICANT = 60.0  # fall for each parameter found, in units of the mean square that is left
+PENALTY = 6.0  # of chi square, for each parameter that is found
+ENOUGH = 1.5  # of the degrees of freedom: what is left when all is explained
+LITTLE = 0.04  # of chi square before: or so much, where survey errors are more than noise
+MARGIN = 20.0  # of chi square, over any other cause
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """One thing that people get wrong, tried on a log.
+
+    Parameters
+    ----------
+    code : str
+        Of `magfusion.model.trust.CODES`.
+    cause, remedy : str
+        Clauses: "the log is explained if ...", and what to do.
+    before, after : float
+        Chi square as declared, and with this explanation.
+    expected : float
+        Degrees of freedom.
+    found : int
+        Parameters that were found to explain it.
+    """
+
+    code: str
+    cause: str
+    remedy: str
+    before: float
+    after: float
+    expected: float
+    found: int = 0
+
+    @property
+    def score(self) -> float:
+        """Chi square, with a price for what had to be found."""
+        return self.after + PENALTY * self.found
+
+    @property
+    def clear(self) -> bool:
+        """Whether it explains so much that it is worth saying."""
+        fall = self.before - self.score
+        enough = self.after < max(ENOUGH * self.expected, LITTLE * self.before)
+        # A bias or a lever arm that its prior holds back costs little, however sure it is.
+        noise = max(self.after / max(self.expected, 1.0), 1e-9)
+        significant = self.found > 0 and fall / self.found > SIGNIFICANT * noise
+        clearly = self.before > CLEARLY * self.after or significant
+        return enough and fall > LEAST_FALL and clearly
+
+    def text(self, of: str) -> str:
+        """Return the sentences that say it, with the evidence."""
+        return (
+            f"The log is explained if {self.cause}: the chi square of {of} falls from"
+            f" {self.before:.4g} to {self.after:.3g}, of {self.expected:.3g} expected at most."
+            f" {self.remedy}"
+        )
+
+
+def clearly_best(tried: Iterable[Explanation]) -> Explanation | None:
+    """Return the explanation that is better than those of any other code, if there is one."""
+    ranked = sorted(tried, key=lambda one: one.score)
+    if not ranked or not ranked[0].clear:
+        return None
+    best = ranked[0]
+    rival = next((one for one in ranked if one.code != best.code), None)
+    if rival is None or rival.score - best.score > max(MARGIN, 0.2 * best.score):
+        return best
+    return None

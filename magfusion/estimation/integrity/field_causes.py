@@ -1,0 +1,239 @@
+"""What people get wrong of beacons and magnetometer, tried on snapshots of the fields."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.integrity.explanation import Explanation
+from magfusion.estimation.integrity.field_snapshots import Snapshots
+from magfusion.model.site import Beacon, Coil, Site
+from magfusion.units import DEGREE, Array
+
+GROSS = 4.0  # chi square over its freedom, below which no mistake in all beacons is sought
+SCREENED = 6  # epochs on which each is tried
+KEPT = 4  # of them, tried on all epochs
+# What the declared moments are too large by: a unit or a convention.
+MOMENT_FACTORS = {
+    "amplitudes were declared as rms values": np.sqrt(0.5),
+    "rms values were declared as amplitudes times the root of two": np.sqrt(2.0),
+    "peak-to-peak values were declared as amplitudes": 2.0,
+    "half of the amplitudes was declared": 0.5,
+    "their unit is larger by a thousand": 1e-3,
+    "their unit is smaller by a thousand (mA m^2)": 1e3,
+    "their unit is smaller by ten thousand (A cm^2)": 1e4,
+    "a tenth of the moments was declared": 0.1,
+    "ten times the moments were declared": 10.0,
+    "a hundredth of the moments was declared (turns?)": 0.01,
+    "a hundred times the moments were declared": 100.0,
+}
+LENGTH_FACTORS = {
+    "they are in feet": 0.3048,
+    "they are in metres and were taken for feet": 1.0 / 0.3048,
+    "they are in centimetres": 0.01,
+    "they are in millimetres": 0.001,
+    "they are in metres and were divided by a hundred": 100.0,
+    "they are in inches": 0.0254,
+}
+
+
+def global_causes(known: Snapshots) -> Iterator[Explanation]:
+    """Yield what a mistake in all beacons at once would explain.
+
+    All of them are tried on a few epochs, and the best on all.
+    """
+    if known.chi_square < GROSS * known.freedom:
+        return  # such mistakes leave more
+    few = known.some(SCREENED)
+    inverted = replace(few.samples, phasor_sensor=-few.samples.phasor_sensor)
+    tried = [(few.of(way.site), way) for way in _ways(known.site)]
+    tried.append((replace(few, samples=inverted), Way(*left_handed(), known.site)))
+    for one, way in sorted(tried, key=lambda pair: pair[0].chi_square)[:KEPT]:
+        whole = replace(one, samples=known.samples)
+        if one.samples is inverted:
+            whole = replace(
+                one,
+                samples=replace(known.samples, phasor_sensor=-known.samples.phasor_sensor),
+            )
+        yield Explanation(
+            way.code, way.cause, way.remedy, known.chi_square, whole.chi_square, known.freedom
+        )
+
+
+def length_cause(words: str) -> tuple[str, str, str]:
+    """Return code, cause and remedy of another unit of lengths."""
+    return (
+        "length_units",
+        f"the positions of the beacons have another unit: {words}",
+        "Give position_m in metres.",
+    )
+
+
+class Way(NamedTuple):
+    """A site in which a mistake is undone."""
+
+    code: str
+    cause: str
+    remedy: str
+    site: Site
+
+
+def left_handed() -> tuple[str, str, str]:
+    """Return code, cause and remedy of axes of which one has the wrong sign."""
+    return (
+        "magnetometer_axes",
+        "the magnetometer's axes are left-handed (one has the wrong sign, or two are exchanged)"
+        " or every coil is wired in reverse",
+        "Check the sign and the order of the magnetometer's axes.",
+    )
+
+
+def _ways(site: Site) -> Iterator[Way]:
+    yield Way(
+        "phase_sign",
+        "the sign of the drive phases is wrong in every beacon",
+        "Change the sign of phase_deg of all coils.",
+        _every(site, partial(_phases, factor=-1.0)),
+    )
+    if any(len(beacon.coils) > 1 for beacon in site.beacons):
+        yield Way(
+            "coils_swapped",
+            "the coils of every beacon are exchanged",
+            "Exchange the moments of the coils of each beacon.",
+            _every(site, coils_exchanged),
+        )
+    for words, factor in (
+        ("degrees were declared that are radians", 1.0 / DEGREE),
+        ("radians were declared in the place of degrees", DEGREE),
+    ):
+        yield Way(
+            "phase_units",
+            f"the drive phases have another unit: {words}",
+            "Give phase_deg in degrees.",
+            _every(site, partial(_phases, factor=1.0 / factor)),
+        )
+        yield Way(
+            "angle_units",
+            f"the attitudes of the beacons have another unit: {words}",
+            "Give rpy_deg in degrees.",
+            _every(site, partial(_angles, factor=1.0 / factor)),
+        )
+    yield Way(
+        "angle_convention",
+        "the attitudes of the beacons are inverted (beacon from world)",
+        "Give rpy_deg as of world_from_beacon.",
+        _every(site, lambda b: replace(b, world_from_beacon=b.world_from_beacon.T)),
+    )
+    yield Way(
+        "angle_convention",
+        "the angles of the beacons are applied in the other order",
+        "Give rpy_deg as R = Rz(yaw) Ry(pitch) Rx(roll).",
+        _every(site, _other_order),
+    )
+    for words, factor in MOMENT_FACTORS.items():
+        yield Way(
+            "moment_units",
+            f"the moments are wrong by a factor of {1.0 / factor:.4g}: {words}",
+            "Give moment_a_m2 as amplitudes in A m^2.",
+            _every(site, partial(scaled, factor=1.0 / factor)),
+        )
+    for words, factor in LENGTH_FACTORS.items():
+        yield Way(
+            *length_cause(words),
+            _every(site, partial(_placed, axes=factor * np.eye(3))),
+        )
+    for name, change in _other_axes():
+        yield Way(
+            "survey_axes",
+            f"the survey's axes are others: {name}",
+            "Give positions in right-handed axes with z up, the same as of the attitudes.",
+            _every(site, partial(_placed, axes=change)),
+        )
+    yield from _exchanges(site)
+
+
+def _other_axes() -> Iterator[tuple[str, Array]]:
+    for i, axis in enumerate("xyz"):
+        flip = np.eye(3)
+        flip[i, i] = -1.0
+        yield f"{axis} points the other way", flip
+    for i, j in combinations(range(3), 2):
+        order = [0, 1, 2]
+        order[i], order[j] = j, i
+        yield f"{'xyz'[i]} and {'xyz'[j]} are exchanged", np.eye(3)[order]
+
+
+def _exchanges(site: Site) -> Iterator[Way]:
+    """Yield sites in which two beacons are taken for each other."""
+    for i, j in combinations(range(len(site.beacons)), 2):
+        one, other = site.beacons[i], site.beacons[j]
+        pair = f"beacons {one.name} and {other.name}"
+        ways = {
+            f"{pair} are exchanged (or their frequencies are)": (
+                "position_world",
+                "world_from_beacon",
+            ),
+            f"the positions of {pair} are exchanged": ("position_world",),
+        }
+        for cause, fields in ways.items():
+            beacons = list(site.beacons)
+            beacons[i] = replace(one, **{name: getattr(other, name) for name in fields})
+            beacons[j] = replace(other, **{name: getattr(one, name) for name in fields})
+            yield Way(
+                "beacons_swapped",
+                cause,
+                "Check which beacon is where, and at which frequency.",
+                replace(site, beacons=tuple(beacons)),
+            )
+
+
+def _every(site: Site, change: Callable[[Beacon], Beacon]) -> Site:
+    return replace(site, beacons=tuple(change(beacon) for beacon in site.beacons))
+
+
+def _coils(beacon: Beacon, change: Callable[[Coil], Coil]) -> Beacon:
+    return replace(beacon, coils=tuple(change(coil) for coil in beacon.coils))
+
+
+def _phases(beacon: Beacon, factor: float) -> Beacon:
+    return _coils(beacon, lambda coil: replace(coil, phase=factor * coil.phase))
+
+
+def _placed(beacon: Beacon, axes: Array) -> Beacon:
+    return replace(beacon, position_world=axes @ beacon.position_world)
+
+
+def scaled(beacon: Beacon, factor: float) -> Beacon:
+    """Return a beacon of other strength."""
+    return _coils(beacon, lambda c: replace(c, moment_beacon=factor * c.moment_beacon))
+
+
+def coils_exchanged(beacon: Beacon) -> Beacon:
+    """Return a beacon whose first two coils have each other's moment."""
+    if len(beacon.coils) < 2:
+        return beacon
+    first, second, *rest = beacon.coils
+    return replace(
+        beacon,
+        coils=(
+            replace(first, moment_beacon=second.moment_beacon),
+            replace(second, moment_beacon=first.moment_beacon),
+            *rest,
+        ),
+    )
+
+
+def _angles(beacon: Beacon, factor: float) -> Beacon:
+    """Return a beacon whose roll, pitch and yaw are multiplied."""
+    angles = Rotation.from_matrix(beacon.world_from_beacon).as_euler("xyz")
+    turned = Rotation.from_euler("xyz", factor * angles).as_matrix()
+    return replace(beacon, world_from_beacon=turned)
+
+
+def _other_order(beacon: Beacon) -> Beacon:
+    angles = Rotation.from_matrix(beacon.world_from_beacon).as_euler("xyz")
+    return replace(beacon, world_from_beacon=Rotation.from_euler("XYZ", angles).as_matrix())

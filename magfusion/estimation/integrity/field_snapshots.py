@@ -1,0 +1,208 @@
+"""Fields of a few dozen calm epochs, and how well a site explains them whatever the motion."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.estimation.snapshot.survey_error import whitened
+from magfusion.estimation.solve.batched import Normal, minimise
+from magfusion.model.noise import measurement_cov, stacked, whitening
+from magfusion.model.parameters import (
+    Block,
+    Calibration,
+    Parameter,
+    dimension,
+    initial_calibration,
+    linearize_channels,
+    placed,
+    predict_channels,
+    retract,
+)
+from magfusion.model.samples import FieldSamples, ImuSamples
+from magfusion.model.site import Site
+from magfusion.units import AnyArray, Array, IntArray
+
+EPOCHS = 24
+ITERATIONS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class _Guess:
+    """Poses of all epochs, and what they share."""
+
+    calibration: Calibration
+    turn: Array  # (n, 3, 3) world_from_body
+    place: Array  # (n, 3)
+    found: Array  # (dimension,) of the shared parameters, so far
+
+    def moved(self, step: Array, blocks: tuple[Block, ...]) -> "_Guess":
+        poses = step[: 6 * len(self.turn)].reshape(-1, 6)
+        shared = step[6 * len(self.turn) :]
+        return _Guess(
+            retract(self.calibration, blocks, shared),
+            self.turn @ Rotation.from_rotvec(poses[:, :3]).as_matrix(),
+            self.place + (self.turn @ poses[:, 3:, None])[..., 0],
+            self.found + shared,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshots:
+    """Phasors of some epochs with a site that may explain them.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+    calibration : Calibration
+    """
+
+    samples: FieldSamples
+    calibration: Calibration
+
+    @property
+    def site(self) -> Site:
+        """The site."""
+        return self.calibration.site
+
+    @property
+    def freedom(self) -> float:
+        """Residuals less poses."""
+        return float(6 * np.sum(self.samples.valid) - 6 * len(self.samples))
+
+    @cached_property
+    def fixes(self) -> Fixes:
+        """Poses, without a guess."""
+        return fix_epochs(self.samples, self.calibration)
+
+    @cached_property
+    def chi_square(self) -> float:
+        """Of the fixes."""
+        return float(np.sum(self.fixes.cost[:, 0]))
+
+    def of(self, site: Site) -> "Snapshots":
+        """Return the same epochs with another site."""
+        return Snapshots(self.samples, replace(self.calibration, site=site))
+
+    def some(self, count: int) -> "Snapshots":
+        """Return a few of the epochs."""
+        chosen = np.zeros(len(self.samples), dtype=bool)
+        chosen[np.linspace(0, len(self.samples) - 1, count).round().astype(np.int64)] = True
+        return replace(self, samples=self.samples.rows(chosen))
+
+    def without(self, name: str) -> "Snapshots":
+        """Return the same epochs as if a beacon had not been received."""
+        own = np.array([beacon == name for beacon, _ in self.samples.channels])
+        phasor = np.where(own[:, None], np.nan, self.samples.phasor_sensor)
+        return Snapshots(replace(self.samples, phasor_sensor=phasor), self.calibration)
+
+    def residual(self, fixes: Fixes) -> Array:
+        """Return the whitened residual at the best fixes, shape (n, channels, 6)."""
+        at, place = fixes.world_from_body[:, 0], fixes.position_world[:, 0]
+        phasor = predict_channels(self.calibration, self.samples.time, at, place)
+        error = stacked(phasor - self.samples.phasor_sensor)
+        return whitened(self._weights, error[..., None]).reshape(error.shape)
+
+    @cached_property
+    def _weights(self) -> Array:
+        cov = measurement_cov(self.site, self.samples, survey_error=True)
+        return whitening(cov, self.samples.valid)
+
+    def fitted(
+        self, free: Sequence[tuple[Parameter, str, float]], fixes: Fixes
+    ) -> tuple[float, Calibration]:
+        """Return chi square and calibration with some parameters found beside the poses.
+
+        Parameters
+        ----------
+        free : sequence of (Parameter, str, float)
+            With owner and a sigma that keeps what is open from running away.
+        fixes : Fixes
+            Where the poses begin.
+        """
+        blocks = _blocks(self.site, free)
+        start = _Guess(
+            self.calibration,
+            fixes.world_from_body[:, 0],
+            fixes.position_world[:, 0],
+            np.zeros(dimension(blocks)),
+        )
+
+        def model(_: IntArray, state: AnyArray) -> Normal:
+            return self._normal(state[0], blocks)
+
+        def move(state: AnyArray, step: Array) -> AnyArray:
+            return _one(state[0].moved(step[0], blocks))
+
+        found = minimise(model, _one(start), move, passes=ITERATIONS, relative=1e-5)
+        guess: _Guess = found.state[0]
+        return float(found.cost[0]), guess.calibration
+
+    def _normal(self, at: _Guess, blocks: tuple[Block, ...]) -> Normal:
+        """Return the normal equations of all poses, and of what they share."""
+        time, n = self.samples.time, len(self.samples)
+        value, by_pose, by_free = linearize_channels(
+            at.calibration, blocks, time, at.turn, at.place
+        )
+        error = (value - stacked(self.samples.phasor_sensor))[..., None]
+        every = np.concatenate([by_pose, by_free, error], axis=-1)
+        rows = whitened(self._weights, every).reshape(n, -1, every.shape[-1])
+        square = np.swapaxes(rows, 1, 2) @ rows
+        sigma = np.concatenate([block.sigma for block in blocks])
+        size = 6 * n + len(sigma)
+        information, gradient = np.zeros((size, size)), np.zeros(size)
+        for k in range(n):
+            own = slice(6 * k, 6 * k + 6)
+            information[own, own] = square[k, :6, :6]
+            information[own, 6 * n :] = square[k, :6, 6:-1]
+            information[6 * n :, own] = square[k, 6:-1, :6]
+            gradient[own] = square[k, :6, -1]
+        information[6 * n :, 6 * n :] = np.sum(square[:, 6:-1, 6:-1], axis=0)
+        information[6 * n :, 6 * n :] += np.diag(1.0 / sigma**2)
+        gradient[6 * n :] = np.sum(square[:, 6:-1, -1], axis=0) + at.found / sigma**2
+        cost = np.sum(square[:, -1, -1]) + np.sum((at.found / sigma) ** 2)
+        return Normal(np.array([cost]), gradient[None], information[None])
+
+
+def _blocks(site: Site, free: Sequence[tuple[Parameter, str, float]]) -> tuple[Block, ...]:
+    out = []
+    for parameter, owner, sigma in free:
+        width = len(parameter.sigma(site, owner))
+        out.append(Block(parameter, owner, slice(0), np.full(width, sigma)))
+    return placed(out)
+
+
+def _one(guess: _Guess) -> AnyArray:
+    state = np.empty(1, dtype=object)
+    state[0] = guess
+    return state
+
+
+def calm_epochs(samples: FieldSamples, imu: ImuSamples, count: int = EPOCHS) -> FieldSamples:
+    """Return epochs spread over a log, of each stretch that with the least rate.
+
+    The size of the rate hangs on no axis and no sign; its unit does not matter either.
+    """
+    if len(samples) <= count:
+        return samples
+    rate = np.linalg.norm(imu.gyro_body, axis=1)
+    nearest = np.clip(np.searchsorted(imu.time, samples.time), 0, len(imu) - 1)
+    most = np.sum(samples.valid, axis=1)
+    order = np.lexsort((rate[nearest], -most))  # as many beacons as there are, then calm
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    stretches = np.array_split(np.arange(len(samples)), count)
+    kept = np.array([stretch[np.argmin(rank[stretch])] for stretch in stretches])
+    chosen = np.zeros(len(samples), dtype=bool)
+    chosen[kept] = True
+    return samples.rows(chosen)
+
+
+def snapshots_of(samples: FieldSamples, imu: ImuSamples, site: Site) -> Snapshots:
+    """Return calm epochs of a log with the site as declared."""
+    some = calm_epochs(samples, imu)
+    return Snapshots(some, initial_calibration(site, float(np.mean(some.time))))

@@ -1,0 +1,182 @@
+"""A first look at a log, in seconds: everything that can be judged without solving for it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.demodulation import phasors
+from magfusion.estimation.integrity.compasses import StillMeans, still_means
+from magfusion.estimation.integrity.diagnosis import with_cause
+from magfusion.estimation.integrity.recording import recorded
+from magfusion.estimation.integrity.signal import Heard, heard_in
+from magfusion.estimation.integrity.spectrum import (
+    Line,
+    Spectrum,
+    judged_lines,
+    named_lines,
+    spectrum,
+)
+from magfusion.estimation.integrity.stamps import Timing, timings
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import SYMPTOMS, Finding, Trust, Verdict
+from magfusion.receiver.cycles import whole_cycles
+from magfusion.receiver.receiver import usual_lockin
+from magfusion.receiver.slots import has_schedule
+from magfusion.receiver.windows import LockinSettings
+from magfusion.units import Array
+
+EPOCHS = 24  # that are fixed
+COPED = frozenset({"samples_lost"})  # what every estimator copes with
+# What is the cause where no window can be demodulated.
+SPOILING = frozenset({"saturated", "jitter", "gap", "samples_lost", "frozen_magnetometer"})
+DOUBT = Verdict.DOUBTFUL
+LEAST_BAD = 3  # epochs without an explanation
+NOTHING_EXPLAINED = 30.0  # residual from which the fixes are none
+SURE = 0.95  # probability of a fix that is used against the compasses
+UNEXPLAINED = 3.0  # residual of the fixes, one where noise, model and survey are as declared
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What a first look found.
+
+    Parameters
+    ----------
+    heard : Heard, optional
+        None without a site, or where no window can be demodulated.
+    spectrum : Spectrum, optional
+    lines : tuple of Line, optional
+        Everything that stands out of it, tones too.
+    fixes : Fixes, optional
+        Of a few epochs.
+    """
+
+    trust: Trust
+    timings: tuple[Timing, ...]
+    means: StillMeans
+    heard: Heard | None = None
+    spectrum: Spectrum | None = None
+    lines: tuple[Line, ...] | None = None
+    fixes: Fixes | None = None
+
+    @property
+    def fix_residual(self) -> float:
+        """Median residual of the fixes; NaN of none."""
+        if self.fixes is None or len(self.fixes) == 0:
+            return float("nan")
+        return float(np.median(self.fixes.residual_rms[:, 0]))
+
+    def heard_as(self) -> list[tuple[str, float, float]]:
+        """Return name, median signal to noise and share of the epochs heard of each beacon."""
+        if self.heard is None or len(self.heard.time) == 0:
+            return []
+        snr = np.nan_to_num(self.heard.snr)
+        shares = np.mean(self.heard.loud, axis=0)
+        return [
+            (name, float(np.median(snr[:, k])), float(shares[k]))
+            for k, name in enumerate(self.heard.beacons)
+        ]
+
+
+def first_look(log: Log, site: Site | None, lockin: LockinSettings | None = None) -> Look:
+    """Look at a log; without a site at the recording alone."""
+    found = spectrum(log, site)
+    seen = None if found is None else named_lines(found, site)
+    look = timings(log), still_means(log, site)
+    if site is None or not site.beacons:
+        return Look(Trust(recorded(log, site)), *look, None, found, seen)
+    findings: list[Finding] = []
+    try:
+        samples = phasors(log, site, lockin)[0]
+    except InputError as error:
+        findings.append(Finding("no_window", f"{error}.", Verdict.FAILED, 10.0))
+        samples = FieldSamples.empty(site.channels)
+    hearing = heard_in(log, site, lockin)
+    if found is not None and not has_schedule(site):
+        settings = usual_lockin(site) if lockin is None else lockin
+        harmless = judged_lines(found, site, settings)
+        findings += [line for line in harmless if line.verdict is Verdict.TRUSTWORTHY]
+    fixes = _fixed(log, site, samples, look[1].time)
+    poses = None
+    if fixes is not None:
+        findings += findings_of_fit(fixes)
+        sure = (fixes.probability[:, 0] > SURE) & fixes.determined[:, 0]
+        best = fixes.best()
+        poses = Trajectory(best.time[sure], best.world_from_body[sure], best.position_world[sure])
+        poses = poses if len(poses) and not findings_of_fit(fixes) else None
+    findings += recorded(log, site, COPED, poses, beacons=True, hearing=hearing)
+    trust = Trust(tuple(_promoted(findings)))
+    if trust.reasons and trust.reasons[0].code in SYMPTOMS:
+        trust = with_cause(trust, log, site, lockin)
+    return Look(trust, *look, hearing, found, seen, fixes)
+
+
+def _promoted(findings: list[Finding]) -> list[Finding]:
+    """Let what spoils every window be the cause of there being none."""
+    if not any(finding.code == "no_window" for finding in findings):
+        return findings
+    return [
+        replace(f, verdict=Verdict.FAILED) if f.code in SPOILING and f.verdict is DOUBT else f
+        for f in findings
+    ]
+
+
+def _fixed(log: Log, site: Site, samples: FieldSamples, near: Array) -> Fixes | None:
+    """Fix a few epochs, at times where the compasses are known, without gravity."""
+    if len(samples) == 0 or any(beacon.unknown is not None for beacon in site.beacons):
+        return None
+    loud = samples.valid.any(axis=1)
+    if has_schedule(site):
+        samples = whole_cycles(samples, log.imu, site)
+        loud = np.ones(len(samples), dtype=bool)
+    if not np.any(loud) or len(samples) == 0:
+        return None
+    usable = np.flatnonzero(loud)
+    wanted = near if len(near) else samples.time[usable]
+    wanted = wanted[np.unique(np.linspace(0, len(wanted) - 1, EPOCHS).astype(np.int64))]
+    at = np.clip(np.searchsorted(samples.time[usable], wanted), 0, len(usable) - 1)
+    chosen = np.zeros(len(samples), dtype=bool)
+    chosen[usable[at]] = True
+    some = samples.rows(chosen)
+    try:
+        return fix_epochs(some, initial_calibration(site, float(np.mean(samples.time))))
+    except EstimationError:
+        return None
+
+
+def findings_of_fit(fixes: Fixes) -> list[Finding]:
+    """Return what is to be said of fixes that do not explain the fields."""
+    residual = fixes.residual_rms[:, 0]
+    median, bad = float(np.median(residual)), residual > UNEXPLAINED
+    if median > UNEXPLAINED:
+        return [
+            Finding(
+                "field_residuals",
+                f"no pose explains the beacons' fields: at {len(fixes)} epochs the median residual"
+                f" is {median:.3g} where about 1 is expected. Positions, attitudes, frequencies,"
+                " moments or phases of the beacons are not as declared, or the epoch of the log is"
+                " not.",
+                Verdict.FAILED if median > NOTHING_EXPLAINED else DOUBT,
+                20.0 + median,
+            )
+        ]
+    if np.sum(bad) < LEAST_BAD:
+        return []
+    time = fixes.time[bad]
+    return [
+        Finding(
+            "field_residuals",
+            f"no pose explains the beacons' fields at {int(np.sum(bad))} of {len(fixes)} epochs"
+            f" between {time[0]:.1f} and {time[-1]:.1f} s: their residual is"
+            f" {float(np.median(residual[bad])):.3g} (median) where about 1 is expected. The field"
+            " of a beacon is false then, or iron is near.",
+            DOUBT,
+            20.0 + float(np.median(residual[bad])),
+        )
+    ]

@@ -1,0 +1,91 @@
+"""Which channels of an epoch the prediction explains, and how well each beacon's field is."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from magfusion.estimation.measurements.measurement import group_distances
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.state import State, states_of
+from magfusion.model.parameters import Block
+from magfusion.units import Array, BoolArray
+
+GATE = 38.3  # chi square of six components, one in a million
+LOST_EPOCHS = 5  # in a row, most of whose channels were refused: the state is wrong, not they
+MEMORY = 0.95  # of the running mean of the distortion, an epoch
+
+
+class Gate:
+    """Refuses outliers, and notices when it is the state that is wrong.
+
+    Attributes
+    ----------
+    counts : Counter
+        Outliers by beacon.
+    distortion : dict of str to float
+        By beacon, running mean of the squared innovation in units of its expectation.
+    refused_in_a_row : int
+        Epochs most of whose channels were refused, up to now.
+    taken, refused : dict of str to float
+        Of the last epoch, by beacon, the mean squared innovation of the channels that were taken
+        and of those that were refused, in the same units.
+    """
+
+    counts: Counter[str]
+    distortion: dict[str, float]
+    refused_in_a_row: int
+    taken: dict[str, float]
+    refused: dict[str, float]
+
+    def __init__(self, channels: tuple[tuple[str, int], ...], blocks: Sequence[Block]) -> None:
+        self.blocks = tuple(blocks)
+        self.owner = np.array([name for name, _ in channels], dtype=object)
+        self.counts = Counter()
+        self.distortion = {}
+        self.refused_in_a_row = 0
+        self.taken, self.refused = {}, {}
+
+    @property
+    def lost(self) -> bool:
+        """Whether the state is to be doubted rather than the measurements."""
+        return self.refused_in_a_row >= LOST_EPOCHS
+
+    def passed(
+        self, measurements: FieldPhasors, state: State, valid: BoolArray, refused: BoolArray
+    ) -> FieldPhasors:
+        """Return the measurements without the channels that a state does not explain.
+
+        Parameters
+        ----------
+        measurements : FieldPhasors
+            Of one epoch.
+        valid, refused : bool ndarray, shape (channels,)
+            What the epoch holds, and what was refused before.
+        """
+        rows = measurements.alone().linearize(states_of([state]), state.calibration, self.blocks)
+        distance = group_distances(rows, state.cov)[0]
+        rejected: BoolArray = np.asarray((distance > GATE) | refused) & valid
+        self._note(distance, valid)
+        self.taken = self._by_beacon(distance, valid & ~rejected)
+        self.refused = self._by_beacon(distance, rejected)
+        for name in self.owner[rejected]:
+            self.counts[f"outlier of {name}"] += 1
+        most = np.sum(rejected) > 0.5 * np.sum(valid)
+        self.refused_in_a_row = self.refused_in_a_row + 1 if most else 0
+        return measurements.without(rejected) if np.any(rejected) else measurements
+
+    def nothing_measured(self) -> None:
+        """Say that an epoch held no field."""
+        self.taken, self.refused = {}, {}
+
+    def _by_beacon(self, distance: Array, chosen: BoolArray) -> dict[str, float]:
+        return {
+            str(name): float(np.mean(distance[chosen & (self.owner == name)])) / 6.0
+            for name in dict.fromkeys(self.owner[chosen].tolist())
+        }
+
+    def _note(self, distance: Array, valid: BoolArray) -> None:
+        for name, level in self._by_beacon(distance, valid).items():
+            before = self.distortion.get(name, level)
+            self.distortion[name] = MEMORY * before + (1.0 - MEMORY) * level

@@ -1,0 +1,234 @@
+"""The verdict on what is held: which parameter the log contradicts, and which it cannot check.
+
+Significance is not consequence: a parameter is called in question where freeing it would lower the
+cost by more than chance does, and would move the poses beyond what their covariance covers.  The
+one that lowers it most names the cause; after it has moved, the next is asked.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.estimation.integrity.score import (
+    Score,
+    field_residual,
+    moved_estimate,
+)
+from magfusion.estimation.integrity.statistics import WITNESS_BUDGET, holm, log_p_chi_square, sigmas
+from magfusion.estimation.integrity.suspects import CODE, Suspect, suspects
+from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
+from magfusion.model.parameters import Block, prior_sigma
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Unverified, Verdict
+from magfusion.units import Array
+
+FARTHEST = 30.0  # typical errors; a direction that is known no better is not looked at
+PER_PARAMETER = 12.0  # chi square that one more parameter must gain to be the better explanation
+COVERED = 4.0  # mean squared Mahalanobis distance that a covariance of six still covers
+HOPELESS = 25.0**2  # beyond which a linear step and its covariance say nothing of where it is
+MOST = 4  # causes that are named
+LEAST_SHARE = 0.03  # of the first cause's chi square; what is less may be its nonlinear rest
+UNCHECKED = 4.0  # chi square of a typical error that stays unnoticed
+
+
+@dataclass(frozen=True, eq=False)
+class Freed:
+    """A suspect, freed.
+
+    Parameters
+    ----------
+    step, cov, known_cov : ndarray, shape (h,), (h, h), (h, h)
+        In typical errors; the last of what the log determines better than those.
+    chi_square, freedom : float
+        By how much twice the cost falls.
+    moved : ndarray, shape (states, 6)
+        What it does to the poses.
+    distance : ndarray, shape (states,)
+        Squared, by the covariance of the poses.
+    """
+
+    suspect: Suspect
+    step: Array
+    cov: Array
+    known_cov: Array
+    chi_square: float
+    freedom: int
+    moved: Array
+    distance: Array
+
+    @property
+    def log_p(self) -> float:
+        """Logarithm of the probability that chance does as much."""
+        return float(log_p_chi_square(self.chi_square, self.freedom))
+
+    @property
+    def gain(self) -> float:
+        """What it explains, less what as many parameters would explain anyway."""
+        return self.chi_square - PER_PARAMETER * self.freedom
+
+
+def held(case: Case) -> Testimony:
+    """Ask everything that is held."""
+    if case.score is None:
+        return NOTHING
+    score, site = case.score, case.result.declared.site
+    unverified = tuple(_unverified(case, score))
+    information, gradient = score.with_declared()
+    findings: list[Finding] = []
+    named: list[Array] = []
+    spread = np.zeros_like(case.pose_cov)
+    total, first = np.zeros(len(gradient)), 0.0
+    while len(findings) < MOST:
+        freed = [
+            found
+            for suspect in suspects(site, score.held)
+            if (found := freed_by(case.pose_cov, score, suspect, information, gradient)) is not None
+        ]
+        cause = _cause(case, score, freed, total)
+        if cause is None or cause.chi_square < LEAST_SHARE * first:
+            break
+        first = max(first, cause.chi_square)
+        findings.append(finding_of(site, score, cause))
+        spread += cause.moved[:, :, None] * cause.moved[:, None, :]
+        spread += score.by_pose @ cause.known_cov @ np.swapaxes(score.by_pose, 1, 2)
+        total = total + cause.step
+        named.append(total)
+        taken = information @ cause.cov
+        gradient = gradient - information @ cause.step
+        information = information - taken @ information
+    return Testimony(
+        tuple(findings),
+        unverified,
+        spread=spread if findings else None,
+        named=tuple(named),
+    )
+
+
+def freed_by(
+    pose_cov: Array, score: Score, suspect: Suspect, information: Array, gradient: Array
+) -> Freed | None:
+    """Free a suspect; None where nothing tells of it."""
+    combine = suspect.combine
+    value, vector = np.linalg.eigh(combine.T @ information @ combine)
+    kept = value > FARTHEST**-2
+    if not np.any(kept):
+        return None
+    vector, value = combine @ vector[:, kept], value[kept]
+    along = vector.T @ gradient
+    step = vector @ (along / value)
+    moved = score.by_pose @ step
+    solved = np.linalg.solve(pose_cov, moved[..., None])[..., 0]
+    known = value > 1.0
+    return Freed(
+        suspect,
+        step,
+        (vector / value) @ vector.T,
+        (vector[:, known] / value[known]) @ vector[:, known].T,
+        float(np.sum(along**2 / value)),
+        int(np.sum(kept)),
+        moved,
+        np.sum(moved * solved, axis=1),
+    )
+
+
+def _cause(case: Case, score: Score, freed: list[Freed], before: Array) -> Freed | None:
+    """Return what explains most of what chance and the claimed covariance do not."""
+    speaks = holm([one.log_p for one in freed], WITNESS_BUDGET)
+    likely = [
+        one
+        for one, significant in zip(freed, speaks, strict=True)
+        if significant and np.mean(one.distance) > COVERED
+    ]
+    for one in sorted(likely, key=lambda one: -one.gain)[:3]:
+        # Everything explains a part of what nothing explains.
+        rest = field_residual(
+            case.result, moved_estimate(case.result, score, score.allowed(before + one.step))
+        )
+        excess = max(1.0, float(np.nanmean(rest**2))) if np.any(np.isfinite(rest)) else 1.0
+        left = float(log_p_chi_square(one.chi_square / excess, one.freedom))
+        if holm([left, *(other.log_p for other in freed if other is not one)], WITNESS_BUDGET)[0]:
+            return one
+    return None
+
+
+def finding_of(site: Site, score: Score, cause: Freed) -> Finding:
+    """Return what is to be said of a cause."""
+    position = float(np.sqrt(np.mean(np.sum(cause.moved[:, 3:] ** 2, axis=1))))
+    rotation = float(np.rad2deg(np.sqrt(np.mean(np.sum(cause.moved[:, :3] ** 2, axis=1)))))
+    mean = float(np.mean(cause.distance))
+    if len(cause.suspect.combine.T) == 1 and len(cause.suspect.blocks) > 1:
+        block = cause.suspect.blocks[0]
+        factor = float(np.exp((prior_sigma(score.held) * cause.step)[block.columns][0]))
+        found = f"all are {factor:.3g} times as large"
+        remedy = "correct them (peak, not rms; their unit), or declare their sigma"
+    else:
+        found = "; ".join(_amounts(site, score, cause, b) for b in _largest(cause))
+        remedy = "correct it by so much, or declare a sigma of that size so that it is estimated"
+    return Finding(
+        CODE[cause.suspect.blocks[0].parameter],
+        f"The log contradicts {cause.suspect.name} as declared: {found}"
+        f" ({float(sigmas(cause.log_p)):.0f} sigma), which moves the poses by"
+        f" {_length(position)} and {rotation:.2g} deg,"
+        f" {np.sqrt(mean):.1f} times what they claim. Remedy: {remedy}.",
+        Verdict.FAILED if mean > HOPELESS else Verdict.DOUBTFUL,
+        float(sigmas(cause.log_p)),
+    )
+
+
+def _largest(cause: Freed) -> list[Block]:
+    """Return the blocks of a suspect that move, most first."""
+    size = {b.name: float(np.max(np.abs(cause.step[b.columns]))) for b in cause.suspect.blocks}
+    moving = sorted(cause.suspect.blocks, key=lambda b: -size[b.name])
+    return [b for b in moving if size[b.name] > 0.1 * size[moving[0].name]][:4]
+
+
+def _amounts(site: Site, score: Score, cause: Freed, block: Block) -> str:
+    """Return what the numbers of a block would change by, the largest first, in words."""
+    unit = block.parameter.spoken
+    scale = prior_sigma(score.held)[block.columns] / unit.size
+    step = scale * cause.step[block.columns]
+    sigma = scale * np.sqrt(np.diagonal(cause.cov))[block.columns]
+    order = np.argsort(-np.abs(step), kind="stable")[:3]
+    return ", ".join(
+        f"{block.parameter.called(site, block.owner, i)}"
+        f" {step[i]:+.3g} ± {sigma[i]:.1g} {unit.text}".rstrip()
+        for i in order.tolist()
+    )
+
+
+def _length(metres: float) -> str:
+    return f"{100.0 * metres:.2g} cm"
+
+
+def _unverified(case: Case, score: Score) -> list[Unverified]:
+    """Return what nothing in the log would contradict, and what it does to the poses."""
+    out = []
+    for block in score.held:
+        rows = np.arange(len(score.information))[block.columns]
+        declared = score.spread[rows]
+        cov = declared @ declared.T
+        root = np.linalg.cholesky(cov) if np.all(np.diagonal(cov) > 1e-12) else np.eye(len(rows))
+        widest = np.where(np.diagonal(root) > 1.0, np.diagonal(root), 1.0)
+        value, vector = np.linalg.eigh(
+            widest[:, None] * score.information[np.ix_(rows, rows)] * widest
+        )
+        free = vector[:, value < UNCHECKED]
+        if not free.shape[1]:
+            continue
+        by_pose = score.by_pose[..., rows]
+        typical = by_pose @ (widest[:, None] * free)
+        solved = np.linalg.solve(case.pose_cov, typical)
+        if np.mean(np.sum(typical * solved, axis=(1, 2))) < 1.0:
+            continue
+        moved = by_pose @ root
+        unit = block.parameter.spoken
+        largest = np.max(prior_sigma(score.held)[block.columns] * np.diagonal(root)) / unit.size
+        out.append(
+            Unverified(
+                block.name,
+                f"{largest:.3g} {unit.text}".rstrip(),
+                float(np.sqrt(np.mean(np.sum(moved[:, 3:] ** 2, axis=(1, 2))))),
+                float(np.rad2deg(np.sqrt(np.mean(np.sum(moved[:, :3] ** 2, axis=(1, 2)))))),
+            )
+        )
+    return out

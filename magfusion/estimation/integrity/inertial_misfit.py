@@ -1,0 +1,57 @@
+"""Inertial residuals: where rates and forces contradict the motion that the fields tell of.
+
+At the optimum the states have taken most of an inertial factor's error; what should be left is
+known from their covariance, of a sample of the intervals.
+"""
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.graph import Estimate
+from magfusion.estimation.inertial import ROWS
+from magfusion.estimation.solve.bordered import eliminate
+from magfusion.units import Array
+
+SAMPLED = 24  # intervals whose covariance is computed: they are much alike
+WIDTHS = {"x": 6, "v": 3, "b": 6}
+
+
+def inertial_errors(result: Smoothed, estimate: Estimate) -> Array:
+    """Return the whitened error of every inertial factor at an estimate, shape (intervals, 15)."""
+    native, count = result.graph.native, result.graph.epochs - 1
+    first, values = native.size() - count, estimate.values
+    out = np.zeros((count, ROWS))
+    for k in range(count):
+        factor = native.at(first + k)
+        assert isinstance(factor, gtsam.NoiseModelFactor)
+        out[k] = factor.whitenedError(values)
+    return out
+
+
+def expected_squares(result: Smoothed) -> Array:
+    """Return the mean square that should be left of each row, shape (15,)."""
+    graph, estimate = result.graph, result.estimate
+    count = graph.epochs - 1
+    linear = graph.native.linearize(estimate.values)
+    tree = eliminate(graph.linearized(estimate), graph.ordering)
+    first = linear.size() - count
+    chosen = np.unique(np.linspace(0, count - 1, min(SAMPLED, count)).astype(int))
+    left = np.zeros((len(chosen), ROWS))
+    for row, k in enumerate(chosen.tolist()):
+        factor = linear.at(first + k)
+        assert isinstance(factor, gtsam.JacobianFactor)
+        keys = [X(k), V(k), B(k), X(k + 1), V(k + 1), B(k + 1)]
+        joint = tree.jointMarginalCovariance(keys).fullMatrix()
+        columns, start = {}, 0
+        for key in keys:
+            width = WIDTHS[chr(gtsam.Symbol(key).chr())]
+            columns[key], start = slice(start, start + width), start + width
+        matrix, begin = np.zeros((ROWS, start)), 0
+        for key in factor.keys():  # noqa: SIM118
+            width = WIDTHS[chr(gtsam.Symbol(key).chr())]
+            matrix[:, columns[key]] = factor.getA()[:, begin : begin + width]
+            begin += width
+        left[row] = 1.0 - np.einsum("ij,jk,ik->i", matrix, joint, matrix)
+    return np.median(left, axis=0)

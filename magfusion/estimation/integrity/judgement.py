@@ -1,0 +1,98 @@
+"""What is said of one state online, and the state with a covariance that it allows."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from magfusion.estimation.state import POSITION, ROTATION, State
+from magfusion.model.trust import Finding, Trust, Verdict, worst
+from magfusion.units import Array
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What the witnesses say of a state.
+
+    Parameters
+    ----------
+    findings : tuple of Finding
+        A failed one means that the platform is lost.
+    excluded : tuple of str
+        Beacons that the gate refused there.
+    inflation : float
+        Of the whole covariance, at least one.
+    turn, shift : float
+        What the attitude (rad) and the position (m) may be off by beyond that, one sigma an axis.
+    protection_level_m, protection_level_deg : float, optional
+        None where there is none.
+    """
+
+    findings: tuple[Finding, ...] = ()
+    excluded: tuple[str, ...] = ()
+    inflation: float = 1.0
+    turn: float = 0.0
+    shift: float = 0.0
+    protection_level_m: float | None = None
+    protection_level_deg: float | None = None
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of the findings'."""
+        return worst(finding.verdict for finding in self.findings)
+
+    @property
+    def reasons(self) -> tuple[Finding, ...]:
+        """The findings that cast doubt, the most important first."""
+        return Trust(self.findings).reasons
+
+    def honest(self, cov: Array) -> Array:
+        """Return the covariance of a state as its witnesses allow it; the same where they agree."""
+        if self.inflation == 1.0 and self.turn == 0.0 and self.shift == 0.0:
+            return cov
+        wide = self.inflation * cov
+        wide[ROTATION, ROTATION] += self.turn**2 * np.eye(3)
+        wide[POSITION, POSITION] += self.shift**2 * np.eye(3)
+        return wide
+
+    def estimators(self, cov: Array) -> Array:
+        """Return the covariance that the estimator itself claims: the inverse of `honest`."""
+        narrow = cov.copy()
+        narrow[ROTATION, ROTATION] -= self.turn**2 * np.eye(3)
+        narrow[POSITION, POSITION] -= self.shift**2 * np.eye(3)
+        return narrow / self.inflation
+
+
+@dataclass(frozen=True)
+class Told:
+    """What was said of the state at a time (s)."""
+
+    time: float
+    judgement: Judgement
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedState(State):
+    """A state and what is said of it; its covariance is as wide as that demands.
+
+    Parameters
+    ----------
+    judgement : Judgement
+    """
+
+    judgement: Judgement = Judgement()
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the state is to be believed."""
+        return self.judgement.verdict
+
+    @property
+    def lost(self) -> bool:
+        """Whether the pose is a guess that nobody should use."""
+        return self.verdict is Verdict.FAILED
+
+
+def judged_state(state: State, judgement: Judgement) -> JudgedState:
+    """Return a state of an estimator as it is told."""
+    own = {field.name: getattr(state, field.name) for field in fields(State)}
+    return JudgedState(**own | {"cov": judgement.honest(state.cov)}, judgement=judgement)

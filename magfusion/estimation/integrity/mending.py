@@ -1,0 +1,36 @@
+"""A recording as the estimators take it: on even clocks, without single samples that are false.
+
+What is mended is said, and no reason for doubt: a sample that is left out is bridged by its
+neighbours, as one that was lost.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.integrity.samples import false_rows, false_samples, streams
+from magfusion.model.samples import ImuSamples, Log, Waveform
+from magfusion.model.site import Site
+from magfusion.model.trust import Verdict
+from magfusion.receiver.even_clocks import on_even_clocks
+
+
+def mended(log: Log, site: Site) -> Log:
+    """Return a log with what is wrong with single stamps and samples mended.
+
+    ``clocks`` and ``noticed`` of the result say what was.
+    """
+    log = on_even_clocks(log, site)
+    found = {stream.name: false_rows(stream, log, site) for stream in streams(log)}
+    if not any(len(rows) for rows in found.values()):
+        return log
+    noticed = [replace(f, verdict=Verdict.TRUSTWORTHY) for f in false_samples(log, site)]
+    noticed = [replace(f, text=f"{f.text} They are left out.") for f in noticed]
+    wave, imu = log.waveform, log.imu
+    inertial = np.union1d(found["gyroscope"], found["accelerometer"])
+    kept = np.delete(np.arange(len(imu)), inertial)
+    imu = ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept])
+    if wave is not None:
+        kept = np.delete(np.arange(len(wave)), found["magnetometer"])
+        wave = Waveform(wave.time[kept], wave.measured_sensor[kept])
+    return replace(log, imu=imu, waveform=wave, noticed=(*log.noticed, *noticed))

@@ -1,0 +1,294 @@
+"""What people get wrong of the inertial sensor and of how the magnetometer is mounted beside it."""
+
+from collections.abc import Callable, Iterator
+from itertools import pairwise, permutations, product
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.integrity.explanation import Explanation
+from magfusion.estimation.integrity.motion_comparison import SHARED, Compared, compared
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import Site
+from magfusion.units import DEGREE, Array
+
+STANDARD_GRAVITY = 9.80665  # m/s^2
+GYRO_UNITS = {
+    "in degrees per second": DEGREE,
+    "in milliradians per second": 1e-3,
+    "in units a thousand times as large": 1e3,
+    "in radians per second, and were converted from degrees": 1.0 / DEGREE,
+    "in revolutions per minute": 2.0 * np.pi / 60.0,
+}
+ACCEL_UNITS = {
+    "in g": STANDARD_GRAVITY,
+    "in mg": 1e-3 * STANDARD_GRAVITY,
+    "in cm/s^2": 1e-2,
+    "in mm/s^2": 1e-3,
+}
+LATEST = 3.0  # s
+PARTS = 4  # of a log, in each of which a delay is sought
+LARGEST_BIAS = {"gyro": 0.5, "accel": 1.5}  # rad/s, m/s^2; what is larger is no bias
+EYE = np.eye(3)
+
+
+def motion_causes(known: Compared, site: Site) -> Iterator[Explanation]:
+    """Yield what a mistake in axes, signs, units, mounting or lever arm would explain."""
+    before, _ = known.explained(EYE, EYE)
+
+    def tried(
+        code: str,
+        cause: str,
+        remedy: str,
+        gyro_axes: Array,
+        accel_axes: Array,
+        gravity: float = 1.0,
+    ) -> Explanation:
+        after, _ = known.explained(gyro_axes, accel_axes, gravity=gravity)
+        return Explanation(code, cause, remedy, before, after, known.freedom)
+
+    yield from _axes(tried)
+    imu = "Check gyro_x/y/z and accel_x/y/z: right-handed axes, rad/s, m/s^2, +g on z at rest."
+    for words, unit in ACCEL_UNITS.items():
+        yield tried("accel_units", f"the specific forces are {words}", imu, EYE, unit * EYE)
+    yield tried(
+        "gravity_missing",
+        "gravity was removed from the specific force",
+        "Record the specific force as the sensor measures it: +g on z at rest, level.",
+        EYE,
+        EYE,
+        gravity=0.0,
+    )
+    yield _scaled(known, before)
+    yield from _accel_scaled(known, before)
+    yield from _freed(known, before, site)
+
+
+def _freed(known: Compared, before: float, site: Site) -> Iterator[Explanation]:
+    """Yield what a lever arm, a mounting or a bias beyond its prior would explain."""
+    after, found = known.explained(EYE, EYE, free="lever")
+    lever = site.platform.magnetometer.position_body - found[SHARED["lever"]]
+    yield Explanation(
+        "lever_arm",
+        f"the lever arm is ({_listed(lever)}) m",
+        "Measure platform.magnetometer.body_from_sensor.position_m: the magnetometer's place in"
+        " the IMU's axes.",
+        before,
+        after,
+        known.freedom,
+        3,
+    )
+    turn, axes = Rotation.identity(), EYE
+    for _ in range(4):
+        after, found = known.explained(axes, axes, free="mounting")
+        turn = Rotation.from_rotvec(found[SHARED["mounting"]]) * turn
+        axes = turn.as_matrix()
+    yield Explanation(
+        "mounting",
+        f"the IMU's axes are turned by {turn.magnitude() / DEGREE:.3g} degrees against those that"
+        f" the mounting declares, about ({_listed(_axis(turn))}) of the body",
+        _mounting_remedy(site, axes),
+        before,
+        after,
+        known.freedom,
+        3,
+    )
+    for sensor, unit in (("gyro", "rad/s"), ("accel", "m/s^2")):
+        after, found = known.explained(EYE, EYE, free=sensor)
+        if np.max(np.abs(found[SHARED[sensor]])) > LARGEST_BIAS[sensor]:
+            continue
+        yield Explanation(
+            "imu_bias",
+            f"the bias of the {'gyro' if sensor == 'gyro' else 'accelerometer'} is"
+            f" ({_listed(found[SHARED[sensor]])}) {unit}, beyond its declared sigma",
+            f"Calibrate it, or declare a larger {sensor}_bias_sigma.",
+            before,
+            after,
+            known.freedom,
+            3,
+        )
+
+
+def _mounting_remedy(site: Site, axes: Array) -> str:
+    right = axes.T @ site.platform.magnetometer.body_from_sensor
+    angles = Rotation.from_matrix(right).as_euler("xyz", degrees=True)
+    return (
+        "Check the axes of IMU and magnetometer; body_from_sensor would be rpy_deg"
+        f" [{', '.join(f'{a:.3g}' for a in angles + 0.0)}]."
+    )
+
+
+def _axis(turn: Rotation) -> Array:
+    vector = turn.as_rotvec()
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)
+
+
+def _listed(values: Array) -> str:
+    return ", ".join(f"{value:.3g}" for value in np.round(values, 6) + 0.0)
+
+
+def _scaled(known: Compared, before: float) -> Explanation:
+    trials = np.linspace(0.8, 1.25, 46)
+    costs = [known.explained(scale * EYE, EYE)[0] for scale in trials]
+    best = int(np.argmin(costs))
+    return Explanation(
+        "gyro_scale",
+        f"the angular rates are {1.0 / trials[best]:.3g} times the true ones",
+        "Calibrate the gyro's scale.",
+        before,
+        costs[best],
+        known.freedom,
+        1,
+    )
+
+
+def _accel_scaled(known: Compared, before: float) -> Iterator[Explanation]:
+    trials = np.linspace(0.9, 1.1, 41)
+    costs = [known.explained(EYE, scale * EYE)[0] for scale in trials]
+    best = int(np.argmin(costs))
+    yield Explanation(
+        "accel_scale",
+        f"the specific forces are {1.0 / trials[best]:.3g} times what the declared gravity gives",
+        "Check world.gravity_m_s2, and the scale of the accelerometer.",
+        before,
+        costs[best],
+        known.freedom,
+        1,
+    )
+
+
+def _axes(
+    tried: Callable[[str, str, str, Array, Array], Explanation],
+) -> Iterator[Explanation]:
+    remedy = "Check the order and the signs of the IMU's axes, and body_from_sensor."
+    for axes in _signed_permutations():
+        words = _named(axes)
+        if np.allclose(axes, EYE):
+            continue
+        if np.linalg.det(axes) > 0:
+            angle = Rotation.from_matrix(axes)
+            cause = (
+                "the IMU's axes are turned against those that the mounting declares, by"
+                f" {angle.magnitude() / DEGREE:.0f} degrees: x, y, z are {words}"
+            )
+            yield tried("mounting", cause, remedy, axes, axes)
+        else:
+            yield tried("imu_axes", f"x, y, z of the IMU are {words}", remedy, axes, axes)
+        flips = np.allclose(np.abs(axes), EYE)
+        gyro = "gyro_sign" if flips and np.linalg.det(axes) < 0 else "imu_axes"
+        yield tried(gyro, f"x, y, z of the gyro are {words}", remedy, axes, EYE)
+        accel = "gravity_sign" if np.allclose(axes, -EYE) else "imu_axes"
+        cause = f"x, y, z of the accelerometer are {words}"
+        if accel == "gravity_sign":
+            cause = "the specific force has the wrong sign (-g on z at rest)"
+        yield tried(accel, cause, remedy, EYE, axes)
+
+
+def _signed_permutations() -> Iterator[Array]:
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            yield np.diag(signs) @ EYE[list(order)]
+
+
+def _named(axes: Array) -> str:
+    """Return which of the true axes each column of the file is."""
+    names = []
+    for column in axes.T:
+        k = int(np.argmax(np.abs(column)))
+        names.append(("-" if column[k] < 0 else "") + "xyz"[k])
+    return ", ".join(names)
+
+
+def gyro_unit_causes(
+    fixes: Fixes, imu: ImuSamples, site: Site, before: float, freedom: float
+) -> Iterator[Explanation]:
+    """Yield what another unit of the angular rates would explain."""
+    for words, unit in GYRO_UNITS.items():
+        converted = ImuSamples(imu.time, unit * imu.gyro_body, imu.accel_body)
+        tried = compared(fixes, converted, site)
+        if tried is not None:
+            yield Explanation(
+                "gyro_units",
+                f"the angular rates are {words}",
+                "Give gyro_x/y/z in rad/s.",
+                before,
+                tried.explained(EYE, EYE)[0],
+                freedom,
+            )
+
+
+def timing_causes(
+    fixes: Fixes, imu: ImuSamples, site: Site, before: float, freedom: float
+) -> Iterator[Explanation]:
+    """Yield what another time, or another rate, of the inertial stamps would explain."""
+    whole = compared(fixes, imu, site)
+    if whole is None or not np.any(
+        np.std(whole.gyro_turned, axis=0) > 3.0 * np.median(whole.turn_sigma)
+    ):
+        return  # what does not turn tells no time
+    edges = np.linspace(0, len(fixes), PARTS + 1).astype(np.int64).tolist()
+    late = [_delay(fixes, imu, site, slice(*part)) for part in pairwise(edges)]
+    known = [(at, value) for at, value in late if np.isfinite(value)]
+    if len(known) < 2:
+        return
+    at, value = np.array(known).T
+    middle = float(np.median(value))
+    steady = compared(fixes, imu, site, late=middle)
+    offset = np.inf
+    if steady is not None:
+        after, _ = steady.explained(EYE, EYE)
+        offset = after
+        yield Explanation(
+            "time_offset",
+            f"the inertial stamps are {middle:.3g} s late against the magnetometer's",
+            "Correct the stamps, or declare platform.imu.time_offset_s.",
+            before,
+            after * freedom / steady.freedom,
+            freedom,
+            1,
+        )
+    if len(known) < 3:
+        return
+    rate, start = np.polyfit(at, value, 1)
+    if abs(rate) < 1e-4:
+        return
+    stamps = (imu.time - start) / (1.0 + rate)
+    again = compared(fixes, ImuSamples(stamps, imu.gyro_body, imu.accel_body), site)
+    if again is not None:
+        after, _ = again.explained(EYE, EYE)
+        if after > 0.7 * offset:
+            return  # a delay says as much
+        yield Explanation(
+            "imu_clock",
+            f"the inertial stamps run {1e6 * rate:.4g} ppm fast against the magnetometer's",
+            "Check the sample rate with which the stamps were made.",
+            before,
+            after * freedom / again.freedom,
+            freedom,
+            2,
+        )
+
+
+def _delay(fixes: Fixes, imu: ImuSamples, site: Site, part: slice) -> tuple[float, float]:
+    """Return the middle of a part of the log, and what its inertial stamps are late by (s).
+
+    The sizes of the turns are compared, which hang on no axis.
+    """
+    time = fixes.time[part]
+    rate = np.linalg.norm(imu.gyro_body, axis=1)
+    stamps = imu.time + site.platform.imu.time_offset
+    total = np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * np.diff(stamps))])
+    turn = fixes.world_from_body[part, 0]
+    angle = Rotation.from_matrix(np.swapaxes(turn[:-1], 1, 2) @ turn[1:]).magnitude()
+    trial = np.arange(-LATEST, LATEST, 0.01)
+    edges = np.interp(time[:, None] + trial, stamps, total)
+    seen = np.diff(edges, axis=0)
+    cost = np.sum((seen - angle[:, None]) ** 2, axis=0)
+    best = int(np.argmin(cost))
+    usual = float(np.median(cost))
+    if not 0 < best < len(trial) - 1 or cost[best] > 0.5 * usual:
+        return float(np.mean(time)), np.nan
+    left, at, right = cost[best - 1 : best + 2]
+    fine = 0.5 * (left - right) / (left - 2.0 * at + right)
+    return float(np.mean(time)), float(trial[best] + 0.01 * fine)

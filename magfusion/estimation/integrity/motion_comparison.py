@@ -1,0 +1,250 @@
+"""Motion by the fields against motion by the inertial sensor, as two linear regressions.
+
+Fixes give how the platform turned from one epoch to a later one, and by second differences how it
+accelerated; gyro and accelerometer say the same in their own axes, units and time.  What relates
+them is linear in the axes of either, in biases, lever arm and gravity, so that a mistake in any is
+tried at the price of a small least-squares problem.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import fftconvolve
+from scipy.spatial.transform import Rotation, Slerp
+
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.field import skew
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import Site
+from magfusion.model.strapdown import attitude_at, attitude_from_gyro
+from magfusion.units import Array, BoolArray, IntArray
+
+TURN_SPAN = 0.4  # s, over which turns are compared
+CURVE_SPAN = 0.6  # s, of each half of a second difference
+GRID = 0.01  # s, of the specific force
+EVEN = 0.25  # of a span, by which epochs may miss it
+NEAREST = 2.0  # m; usual distance of a beacon, over which its survey's error tilts a fix
+LOCAL_ROTATION = 3e-3  # rad, what fixes err by that no noise tells of
+LOCAL_POSITION = 1e-3  # m
+
+SHARED = {"gyro": slice(0, 3), "accel": slice(3, 6), "tilt": slice(6, 8)}
+SHARED |= {"mounting": slice(8, 11), "lever": slice(11, 14)}
+WIDTH = 14
+WIDE = {"gyro": 10.0, "accel": 100.0, "tilt": 1.0, "mounting": 3.0, "lever": 10.0}
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """What fixes and inertial sensor say of the same turns and accelerations.
+
+    Parameters
+    ----------
+    turned, gyro_turned : ndarray, shape (m, 3)
+        Rotation vectors (rad) over spans (s), in body axes.
+    span : ndarray, shape (m,)
+    turn_sigma : ndarray, shape (m,)
+        (rad)
+    curve_world : ndarray, shape (n, 3)
+        Accelerations of the body (m/s^2).
+    force : ndarray, shape (n, 3, 3, 3)
+        ``force[:, i, j, k]``: weighted mean of ``world_from_body[i, j]`` times axis k of the
+        specific force, so that the axes may be exchanged afterwards (m/s^2).
+    carried : ndarray, shape (n, 3, 3)
+        Weighted mean of ``world_from_body``.
+    bent : ndarray, shape (n, 3, 3)
+        Second difference of ``world_from_body`` (1/s^2).
+    curve_sigma : ndarray, shape (n,)
+        (m/s^2)
+    gravity : float
+        (m/s^2)
+    prior : ndarray, shape (14,)
+        Sigmas of `SHARED`.
+    """
+
+    turned: Array
+    gyro_turned: Array
+    span: Array
+    turn_sigma: Array
+    curve_world: Array
+    force: Array
+    carried: Array
+    bent: Array
+    curve_sigma: Array
+    gravity: float
+    prior: Array
+
+    @property
+    def freedom(self) -> float:
+        """Number of residuals."""
+        return float(self.turned.size + self.curve_world.size)
+
+    def explained(
+        self,
+        gyro_axes: Array,
+        accel_axes: Array,
+        free: str | None = None,
+        gravity: float = 1.0,
+    ) -> tuple[float, Array]:
+        """Return chi square, and the shared parameters, if the axes are these.
+
+        Parameters
+        ----------
+        gyro_axes, accel_axes : ndarray, shape (3, 3)
+            Take a reading to body axes and SI units.
+        free : str, optional
+            What of `SHARED` is found without a prior.
+        gravity : float
+            Share of gravity that is in the specific force.
+        """
+        by_gyro = self.gyro_turned @ gyro_axes.T
+        turns = np.zeros((len(by_gyro), 3, WIDTH))
+        turns[..., SHARED["gyro"]] = -self.span[:, None, None] * np.eye(3)
+        turns[..., SHARED["mounting"]] = -skew(by_gyro)
+        turn_error = self.turned - by_gyro
+        force = np.einsum("nijk,jk->ni", self.force, accel_axes)
+        curves = np.zeros((len(force), 3, WIDTH))
+        curves[..., SHARED["accel"]] = -self.carried
+        curves[..., SHARED["tilt"]] = (
+            -self.gravity * gravity * skew(np.array([0.0, 0.0, 1.0]))[:, :2]
+        )
+        body_force = np.einsum("nijl,kl->nijk", self.force, accel_axes)
+        for axis in range(3):
+            turned = np.einsum("nijk,jk->ni", body_force, skew(np.eye(3)[axis]))
+            curves[..., SHARED["mounting"].start + axis] = turned
+        curves[..., SHARED["lever"]] = -self.bent
+        up = np.array([0.0, 0.0, gravity * self.gravity])
+        curve_error = self.curve_world + up - force
+        rows = np.concatenate(
+            [
+                (turns / self.turn_sigma[:, None, None]).reshape(-1, WIDTH),
+                (curves / self.curve_sigma[:, None, None]).reshape(-1, WIDTH),
+            ]
+        )
+        error = np.concatenate(
+            [
+                (turn_error / self.turn_sigma[:, None]).ravel(),
+                (curve_error / self.curve_sigma[:, None]).ravel(),
+            ]
+        )
+        prior = self.prior.copy()
+        if free is not None:
+            prior[SHARED[free]] = WIDE[free]
+        information = rows.T @ rows + np.diag(1.0 / prior**2)
+        found = np.linalg.solve(information, rows.T @ error)
+        left = error - rows @ found
+        return float(left @ left + np.sum((found / prior) ** 2)), found
+
+
+def compared(fixes: Fixes, imu: ImuSamples, site: Site, late: float = 0.0) -> Compared | None:
+    """Return what there is to compare; None where the log is too short.
+
+    Parameters
+    ----------
+    fixes : Fixes
+        Of all epochs, with the site's mounting and lever arm.
+    late : float
+        What the inertial stamps are late by, beyond the declared offset (s).
+    """
+    time = fixes.time
+    stamps = imu.time + site.platform.imu.time_offset - late
+    turn, place, cov = (
+        fixes.world_from_body[:, 0],
+        fixes.position_world[:, 0],
+        fixes.pose_cov[:, 0],
+    )
+    sure = fixes.determined[:, 0] & (fixes.probability[:, 0] > 0.99)
+    sure &= (time > stamps[0] + CURVE_SPAN) & (time < stamps[-1] - CURVE_SPAN)
+    rotation_sigma = np.sqrt(np.einsum("nii->n", cov[:, :3, :3]) / 3.0)
+    place_sigma = np.sqrt(np.einsum("nii->n", cov[:, 3:, 3:]) / 3.0)
+    i, j = _pairs(time, sure, TURN_SPAN)
+    before, at, after = _triples(time, sure, CURVE_SPAN)
+    if len(i) < 8 or len(at) < 8:
+        return None
+    relative = np.swapaxes(turn[i], 1, 2) @ turn[j]
+    attitude = attitude_from_gyro(stamps, imu.gyro_body)
+    by_gyro = attitude_at(attitude, stamps, imu.gyro_body, time)
+    half = 0.5 * (time[after] - time[before])[:, None]
+    force, carried = _forces(fixes, stamps, imu, time[at])
+    return Compared(
+        turned=Rotation.from_matrix(relative).as_rotvec(),
+        gyro_turned=(by_gyro[i].inv() * by_gyro[j]).as_rotvec(),
+        span=time[j] - time[i],
+        turn_sigma=np.sqrt(rotation_sigma[i] ** 2 + rotation_sigma[j] ** 2 + LOCAL_ROTATION**2),
+        curve_world=(place[after] - 2.0 * place[at] + place[before]) / half**2,
+        force=force,
+        carried=carried,
+        bent=(turn[after] - 2.0 * turn[at] + turn[before]) / half[..., None] ** 2,
+        curve_sigma=np.sqrt(6.0 * (place_sigma[at] ** 2 + LOCAL_POSITION**2)) / half[:, 0] ** 2,
+        gravity=site.gravity,
+        prior=_prior(site),
+    )
+
+
+def _prior(site: Site) -> Array:
+    imu, sigma = site.platform.imu, site.platform.magnetometer.sigma
+    tilts = [
+        np.hypot(np.max(b.sigma.rotation_beacon), np.max(b.sigma.position_world) / NEAREST)
+        for b in site.beacons
+    ]
+    tilt = 2e-3 + float(np.mean(tilts))
+    return np.concatenate(
+        [
+            np.full(3, imu.gyro_bias_sigma),
+            np.full(3, imu.accel_bias_sigma),
+            np.full(2, tilt),
+            np.maximum(sigma.rotation_sensor, 2e-3) + 0.5 * tilt,
+            np.maximum(sigma.position_body, 2e-3),
+        ]
+    )
+
+
+def _pairs(time: Array, sure: BoolArray, span: float) -> tuple[IntArray, IntArray]:
+    """Return epochs a span apart, one pair after the other."""
+    out: list[tuple[int, int]] = []
+    first = 0
+    while first < len(time) - 1:
+        last = int(np.argmin(np.abs(time - time[first] - span)))
+        if last > first and abs(time[last] - time[first] - span) < EVEN * span:
+            if sure[first] and sure[last]:
+                out.append((first, last))
+            first = last
+        else:
+            first += 1
+    pairs = np.array(out, dtype=np.int64).reshape(-1, 2)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _triples(time: Array, sure: BoolArray, span: float) -> tuple[IntArray, IntArray, IntArray]:
+    """Return epochs with others a span before and after them, evenly."""
+    out: list[tuple[int, int, int]] = []
+    at = 0
+    while at < len(time):
+        before = int(np.argmin(np.abs(time - time[at] + span)))
+        after = int(np.argmin(np.abs(time - time[at] - span)))
+        even = abs(time[after] + time[before] - 2.0 * time[at]) < 0.02 * span
+        whole = abs(time[after] - time[before] - 2.0 * span) < EVEN * span
+        if even and whole and sure[before] and sure[at] and sure[after]:
+            out.append((before, at, after))
+            at = max(at + 1, int(np.searchsorted(time, time[at] + 0.5 * span)))
+        else:
+            at += 1
+    triples = np.array(out, dtype=np.int64).reshape(-1, 3)
+    return triples[:, 0], triples[:, 1], triples[:, 2]
+
+
+def _forces(fixes: Fixes, stamps: Array, imu: ImuSamples, wanted: Array) -> tuple[Array, Array]:
+    """Return the specific force in world axes as a second difference weighs it.
+
+    The mean under a triangle of twice `CURVE_SPAN` is what acceleration makes of positions.
+    """
+    time = fixes.time
+    grid = np.linspace(time[0], time[-1], round((time[-1] - time[0]) / GRID) + 1)
+    turns = Slerp(time, Rotation.from_matrix(fixes.world_from_body[:, 0]))(grid).as_matrix()
+    force = np.stack([np.interp(grid, stamps, axis) for axis in imu.accel_body.T], axis=1)
+    count = round(CURVE_SPAN / GRID)
+    weight = np.concatenate([np.arange(1, count + 1), np.arange(count - 1, 0, -1)]) / count**2
+    outer = turns[:, :, :, None] * force[:, None, None, :]
+    both = np.concatenate([outer.reshape(len(grid), 27), turns.reshape(len(grid), 9)], axis=1)
+    mean = fftconvolve(both, weight[:, None], mode="same", axes=0)
+    rows = np.clip(np.round((wanted - grid[0]) / GRID).astype(np.int64), 0, len(grid) - 1)
+    return mean[rows, :27].reshape(-1, 3, 3, 3), mean[rows, 27:].reshape(-1, 3, 3)

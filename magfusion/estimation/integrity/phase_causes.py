@@ -1,0 +1,152 @@
+"""What may be wrong with clocks and drive phases: each epoch's phases are found beside its pose."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.integrity.explanation import CLEARLY, LEAST_FALL, Explanation
+from magfusion.estimation.integrity.field_causes import left_handed
+from magfusion.estimation.integrity.field_snapshots import Snapshots
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.samples import FieldSamples
+from magfusion.units import DEGREE, Array
+
+TWO_PI = 2.0 * np.pi
+LONGEST_SHIFT = 0.5  # s; an epoch that is farther off is known up to a common period of the tones
+SHIFT_STEP = 2e-4  # s
+RATE_REACH = 0.02  # relative; clocks that are farther off are not sought
+COMMON = 0.2  # spread of relative rates, of their mean, that is one clock's
+STILL = 2e-6  # relative rate that is none
+REVERSED = 0.1  # rad, that a phase may be off a half turn
+ALIKE = 0.7  # of the chi square of constant phases, that those of other clocks may leave
+DENSE = 60  # neighbouring epochs that tell a rate
+
+
+def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]:
+    """Yield what another epoch, or another rate of a clock, would explain.
+
+    Parameters
+    ----------
+    known : Snapshots
+        All of whose drives are declared to be synchronised.
+    every : FieldSamples
+        All epochs of the log.
+    """
+    if not all(beacon.synchronised for beacon in known.site.beacons):
+        return
+    loose = fix_epochs(known.samples, known.calibration, free=("phase",))
+    lower = float(np.sum(loose.cost[:, 0]))
+    if known.chi_square - lower < LEAST_FALL or known.chi_square < CLEARLY * lower:
+        return
+    tones_hz = np.concatenate([beacon.tone_frequencies_hz for beacon in known.site.beacons])
+    rate = _rates(known, every, tones_hz)
+    phase = loose.phase[:, 0]
+    mean = np.angle(np.nansum(np.exp(1j * phase), axis=0))
+    constant = _turned(known, mean)
+    if rate is not None and np.max(np.abs(rate)) > STILL:
+        clocks = list(_of_clocks(known, phase, rate, tones_hz))
+        if all(one.after < ALIKE * constant.chi_square - LEAST_FALL for one in clocks):
+            yield from clocks
+            return
+    shift = _shift(mean, tones_hz)
+    shifted = _turned(known, -TWO_PI * tones_hz * shift)
+    yield _said(
+        known,
+        shifted,
+        1,
+        "epoch_shift",
+        f"all stamps are {1e3 * shift:.3g} ms late against the epoch of the drive phases"
+        " (or that and a whole number of the tones' common periods)",
+        "Correct epoch_ns of the log, or the delay of the magnetometer's stamps.",
+    )
+    if np.all(np.abs(np.abs(mean) - np.pi) < REVERSED):
+        yield _said(known, _turned(known, np.full(len(mean), np.pi)), 0, *left_handed())
+    elif constant.chi_square < ALIKE * shifted.chi_square - LEAST_FALL:
+        yield _said(
+            known,
+            constant,
+            len(mean),
+            "phase",
+            f"the drive phases are ({', '.join(f'{m:.3g}' for m in mean / DEGREE)}) degrees beyond"
+            " the declared",
+            "Check phase_deg, or declare synchronised: false for the beacons.",
+        )
+
+
+def _said(
+    known: Snapshots, tried: Snapshots, found: int, code: str, cause: str, remedy: str
+) -> Explanation:
+    return Explanation(
+        code, cause, remedy, known.chi_square, tried.chi_square, known.freedom, found
+    )
+
+
+def _turned(known: Snapshots, turn: Array) -> Snapshots:
+    """Return epochs whose phasors have gone ahead by so much as is taken off here (rad)."""
+    phasor = known.samples.phasor_sensor * np.exp(-1j * turn)[..., None]
+    return replace(known, samples=replace(known.samples, phasor_sensor=phasor))
+
+
+def _rates(known: Snapshots, every: FieldSamples, tones_hz: Array) -> Array | None:
+    """Return how fast each channel's phase runs away, relative to its frequency."""
+    first = max(0, (len(every) - DENSE) // 2)
+    chosen = np.zeros(len(every), dtype=bool)
+    chosen[first : first + DENSE] = True
+    some = every.rows(chosen)
+    if len(some) < 8:
+        return None
+    loose = fix_epochs(some, known.calibration, free=("phase",))
+    phase, elapsed = loose.phase[:, 0], some.time - some.time[0]
+    trial = np.arange(-RATE_REACH, RATE_REACH, 0.25 / (elapsed[-1] * np.max(tones_hz)))
+    out = []
+    for k, tone in enumerate(tones_hz):
+        turned = np.exp(1j * (phase[:, k] - TWO_PI * tone * trial[:, None] * elapsed))
+        best = float(trial[np.argmax(np.abs(np.sum(turned, axis=1)))])
+        left = np.angle(
+            np.exp(1j * phase[:, k])
+            * np.exp(-1j * TWO_PI * tone * best * elapsed)
+            * np.exp(
+                -1j * np.angle(np.sum(np.exp(1j * (phase[:, k] - TWO_PI * tone * best * elapsed))))
+            )
+        )
+        out.append(best + float(np.polyfit(elapsed, left, 1)[0]) / (TWO_PI * tone))
+    return np.array(out)
+
+
+def _of_clocks(
+    known: Snapshots, phase: Array, rate: Array, tones_hz: Array
+) -> Iterator[Explanation]:
+    time, common = known.samples.time, float(np.median(rate))
+    alike = np.abs(rate - common) < max(COMMON * abs(common), STILL)
+    turn, found = TWO_PI * tones_hz * rate * time[:, None], len(rate)
+    left = np.angle(np.nansum(np.exp(1j * (phase - turn)), axis=0))
+    tried = _turned(known, turn + left)
+    names = [name for name, _ in known.samples.channels]
+    usual = max(float(np.median(np.abs(rate))), STILL)
+    strays = [n for n, r in zip(names, rate, strict=True) if abs(r) > 10.0 * usual]
+    if np.all(alike):
+        code, found = "sample_rate", 2
+        cause = f"the magnetometer's stamps run {1e6 * -common:.4g} ppm fast against the drives"
+        remedy = "Check the sample rate with which the stamps were made."
+    elif len(set(strays)) == 1:
+        code, found = "beacon_clock", 2
+        k = names.index(strays[0])
+        cause = f"beacon {strays[0]} runs at {tones_hz[k] * (1.0 + rate[k]):.6g} Hz"
+        remedy = "Correct its frequency_hz, or declare synchronised: false."
+    else:
+        code, found = "beacon_clock", 2 * len(rate)
+        cause = "the drives run on clocks of their own"
+        remedy = "Declare synchronised: false for the beacons."
+    yield Explanation(code, cause, remedy, known.chi_square, tried.chi_square, known.freedom, found)
+
+
+def _shift(phase: Array, tones_hz: Array) -> float:
+    """Return the delay (s) that phases show, the shortest of those that explain them alike."""
+    trial = np.arange(-LONGEST_SHIFT, LONGEST_SHIFT, SHIFT_STEP)
+    turned = np.exp(1j * (phase + TWO_PI * tones_hz * trial[:, None]))
+    agreement = np.real(np.sum(turned, axis=1))
+    near = np.flatnonzero(agreement > np.max(agreement) - 0.02)
+    best = float(trial[near[np.argmin(np.abs(trial[near]))]])
+    left = np.angle(np.exp(1j * (phase + TWO_PI * tones_hz * best)))
+    return best - float(np.sum(left * tones_hz) / np.sum(TWO_PI * tones_hz**2))

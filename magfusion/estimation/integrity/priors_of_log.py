@@ -1,0 +1,129 @@
+"""What a log's calibration and biases changed by, against what the site declares of them."""
+
+import numpy as np
+
+from magfusion.estimation.integrity.statistics import (
+    WITNESS_BUDGET,
+    holm,
+    log_p_chi_square,
+    sigmas,
+)
+from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
+from magfusion.model.parameters import Block, Parameter, difference
+from magfusion.model.prior import prior_sqrt_covariance
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import Array
+
+SAID = 0.02  # of the prior's variance, below which the data said nothing along a direction
+TOLERATED = 2.0  # chi square per degree of freedom below which sigmas are right enough
+ABSURD = 50.0  # sigmas of a bias that no sensor has: the data are not what the site says
+
+
+def calibration_change(case: Case) -> Testimony:
+    """Judge by how much the calibration moved from its declared values."""
+    result = case.result
+    if not result.blocks:
+        return NOTHING
+    spread = prior_sqrt_covariance(result.declared.site, result.blocks)
+    change = difference(result.declared, result.calibration, result.blocks)
+    cov = spread @ spread.T - result.calibration_cov
+    if case.score is not None:  # what is held disturbs the change as well
+        moved = case.score.by_calibration @ case.score.spread
+        cov = cov + 2.0 * moved @ moved.T
+    scale = np.sqrt(np.diagonal(spread @ spread.T))
+    change, cov = change / scale, cov / scale[:, None] / scale
+    tests = [_distance(change, cov, [block]) for block in result.blocks]
+    kinds = list(dict.fromkeys(block.parameter for block in result.blocks))
+    of_kind = {kind: [b for b in result.blocks if b.parameter == kind] for kind in kinds}
+    joint = {kind: _distance(change, cov, blocks) for kind, blocks in of_kind.items()}
+    whole = _distance(change, cov, list(result.blocks))
+    every = [*tests, *joint.values(), whole]
+    speaks = holm([log_p for _, _, log_p in every], WITNESS_BUDGET)
+    said = [(t, yes and t[0] > TOLERATED * t[1]) for t, yes in zip(every, speaks, strict=True)]
+    if not any(yes for _, yes in said):
+        return NOTHING
+    excess = max(square / freedom for (square, freedom, _), yes in said if yes)
+    speaking = {b.parameter for b, (_, yes) in zip(result.blocks, said, strict=False) if yes}
+    speaking |= {k for k, (_, yes) in zip(kinds, said[len(tests) :], strict=False) if yes}
+    findings = [
+        _finding(kind, of_kind[kind], *joint[kind], change) for kind in kinds if kind in speaking
+    ]
+    if not findings:
+        square, freedom, log_p = whole
+        findings = [
+            Finding(
+                "prior",
+                "All together, the calibration moved farther from its declared values than their"
+                f" sigmas allow: a chi square of {square:.3g} on {freedom}. Declare sigmas that are"
+                f" {np.sqrt(square / freedom):.2g} times as large.",
+                Verdict.DOUBTFUL,
+                float(sigmas(log_p)),
+            )
+        ]
+    return Testimony(tuple(findings), factor=np.full(len(case.pose_cov), excess))
+
+
+def _distance(change: Array, cov: Array, blocks: list[Block]) -> tuple[float, int, float]:
+    """Return chi square, degrees of freedom, and logarithm of its probability."""
+    rows = np.concatenate([np.arange(len(change))[block.columns] for block in blocks])
+    own = cov[np.ix_(rows, rows)]
+    value, vector = np.linalg.eigh(0.5 * (own + own.T))
+    said = value > SAID
+    if not np.any(said):
+        return 0.0, 1, 0.0
+    square = float(np.sum((vector[:, said].T @ change[rows]) ** 2 / value[said]))
+    freedom = int(np.sum(said))
+    return square, freedom, float(log_p_chi_square(square, freedom))
+
+
+def _finding(
+    kind: Parameter, blocks: list[Block], square: float, freedom: int, log_p: float, change: Array
+) -> Finding:
+    unit = kind.spoken
+    moved = {b.name: float(np.max(np.abs(change[b.columns]))) for b in blocks}
+    most = sorted(blocks, key=lambda b: -moved[b.name])[:3]
+    amounts = ", ".join(f"{b.name} by {moved[b.name]:.1f} sigma" for b in most)
+    declared = float(np.max([np.max(b.sigma) for b in blocks])) / unit.size
+    times = float(np.sqrt(max(square / freedom, max(moved.values()) ** 2 / 4.0)))
+    sigma = f"{declared:.3g} {unit.text}".rstrip(), f"{times * declared:.2g} {unit.text}".rstrip()
+    return Finding(
+        "prior",
+        f"The log moved {amounts}: farther from what the site declares than its sigmas allow (a chi"
+        f" square of {square:.3g} on {freedom}). Declare a sigma of {sigma[1]} where {sigma[0]} is"
+        f" declared for {kind.kind.replace('_', ' ')}, or measure it again.",
+        Verdict.DOUBTFUL,
+        float(sigmas(log_p)),
+    )
+
+
+def bias_change(case: Case) -> Testimony:
+    """Judge whether the biases of the IMU are such as the site declares."""
+    states, imu = case.result.states, case.result.declared.site.platform.imu
+    assert states.accel_bias_body is not None
+    assert states.gyro_bias_body is not None
+    kinds = (
+        ("accelerometer", states.accel_bias_body[0], imu.accel_bias_sigma, "m/s^2", "accel"),
+        ("gyroscope", states.gyro_bias_body[0], imu.gyro_bias_sigma, "rad/s", "gyro"),
+    )
+    distances = [bias / max(sigma, 1e-9) for _, bias, sigma, _, _ in kinds]
+    log_p = [float(log_p_chi_square(np.sum(d**2), 3)) for d in distances]
+    findings, excess = [], 1.0
+    for (name, bias, sigma, unit, key), d, p, yes in zip(
+        kinds, distances, log_p, holm(log_p, WITNESS_BUDGET), strict=True
+    ):
+        if not yes:
+            continue
+        worst = int(np.argmax(np.abs(d)))
+        excess = max(excess, float(np.sum(d**2)) / 3.0)
+        findings.append(
+            Finding(
+                "imu_bias",
+                f"The bias of the {name} is {bias[worst]:+.3g} {unit} on {'xyz'[worst]},"
+                f" {abs(d[worst]):.0f} times the declared {key}_bias_sigma of {sigma:.2g}: the data"
+                " are in another unit or frame than declared, the sensor is uncalibrated, or a"
+                f" {key}_bias_sigma of {float(np.max(np.abs(bias))):.2g} is to be declared.",
+                Verdict.FAILED if float(np.max(np.abs(d))) > ABSURD else Verdict.DOUBTFUL,
+                float(sigmas(p)),
+            )
+        )
+    return Testimony(tuple(findings), factor=np.full(len(states), excess)) if findings else NOTHING

@@ -1,0 +1,111 @@
+"""What the raw streams of a log say against it, whatever is made of them."""
+
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.integrity.body_iron import IRON_SPAN, iron_on_body
+from magfusion.estimation.integrity.compasses import still_means, wrong_compasses
+from magfusion.estimation.integrity.samples import (
+    clipped_samples,
+    false_samples,
+    frozen_samples,
+    repeated_samples,
+)
+from magfusion.estimation.integrity.signal import Heard, heard_in, unheard
+from magfusion.estimation.integrity.spectrum import undeclared_lines
+from magfusion.estimation.integrity.stamps import uneven_stamps
+from magfusion.estimation.integrity.turn_witness import turned_otherwise
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding, Trust, Verdict
+
+Witness = Callable[[Log, Site | None], Iterable[Finding]]
+
+WITNESSES: tuple[Witness, ...] = (
+    uneven_stamps,
+    frozen_samples,
+    repeated_samples,
+    clipped_samples,
+    false_samples,
+)
+LONGEST = 1200.0  # s; of a longer log the compasses and the spectrum are judged by its beginning
+# Of the gyroscope and the clocks: with them wrong, nothing is still in the axes it keeps.
+UNSTEADY = frozenset(
+    {"gyro_sign", "gyro_units", "gyro_scale", "imu_axes", "imu_clock", "stuck_axis"}
+)
+# What estimators bridge with an honest covariance is said, and no reason for doubt.
+BRIDGED = frozenset({"gap", "samples_lost", "silent_beacon"})
+
+
+def recorded(
+    log: Log,
+    site: Site | None,
+    bridged: Collection[str] = frozenset(),
+    poses: Trajectory | None = None,
+    *,
+    beacons: bool = False,
+    hearing: Heard | None = None,
+) -> tuple[Finding, ...]:
+    """Return what is wrong with a recording; without a site, of the streams alone.
+
+    Parameters
+    ----------
+    bridged : collection of str
+        Codes of what the estimator copes with.
+    poses : Trajectory, optional
+        By the beacons: they tell whose compass is wrong.
+    beacons : bool
+        Whether the result hangs on the beacons: then it is said how each is heard, and what else
+        transmits.
+    hearing : Heard, optional
+        How they are heard, where that is known already.
+    """
+    found = [*log.noticed, *(one for witness in WITNESSES for one in witness(log, site))]
+    log = beginning(log)
+    found += turned_otherwise(log, site)
+    if not any(finding.code in UNSTEADY for finding in found):
+        found += wrong_compasses(log, site, poses)
+        if site is not None and log.waveform is not None:
+            found += iron_on_body(still_means(log, site, IRON_SPAN), site)
+    if beacons and site is not None and site.beacons:
+        found += [f for f in undeclared_lines(log, site) if f.verdict is not Verdict.TRUSTWORTHY]
+        hearing = heard_in(log, site) if hearing is None else hearing
+        found += [] if hearing is None else unheard(hearing, site)
+    return tuple(replace(f, verdict=Verdict.TRUSTWORTHY) if f.code in bridged else f for f in found)
+
+
+def beginning(log: Log, span: float = LONGEST) -> Log:
+    """Return the first part of a log, of this length (s)."""
+    end = float(log.imu.time[0]) + span if len(log.imu) else span
+    if len(log.imu) and log.imu.time[-1] > end:
+        kept = slice(0, int(np.searchsorted(log.imu.time, end)))
+        imu = replace(
+            log.imu,
+            time=log.imu.time[kept],
+            gyro_body=log.imu.gyro_body[kept],
+            accel_body=log.imu.accel_body[kept],
+        )
+        log = replace(log, imu=imu)
+    wave = log.waveform
+    if wave is not None and len(wave) and wave.time[-1] > end:
+        kept = slice(0, int(np.searchsorted(wave.time, end)))
+        short = replace(wave, time=wave.time[kept], measured_sensor=wave.measured_sensor[kept])
+        log = replace(log, waveform=short)
+    return log
+
+
+def passed_on(log: Log, site: Site) -> Trust:
+    """Return what is to be said of a log whose fields are only put in another form.
+
+    Whoever estimates by them judges them again; what would fail that is doubtful here.
+    """
+    found = recorded(log, site, BRIDGED)
+    return Trust(
+        tuple(
+            replace(f, verdict=Verdict.DOUBTFUL) if f.verdict is Verdict.FAILED else f
+            for f in found
+        )
+    )

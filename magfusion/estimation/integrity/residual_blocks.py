@@ -1,0 +1,280 @@
+"""Residuals of fields and of inertial data, by beacon, by axis and by time.
+
+Judged by a chi square whose degrees of freedom count what is independent: neighbours in time are
+not, by the autocorrelation that is measured.  What is left of the fields is taken after everything
+uncertain has moved as far as its declared sigma allows, and after the causes that were named.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.graph import Estimate
+from magfusion.estimation.integrity.inertial_misfit import expected_squares, inertial_errors
+from magfusion.estimation.integrity.statistics import (
+    WITNESS_BUDGET,
+    effective_number,
+    holm,
+    log_p_chi_square,
+    sigmas,
+)
+from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.measurements.pose_fix import PoseFix
+from magfusion.estimation.state import states_in
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import Array, BoolArray
+
+BLOCK, MOST_BLOCKS = 10.0, 24  # s; stretches that are judged by themselves
+INDEPENDENT = 3.0  # numbers of a phasor's six: one model error bends several
+TOLERATED = 1.2**2  # mean square below which sigmas are right enough
+TOLERATED_INERTIAL = 1.5**2
+AXES = {0: "gyroscope, x", 1: "gyroscope, y", 2: "gyroscope, z"} | {
+    6: "accelerometer, x",
+    7: "accelerometer, y",
+    8: "accelerometer, z",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Misfit:
+    """Residuals of one kind in one stretch.
+
+    Parameters
+    ----------
+    name : str
+        Beacon, or axis.
+    rows : bool ndarray, shape (n,)
+        The stretch.
+    square : float
+        Mean, one where all is as declared.
+    log_p : float
+        Logarithm of the probability that chance does as much.
+    whole : bool
+        Whether the stretch is all of the log.
+    """
+
+    name: str
+    rows: BoolArray
+    square: float
+    log_p: float
+    whole: bool
+
+
+def blocks_of(time: Array) -> list[BoolArray]:
+    """Return the stretches of a log, the whole of it first."""
+    length = float(time[-1] - time[0])
+    count = int(np.clip(length / BLOCK, 1, MOST_BLOCKS))
+    at = np.minimum((time - time[0]) / max(length, 1e-9) * count, count - 1).astype(int)
+    whole = np.ones(len(time), dtype=bool)
+    return [whole] if count == 1 else [whole, *(at == k for k in range(count))]
+
+
+def misfits(name: str, residual: Array, blocks: list[BoolArray], numbers: float) -> list[Misfit]:
+    """Test residuals of one kind in every stretch.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n, ...)
+        NaN where missing.
+    numbers : float
+        How many independent ones there are at a time.
+    """
+    flat = residual.reshape(len(residual), -1)
+    known = np.isfinite(flat).any(axis=1)
+    if np.sum(known) < 2:
+        return []
+    share = effective_number(flat[known]) / float(np.sum(known))
+    out = []
+    for rows in blocks:
+        own = flat[rows & known]
+        if not len(own):
+            continue
+        freedom = numbers * max(1.0, share * len(own))
+        square = float(np.nanmean(own**2))
+        log_p = float(log_p_chi_square(square * freedom, freedom))
+        out.append(Misfit(name, rows, square, log_p, rows is blocks[0]))
+    return out
+
+
+def fields(case: Case, raw: Array, weighed: Array) -> Testimony:
+    """Judge what is left of the fields.
+
+    Parameters
+    ----------
+    raw, weighed : ndarray, shape (n, channels, 6)
+        Whitened, NaN where missing: all of it, and what a robust loss has not held back.
+    """
+    result = case.result
+    if not np.any(np.isfinite(raw)):
+        return NOTHING
+    time, channels = result.fields.time, result.fields.channels
+    blocks, tests = blocks_of(time), []
+    several = {name for name, tone in channels if tone}
+    for c, (name, tone) in enumerate(channels):
+        called = f"beacon {name}" + (f", tone {tone}" if name in several else "")
+        tests += misfits(called, raw[:, c], blocks, INDEPENDENT)
+    speaking = _speaking(tests, TOLERATED)
+    if not speaking:
+        return NOTHING
+    factor = _field_factor(case, weighed, blocks)
+    verdict = Verdict.DOUBTFUL if np.max(factor) > TOLERATED else Verdict.TRUSTWORTHY
+    findings = tuple(_field_finding(result, named, time, verdict) for named in _by_name(speaking))
+    return Testimony(findings, factor=factor)
+
+
+def fixes(case: Case) -> Testimony:
+    """Judge the fixes of loose coupling, which are all that is left of the fields there."""
+    graph = case.result.graph
+    measured = next((m for m in graph.measurements if isinstance(m, PoseFix)), None)
+    if measured is None or case.result.fix_response is None:
+        return NOTHING
+    error = graph.residual(measured, case.result.estimate)
+    time = case.result.states.time[measured.epoch]
+    speaking = _speaking(misfits("the fixes", error, blocks_of(time), INDEPENDENT), TOLERATED)
+    if not speaking:
+        return NOTHING
+    worst = float(max(one.square for one in speaking))
+    finding = Finding(
+        "field_residuals",
+        f"The fixes of single epochs deviate {_when(speaking, time)} from the motion that the"
+        f" inertial sensor tells of, by {np.sqrt(worst):.2g} times what they claim. Smooth with"
+        " tight coupling, which can tell the cause.",
+        Verdict.DOUBTFUL,
+        float(max(sigmas(one.log_p) for one in speaking)),
+    )
+    return Testimony((finding,), factor=np.full(len(case.pose_cov), worst))
+
+
+def _speaking(tests: list[Misfit], tolerated: float) -> list[Misfit]:
+    speaks = holm([one.log_p for one in tests], WITNESS_BUDGET)
+    return [t for t, yes in zip(tests, speaks, strict=True) if yes and t.square > tolerated]
+
+
+def _by_name(speaking: list[Misfit]) -> Iterator[list[Misfit]]:
+    for name in dict.fromkeys(one.name for one in speaking):
+        yield [one for one in speaking if one.name == name]
+
+
+def _field_finding(result: Smoothed, named: list[Misfit], time: Array, verdict: Verdict) -> Finding:
+    rms = float(np.sqrt(max(one.square for one in named)))
+    error = result.declared.site.model_error
+    sure = float(max(sigmas(one.log_p) for one in named))
+    return Finding(
+        "field_residuals",
+        f"The field of {named[0].name} deviates {_when(named, time)} from the model by {rms:.2g}"
+        f" times what its noise and the model error of {100.0 * error:.2g} % allow. Iron near the"
+        " beacon or the path, another drive than declared, or a disturbance: map the field"
+        " (magfusion calibrate fieldmap), check the beacon, or declare a model_error of"
+        f" {rms * error:.1g}.",
+        verdict,
+        sure,
+    )
+
+
+def _when(named: list[Misfit], time: Array) -> str:
+    parts = [one for one in named if not one.whole]
+    if not parts or (any(one.whole for one in named) and len(parts) > 3):
+        return "throughout"
+    rows = np.any([one.rows for one in parts], axis=0)
+    return f"between {time[rows][0]:.0f} and {time[rows][-1]:.0f} s"
+
+
+def _field_factor(case: Case, rest: Array, blocks: list[BoolArray]) -> Array:
+    """Return what makes the covariance of every pose honest again.
+
+    Errors that last weigh as many times as epochs are averaged, but no more: in a fix alone they
+    weigh once.
+    """
+    memory, result = _memory(case), case.result
+    # Weighed once: neighbouring windows share samples, which their covariance allows for.
+    lasting = [min(_persistence(rest[:, c]), memory) for c in range(rest.shape[1])]
+    out = np.ones(len(result.states))
+    where = np.interp(result.states.time, result.fields.time, np.arange(len(rest)))
+    at = np.round(where).astype(int)
+    with np.errstate(invalid="ignore"):
+        for rows in blocks:
+            squares = np.array(
+                [_mean(rest[rows, c] ** 2) for c in range(rest.shape[1])], dtype=float
+            )
+            factor = float(np.nanmean(squares * lasting))
+            inside = rows[at]
+            out[inside] = np.maximum(out[inside], factor)
+    return out
+
+
+def _mean(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.mean(known)) if len(known) else float("nan")
+
+
+def _memory(case: Case) -> float:
+    """Return how many epochs of the fields the estimator averages at a time."""
+    graph, estimate = case.result.graph, case.result.estimate
+    fields = next(m for m in graph.measurements if isinstance(m, FieldPhasors))
+    states = states_in(estimate.values).rows(fields.epoch)
+    by_pose = fields.linearize(states, estimate.calibration, ()).by_pose
+    assert by_pose is not None
+    flat = by_pose.reshape(len(by_pose), -1, 6)
+    information = np.swapaxes(flat, 1, 2) @ flat
+    share = np.einsum("nij,nji->n", information, case.pose_cov[fields.epoch]) / 6.0
+    return float(max(1.0, 1.0 / np.median(share)))
+
+
+def _persistence(residual: Array) -> float:
+    """Return the sum of the autocorrelation of a series, as far as it is to be seen."""
+    known = np.isfinite(residual)
+    filled = np.where(known, residual, 0.0)
+    count, square = int(np.sum(known)), float(np.sum(filled**2))
+    if count == 0 or square == 0.0:
+        return 1.0
+    total = 1.0
+    for lag in range(1, len(residual) // 3):
+        both = int(np.sum(known[lag:] & known[:-lag]))
+        if both == 0:
+            break
+        correlation = float(np.sum(filled[lag:] * filled[:-lag])) / both * count / square
+        if correlation < 2.0 / np.sqrt(both):
+            break
+        total += 2.0 * correlation
+    return total
+
+
+def inertial(case: Case, estimate: Estimate) -> Testimony:
+    """Judge the inertial residuals at an estimate."""
+    result = case.result
+    if result.graph.epochs < 4 or not result.graph.measurements:
+        return NOTHING
+    time = 0.5 * (result.states.time[1:] + result.states.time[:-1])
+    try:
+        expected = expected_squares(result)
+    except RuntimeError:  # of an undetermined stretch, which others tell of
+        return NOTHING
+    error, blocks = inertial_errors(result, estimate), blocks_of(time)
+    tests: list[Misfit] = []
+    for row, name in AXES.items():
+        if expected[row] > 1e-6:
+            tests += misfits(name, error[:, row] / np.sqrt(expected[row]), blocks, 1.0)
+    speaking = _speaking(tests, TOLERATED_INERTIAL)
+    if not speaking:
+        return NOTHING
+    worst = max(speaking, key=lambda one: -one.log_p)
+    rms = float(np.sqrt(worst.square))
+    names = ", ".join(dict.fromkeys(one.name for one in speaking))
+    finding = Finding(
+        "inertial_residuals",
+        f"The inertial data contradict the motion that the fields tell of"
+        f" {_when([one for one in speaking if one.name == worst.name], time)}: {names} deviate by"
+        f" up to {rms:.2g} times what the declared noise allows. Shocks, a false axis or scale,"
+        " stamps, or declared noise that is too small: check the inertial sensor, or declare"
+        " larger gyro_noise and accel_noise.",
+        Verdict.DOUBTFUL,
+        float(sigmas(worst.log_p)),
+    )
+    factor = np.ones(len(result.states))
+    for one in speaking:
+        rows = np.append(one.rows, one.rows[-1]) | np.insert(one.rows, 0, one.rows[0])
+        factor[rows] = np.maximum(factor[rows], one.square)
+    return Testimony((finding,), factor=factor)

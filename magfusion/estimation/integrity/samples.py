@@ -1,0 +1,306 @@
+"""What the samples say, one by one: frozen, repeated, clipped, and false ones.
+
+Instruments have steps, so that two samples in a row may well be alike; how often they are is
+measured in the log itself.  A magnetometer that is read faster than it measures holds its values,
+which is no saturation.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Verdict
+from magfusion.receiver.slots import has_schedule
+from magfusion.units import Array, BoolArray, IntArray
+
+CHANCE = 1e-7  # of a false alarm a stream
+SHORTEST_FREEZE = 0.15  # s
+DOUBTFUL_FREEZE = 0.25  # s; within which a beacon is not heard twice
+DEAD = 0.5  # share of the log from which a frozen axis is a dead one
+HELD = 0.05  # share of samples that are their predecessors, from which it is said
+OFTEN = 0.4  # share from which the values are late by more than a step
+ALWAYS = 0.98  # share of the samples
+PILE = 5.0  # times as often as the values next to it, an extreme is a limit
+LEAST_PILE = 12  # samples at a limit
+LEAST_RUN = 3  # of them in a row, at least once
+SPIKE = 15.0  # times the scatter beside it
+LEAST_SPIKES, SPIKE_SHARE = 5, 2e-4  # of them; fewer may be knocks
+SURE_SPIKE, LEAST_SURE = 30.0, 2  # times the scatter, and how many of those are enough
+SMOOTH_TONE = 0.15  # cycles a sample; of a faster one neighbours say nothing
+BLOCK = 128  # samples in which the scatter is measured
+AXES = "xyz"
+
+
+@dataclass(frozen=True, eq=False)
+class Stream:
+    """Three axes of one instrument.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    value : ndarray, shape (n, 3)
+        In the unit times the scale.
+    """
+
+    name: str
+    time: Array
+    value: Array
+    unit: str
+    scale: float = 1.0
+
+
+def streams(log: Log) -> tuple[Stream, ...]:
+    """Return the raw streams of a log."""
+    found = [
+        Stream("gyroscope", log.imu.time, log.imu.gyro_body, "rad/s"),
+        Stream("accelerometer", log.imu.time, log.imu.accel_body, "m/s^2"),
+    ]
+    if log.waveform is not None:
+        wave = log.waveform
+        found.append(Stream("magnetometer", wave.time, wave.measured_sensor, "uT", 1e6))
+    return tuple(one for one in found if len(one.time) > 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """Stretches of samples: from ``first`` up to but without ``last``, each shape (n,)."""
+
+    first: IntArray
+    last: IntArray
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+
+def runs(flag: BoolArray) -> Runs:
+    """Return where flags (n,) are set in a row."""
+    edge = np.diff(np.concatenate([[False], flag, [False]]).astype(np.int8))
+    return Runs(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1))
+
+
+def frozen(stream: Stream, same: BoolArray) -> Runs:
+    """Return the stretches that are longer alike than chance allows.
+
+    Parameters
+    ----------
+    same : bool ndarray, shape (n - 1,)
+        Whether a sample is its predecessor.
+    """
+    count = len(same)
+    blocks = np.array_split(same, max(1, count // BLOCK))
+    # A freeze itself must not raise what is taken for usual.
+    usual = float(np.quantile([np.mean(block) for block in blocks], 0.4))
+    by_chance = np.log(CHANCE / count) / np.log(min(max(usual, 1e-3), 0.97))
+    step = float(np.median(np.diff(stream.time)))
+    least = max(by_chance, SHORTEST_FREEZE / step, 6.0)
+    found = runs(same)
+    long = found.last - found.first >= least
+    return Runs(found.first[long], found.last[long])
+
+
+def frozen_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
+    """Yield the axes that stand still for longer than an instrument can."""
+    for stream in streams(log):
+        whole = _all_frozen(stream)
+        if len(whole):
+            yield _freeze(stream, "all axes", whole)
+            continue
+        for axis in range(3):
+            value = stream.value[:, axis]
+            alone = frozen(stream, value[1:] == value[:-1])
+            if len(alone) and not _at_limit(stream, axis, alone):
+                yield _freeze(stream, f"axis {AXES[axis]}", alone)
+
+
+def _all_frozen(stream: Stream) -> Runs:
+    return frozen(stream, np.all(stream.value[1:] == stream.value[:-1], axis=1))
+
+
+def _at_limit(stream: Stream, axis: int, found: Runs) -> bool:
+    """Tell whether an axis stands still only where it goes no farther."""
+    value = stream.value[:, axis]
+    low, high = float(np.min(value)), float(np.max(value))
+    at = value[found.first]
+    if low == high:  # always: where no other axis goes farther
+        return bool(high != 0.0 and abs(high) == np.max(np.abs(stream.value)))
+    return bool(np.all((at == low) | (at == high)))
+
+
+def _freeze(stream: Stream, where: str, found: Runs) -> Finding:
+    begin, end = stream.time[found.first], stream.time[found.last]
+    length, span = end - begin, float(stream.time[-1] - stream.time[0])
+    share = float(np.sum(length)) / span
+    longest = int(np.argmax(length))
+    at = stream.value[found.first[longest]] * stream.scale
+    value = f" at {at[AXES.index(where[-1])]:.4g} {stream.unit}" if where[-2] == " " else ""
+    more = f" and {len(found) - 1} times more" if len(found) > 1 else ""
+    dead = share > DEAD
+    verdict = Verdict.FAILED if dead else Verdict.DOUBTFUL
+    if not dead and length[longest] < DOUBTFUL_FREEZE:
+        verdict = Verdict.TRUSTWORTHY
+    hung = "frozen_magnetometer" if stream.name == "magnetometer" else "frozen_imu"
+    code = "stuck_axis" if dead or where != "all axes" else hung
+    cause = "it is dead or not connected" if dead else "the sensor or its driver hung"
+    return Finding(
+        code,
+        f"{stream.name}: {where} stood still{value} from {begin[longest]:.2f} to"
+        f" {end[longest]:.2f} s{more}, {100.0 * share:.0f} % of the log: {cause}. Cut that part out"
+        " by --start and --end, or repair the sensor.",
+        verdict,
+        3e3 + share,
+    )
+
+
+def repeated_samples(log: Log, site: Site | None) -> Iterator[Finding]:
+    """Yield the instruments that are read faster than they measure."""
+    for stream in streams(log):
+        same, still = np.all(stream.value[1:] == stream.value[:-1], axis=1), _all_frozen(stream)
+        for first, last in zip(still.first, still.last, strict=True):
+            same[first:last] = False
+        share = float(np.mean(same))
+        if share < HELD or share > 0.98:
+            continue
+        rate_hz = 1.0 / float(np.median(np.diff(stream.time)))
+        own = (1.0 - share) * rate_hz
+        timed = stream.name == "magnetometer" and site is not None and len(site.beacons) > 0
+        yield Finding(
+            "repeated_samples",
+            f"{stream.name}: {100.0 * share:.0f} % of the samples repeat the one before: it is"
+            f" read at {rate_hz:.4g} Hz and measures at about {own:.3g} Hz, so that held values"
+            " are late by up to a step. Read it when it has measured.",
+            Verdict.DOUBTFUL if timed or share > OFTEN else Verdict.TRUSTWORTHY,
+            100.0 + share / HELD,
+        )
+
+
+def clipped_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
+    """Yield the axes that stop at a limit of their instrument."""
+    for stream in streams(log):
+        kept = np.ones(len(stream.time), dtype=bool)
+        still = _all_frozen(stream)
+        for first, last in zip(still.first, still.last, strict=True):
+            kept[first : last + 1] = False
+        if np.sum(kept) < LEAST_PILE:
+            continue
+        largest = float(np.max(np.abs(stream.value[kept])))
+        for axis in range(3):
+            for sign in (-1.0, 1.0):
+                count, limit = clipped(sign * stream.value[kept, axis], largest)
+                if count == 0:
+                    continue
+                share = count / len(stream.time)
+                first_at = stream.time[np.argmax(stream.value[:, axis] == sign * limit)]
+                yield Finding(
+                    "saturated",
+                    f"{stream.name}: axis {AXES[axis]} stops at {sign * limit * stream.scale:+.4g}"
+                    f" {stream.unit} in {count} samples ({100.0 * share:.2g} %), first at"
+                    f" {first_at:.2f} s: its range ends there. Choose a larger range, or keep away"
+                    " from what drives it there.",
+                    weight=500.0 + 100.0 * share,
+                )
+
+
+def clipped(value: Array, largest: float = np.inf) -> tuple[int, float]:
+    """Return how many samples (n,) are at an upper limit, and the limit; zero where it is none.
+
+    A limit is reached far more often than the values just below it, and more than twice in a row.
+
+    Parameters
+    ----------
+    largest : float
+        Of all axes: an axis that is at it nearly always is at its limit too.
+    """
+    limit = float(np.max(value))
+    at = value == limit
+    count = int(np.sum(at))
+    if count < LEAST_PILE or (count > ALWAYS * len(value) and limit < largest):
+        return 0, limit
+    highest = min(8 * count, len(value))
+    below = np.unique(np.partition(value, -highest)[-highest:])
+    # Of an axis that is always at it, nothing is below.
+    nearby = max((int(np.sum(value == one)) for one in below[-4:-1]), default=0)
+    if len(below) < 3 and count < ALWAYS * len(value):
+        return 0, limit
+    found = runs(at)
+    longest = int(np.max(found.last - found.first))
+    apart = (value[1:] == value[:-1])[~at[1:]]
+    held = float(np.mean(apart)) if len(apart) else 0.0
+    by_chance = np.log(CHANCE) / np.log(min(max(held, 1e-3), 0.97))
+    pile = count > PILE * nearby
+    return (count if pile and longest >= max(LEAST_RUN, 0.5 * by_chance) else 0), limit
+
+
+def spikes(stream: Stream, least: float = SPIKE) -> BoolArray:
+    """Tell which samples are false alone, shape (n, 3): off the curve through their neighbours.
+
+    Parameters
+    ----------
+    stream : Stream
+        Its neighbours must agree among each other: a knock moves several samples.
+    least : float
+        Deviation, in units of the scatter about it.
+    """
+    x = stream.value
+    found = np.zeros(x.shape, dtype=bool)
+    if len(x) < 2 * BLOCK:
+        return found
+    before, after = x[1:-3], x[3:-1]
+    curve = (4.0 * (before + after) - x[:-4] - x[4:]) / 6.0
+    off = np.abs(x[2:-2] - curve)
+    floor = 1e-9 * np.max(np.abs(x))
+    apart = np.maximum(np.abs(after - before), np.abs(x[:-4] - x[4:]))
+    found[2:-2] = (off > least * _scatter(off) + floor) & (off > 3.0 * apart)
+    return found
+
+
+def _scatter(off: Array) -> Array:
+    """Return the usual size of deviations (n, 3) about each of them, over three blocks."""
+    count = len(off) // BLOCK
+    usual = np.median(off[: count * BLOCK].reshape(count, BLOCK, -1), axis=1) / 0.6745
+    padded = np.concatenate([usual[:1], usual, usual[-1:]])
+    widest = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
+    block = np.minimum(np.arange(len(off)) // BLOCK, count - 1)
+    return np.asarray(widest[block])
+
+
+def false_rows(stream: Stream, log: Log, site: Site | None) -> IntArray:
+    """Return the samples of a stream that are false alone; none where they are too few to tell."""
+    if any(finding.text.startswith(stream.name) for finding in clipped_samples(log, site)):
+        return np.zeros(0, dtype=np.int64)  # a limit makes corners
+    if stream.name == "magnetometer" and site is not None and not _smooth_between(stream, site):
+        return np.zeros(0, dtype=np.int64)
+    bad = spikes(stream)
+    rows = np.flatnonzero(bad.any(axis=1))
+    sure = int(np.sum(spikes(stream, SURE_SPIKE).any(axis=1)))
+    few = len(rows) < max(LEAST_SPIKES, SPIKE_SHARE * len(bad)) and sure < LEAST_SURE
+    return rows[:0] if few else rows
+
+
+def _smooth_between(stream: Stream, site: Site) -> bool:
+    """Return whether the declared drives leave the field smooth from sample to sample."""
+    if has_schedule(site):
+        return False
+    step = float(np.median(np.diff(stream.time)))
+    return all(np.max(b.tone_frequencies_hz) * step < SMOOTH_TONE for b in site.beacons)
+
+
+def false_samples(log: Log, site: Site | None) -> Iterator[Finding]:
+    """Yield the instruments that give single false samples."""
+    for stream in streams(log):
+        rows = false_rows(stream, log, site)
+        if len(rows) == 0:
+            continue
+        x = stream.value
+        off = np.abs(x[rows] - 0.5 * (x[rows - 1] + x[rows + 1])) * stream.scale
+        yield Finding(
+            "false_samples" if stream.name == "magnetometer" else "imu_spikes",
+            f"{stream.name}: {len(rows)} single samples ({1e3 * len(rows) / len(x):.2g} in a"
+            f" thousand) are off their neighbours, by {np.median(np.max(off, axis=1)):.3g}"
+            f" {stream.unit} (median), first at {stream.time[rows[0]]:.3f} s: probably bits are"
+            " lost between sensor and recorder. Check the cable and the bus speed.",
+            weight=300.0 + 1e3 * len(rows) / len(x),
+        )

@@ -1,0 +1,217 @@
+"""The score test: what freeing a parameter that is held would gain, and where it would go.
+
+At the optimum of all that is estimated, one elimination of the linear system leaves the information
+of everything held, and the gradient of the cost by it (the score).  A step of Gauss and Newton then
+says what each would change to, by how much the cost would fall, and how the poses would move; no
+system is solved again.
+"""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.factors import CALIBRATION_KEY, CONSIDERED_KEY
+from magfusion.estimation.graph import Estimate, Graph, steps_of_others
+from magfusion.estimation.inertial import ROWS
+from magfusion.estimation.integrity.suspects import TOLERANCE, Inertial, Stream, held_blocks
+from magfusion.estimation.measurements.earth import EarthField
+from magfusion.estimation.measurements.measurement import Rows
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.solve.bordered import eliminate_partial
+from magfusion.model.parameters import Block, Calibration, dimension, prior_sigma, retract
+from magfusion.model.prior import prior_sqrt_covariance
+from magfusion.model.samples import ImuSamples
+from magfusion.units import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """Of everything that is held, in units of its typical error.
+
+    Parameters
+    ----------
+    held : tuple of Block
+        Whose sigmas are those units.
+    information : ndarray, shape (h, h)
+        Of them, all that is estimated eliminated.
+    gradient : ndarray, shape (h,)
+        What they would gain, downhill: a step is the information's inverse times this.
+    spread : ndarray, shape (h, k)
+        A root of the covariance of their errors that the site declares; zero where it takes them
+        as known.
+    by_state : ndarray, shape (states, 15, h)
+        What a unit of them does to pose, velocity and biases.
+    by_calibration : ndarray, shape (dimension, h)
+        What a unit of them does to the calibration that is estimated.
+    """
+
+    held: tuple[Block, ...]
+    information: Array
+    gradient: Array
+    spread: Array
+    by_state: Array
+    by_calibration: Array
+
+    @property
+    def by_pose(self) -> Array:
+        """What a unit of them does to the poses, shape (states, 6, h)."""
+        return self.by_state[:, :6]
+
+    def with_declared(self) -> tuple[Array, Array]:
+        """Let what is uncertain move as far as its declared sigma and its tolerance allow.
+
+        Returns
+        -------
+        information : ndarray, shape (h, h)
+            Of what they may be wrong by beyond what is declared.
+        gradient : ndarray, shape (h,)
+        """
+        tolerance = [np.full(len(b.sigma), TOLERANCE.get(b.parameter, 0.0)) for b in self.held]
+        own = np.concatenate(tolerance) / prior_sigma(self.held)
+        taken = self._taken(np.concatenate([self.spread, np.diag(own)], axis=1))
+        left = self.information - self.information @ taken @ self.information
+        gradient = self.gradient - self.information @ (taken @ self.gradient)
+        return 0.5 * (left + left.T), gradient
+
+    def allowed(self, step: Array) -> Array:
+        """Return a step with what all else then moves by, as far as its declared sigma allows."""
+        return step + self._taken(self.spread) @ (self.gradient - self.information @ step)
+
+    def _taken(self, spread: Array) -> Array:
+        inner = np.eye(spread.shape[1]) + spread.T @ self.information @ spread
+        return np.asarray(spread @ np.linalg.solve(inner, spread.T))
+
+
+def score_of(result: Smoothed, imu: ImuSamples) -> Score | None:
+    """Return the score of everything that a result holds; None where there is nothing to ask.
+
+    Parameters
+    ----------
+    imu : ImuSamples
+        As it was recorded.
+    """
+    graph, estimate = result.graph, result.estimate
+    if not graph.measurements or result.fix_response is not None:
+        return None
+    steady = any(isinstance(m, EarthField) for m in graph.measurements)
+    held = held_blocks(result.declared.site, result.blocks, steady=steady)
+    size = dimension(held)
+    if size == 0:
+        return None
+    unit = np.diag(prior_sigma(held))
+    by_others = _by_stream(result, held, imu) @ unit
+    system = graph.beside(estimate, held, unit, by_others, explaining=True)
+    conditional, rest = eliminate_partial(system, graph.ordering)
+    order = gtsam.Ordering()
+    order.push_back(CONSIDERED_KEY)
+    information, gradient = rest.hessian(order)
+    moved = steps_of_others(_without_error(conditional), size)
+    keys = [key for i in range(graph.epochs) for key in (X(i), V(i), B(i))]
+    by_state = np.stack([step.vector(keys).reshape(-1, 15) for step in moved], axis=2)
+    by_calibration = np.zeros((dimension(result.blocks), size))
+    if result.blocks:
+        by_calibration[:] = np.array([step.at(CALIBRATION_KEY) for step in moved]).T
+    spread = _declared(result, held)
+    return Score(held, information, gradient, spread, by_state, by_calibration)
+
+
+def _without_error(net: gtsam.GaussianBayesNet) -> gtsam.GaussianBayesNet:
+    for i in range(net.size()):
+        net.at(i).getb()[...] = 0.0
+    return net
+
+
+def _declared(result: Smoothed, held: tuple[Block, ...]) -> Array:
+    """Return a root of the covariance that the site declares of what is held, typical errors."""
+    size = dimension(held)
+    if not result.considered:
+        return np.zeros((size, 0))
+    spread = prior_sqrt_covariance(result.declared.site, result.considered)
+    at = {b.key: b.columns for b in held}
+    out = np.zeros((size, spread.shape[1]))
+    for block in result.considered:
+        if block.key in at:  # one from outside is not tried
+            out[at[block.key]] = spread[block.columns]
+    return out / prior_sigma(held)[:, None]
+
+
+def _by_stream(result: Smoothed, held: tuple[Block, ...], imu: ImuSamples) -> Array:
+    """Return what the held parameters of the IMU do to its factors, shape (intervals, 15, h)."""
+    states, graph = result.states, result.graph
+    first = _first_inertial(graph)
+    size, count = dimension(held), graph.epochs - 1
+    out = np.zeros((count, ROWS, size))
+    linear = graph.native.linearize(result.estimate.values)
+    time = imu.time + result.calibration.time_offset
+    of_bias = np.zeros((count, ROWS, 6))
+    for k in range(count):
+        factor = linear.at(first + k)
+        assert isinstance(factor, gtsam.JacobianFactor)
+        # A bias that is the same at both ends leaves its random walk alone.
+        whole, column = factor.getA(), 0
+        for key in factor.keys():  # noqa: SIM118
+            symbol = gtsam.Symbol(key).chr()
+            width = 3 if symbol == ord("v") else 6
+            if symbol == ord("b"):
+                of_bias[k] += whole[:, column : column + width]
+            column += width
+    for block in held:
+        if isinstance(block.parameter, Inertial):
+            bias = block.parameter.as_bias(Stream(imu, states.world_from_body))
+            if len(bias) != count:
+                bias = _means(bias, time, states.time)
+            out[:, :, block.columns] = of_bias @ bias
+    return out
+
+
+def moved_estimate(result: Smoothed, score: Score, step: Array) -> Estimate:
+    """Return the estimate that a step of what is held leads to.
+
+    Parameters
+    ----------
+    step : ndarray, shape (h,)
+        In typical errors.
+    """
+    estimate, change = result.estimate, gtsam.VectorValues()
+    for i, own in enumerate(score.by_state @ step):
+        for key, part in ((X(i), own[:6]), (V(i), own[6:9]), (B(i), own[9:])):
+            change.insert(key, part)
+    by_blocks = score.by_calibration @ step
+    own_step = prior_sigma(score.held) * step
+
+    def moved(calibration: Calibration) -> Calibration:
+        return retract(retract(calibration, result.blocks, by_blocks), score.held, own_step)
+
+    segments = tuple(moved(calibration) for calibration in estimate.segments)
+    return Estimate(estimate.values.retract(change), moved(estimate.calibration), segments)
+
+
+def field_residual(result: Smoothed, estimate: Estimate, *, raw: bool = False) -> Array:
+    """Return the whitened residual of the fields at an estimate, NaN where missing.
+
+    Shape (n, channels, 6); what a robust loss holds back is held back unless it is asked for raw.
+    """
+    graph = result.graph
+    fields = next((m for m in graph.measurements if isinstance(m, FieldPhasors)), None)
+    if fields is None:
+        return np.full_like(result.residual, np.nan)
+    alone = fields.alone()
+    loss = None if raw else alone.loss
+    error = Rows(graph.residual(alone, estimate)).weighed(loss)[0].error
+    return np.where(result.fields.valid[..., None], error, np.nan)
+
+
+def _first_inertial(graph: Graph) -> int:
+    return graph.native.size() - (graph.epochs - 1)
+
+
+def _means(value: Array, time: Array, edges: Array) -> Array:
+    """Return the mean of samples between edges; zero where there is none."""
+    at = np.searchsorted(time, edges)
+    total = np.concatenate([np.zeros((1, *value.shape[1:])), np.cumsum(value, axis=0)])
+    number = np.diff(at)
+    sums = total[at[1:]] - total[at[:-1]]
+    return sums / np.maximum(number, 1)[:, None, None]

@@ -1,0 +1,306 @@
+"""Solution separation: the estimate without each beacon against the one with all.
+
+Multiple-hypothesis solution separation of advanced RAIM (J. Blanch et al., IEEE Trans. Aerospace
+and Electronic Systems 51(1), 2015).  Under the hypothesis that one beacon is false, by whatever
+amount, the estimate without it is right.  What the estimate with all deviates from it by more than
+a threshold is an alarm; what stays below the threshold bounds what the false beacon can do unseen.
+All is by epoch, and batched.
+
+Position and attitude each are judged by the norm of a Gaussian vector, whose tail has two bounds:
+that of a single number with all of the variance (G. J. Székely and N. K. Bakirov, Probability
+Theory and Related Fields 126, 2003), and that of three equal ones with the largest.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import erfc, ndtri
+from scipy.stats import chi
+
+from magfusion.estimation.solve.batched import open_inverse
+from magfusion.model.trust import Risk
+from magfusion.units import DEGREE, Array, BoolArray, IntArray
+
+POSE = 6  # axes: rotation, then position
+BISECTIONS = 24
+MOST_DEG = 180.0  # an attitude level beyond it says nothing
+SINGLE_HOLDS = 0.215  # probability of a tail below which a single number bounds it
+LEAST = 1e-30  # rad, m; a deviation below it is none
+PARTS = (slice(0, 3), slice(3, 6))  # rotation, position
+
+
+class Radius(NamedTuple):
+    """Norms of Gaussian vectors of three numbers, bounded from above.
+
+    Parameters
+    ----------
+    whole : ndarray, shape (...)
+        Root of the sum of the variances.
+    largest : ndarray, shape (...)
+        Largest standard deviation of any direction.
+    """
+
+    whole: Array
+    largest: Array
+
+    def tail(self, radius: Array) -> Array:
+        """Return a probability that is not less than that of a norm beyond a radius."""
+        single = erfc(radius / (np.sqrt(2.0) * np.maximum(self.whole, LEAST)))
+        share = radius / np.maximum(self.largest, LEAST)
+        share = np.clip(share, 0.0, 1e3)
+        three = erfc(share / np.sqrt(2.0)) + np.sqrt(2.0 / np.pi) * share * np.exp(-0.5 * share**2)
+        return np.minimum(three, np.where(single < SINGLE_HOLDS, single, 1.0))
+
+    def beyond(self, probability: Array | float) -> Array:
+        """Return a radius that a norm exceeds with no more than a probability."""
+        single = -ndtri(0.5 * np.minimum(probability, 0.999 * SINGLE_HOLDS))
+        with np.errstate(invalid="ignore"):  # of what is known exactly
+            bounds = single * self.whole, chi.isf(probability, 3) * self.largest
+        return np.fmin(*bounds)
+
+
+def radii(cov: Array) -> Radius:
+    """Return the norms of rotation and position, shape (..., 2), of covariances (..., 6, 6)."""
+    blocks = np.stack([cov[..., part, part] for part in PARTS], axis=-3)
+    trace = np.maximum(np.einsum("...ii->...", blocks), 0.0)
+    trace = np.maximum(trace, 0.0)  # what is known exactly may round below
+    largest = np.clip(_largest_eigenvalue(blocks), 0.0, trace)
+    return Radius(np.sqrt(trace), np.sqrt(largest))
+
+
+def _largest_eigenvalue(matrix: Array) -> Array:
+    """Return the largest eigenvalue of symmetric matrices (..., 3, 3), by its closed form."""
+    mean = np.einsum("...ii->...", matrix) / 3.0
+    rest = matrix - mean[..., None, None] * np.eye(3)
+    size = np.sqrt(np.einsum("...ij,...ij->...", rest, rest) / 6.0)
+    scaled = rest / np.where(size > 0.0, size, 1.0)[..., None, None]
+    a, b, c = (scaled[..., i, :] for i in range(3))
+    half = 0.5 * np.einsum("...i,...i->...", a, np.cross(b, c))
+    return mean + 2.0 * size * np.cos(np.arccos(np.clip(half, -1.0, 1.0)) / 3.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Separation:
+    """Estimates without each beacon, beside the one with all.
+
+    Rotation, then position, in axes of any kind.
+
+    Parameters
+    ----------
+    step : ndarray, shape (n, beacons, 6)
+        Estimate without a beacon minus the one with all (rad, m).
+    cov : ndarray, shape (n, 6, 6)
+        Of the estimate with all.
+    subset_cov : ndarray, shape (n, beacons, 6, 6)
+        Without a beacon; of no meaning where it is not determined.
+    separation_cov : ndarray, shape (n, beacons, 6, 6)
+        Of the step.
+    determined : bool ndarray, shape (n, beacons)
+        Whether there is an estimate without a beacon.
+    cost : ndarray, shape (n, beacons)
+        Squared residual that is left without a beacon.
+    rows : ndarray, shape (n, beacons)
+        Residuals of each beacon; of one that is not in an epoch none, and it cannot be false.
+    """
+
+    step: Array
+    cov: Array
+    subset_cov: Array
+    separation_cov: Array
+    determined: BoolArray
+    cost: Array
+    rows: Array
+
+    @cached_property
+    def sigma(self) -> Radius:
+        """Of the estimate with all, shape (n, 2): rotation and position."""
+        return radii(self.cov)
+
+    @cached_property
+    def subset_sigma(self) -> Radius:
+        """Of the estimates without a beacon, shape (n, beacons, 2)."""
+        return radii(self.subset_cov)
+
+    @cached_property
+    def separation_sigma(self) -> Radius:
+        """Of the steps, shape (n, beacons, 2)."""
+        return radii(self.separation_cov)
+
+    @cached_property
+    def shift(self) -> Array:
+        """Norm of the steps, shape (n, beacons, 2) (rad, m)."""
+        return np.stack([np.linalg.norm(self.step[..., part], axis=-1) for part in PARTS], axis=-1)
+
+    def prior(self, risk: Risk) -> Array:
+        """Return the probability that each beacon is false, shape (n, beacons)."""
+        return np.where(self.rows > 0, risk.fault, 0.0)
+
+    def thresholds(self, risk: Risk, slack: float = 0.0) -> Array:
+        """Return how large a step may be, shape (n, beacons, 2) (rad, m).
+
+        Parameters
+        ----------
+        slack : float
+            A step below so many sigma of the estimate with all is no alarm: it is covered.
+        """
+        tests = len(PARTS) * self.step.shape[1]
+        limit = self.separation_sigma.beyond(risk.false_alarm / tests)
+        return np.maximum(limit, slack * self.sigma.whole[:, None])
+
+    def excess(self, risk: Risk, slack: float = 0.0) -> Array:
+        """Return the step of each beacon, of its threshold, shape (n, beacons); above one: alarm.
+
+        That of rotation or position, whichever is larger.
+        """
+        limit = self.thresholds(risk, slack)
+        known = (self.determined & (self.rows > 0))[..., None]
+        return np.max(np.where(known, self.shift / np.maximum(limit, LEAST), 0.0), axis=2)
+
+    def likely(self, prior: Array) -> Array:
+        """Return the probability of each beacon, given that one is false, shape (n, beacons).
+
+        Parameters
+        ----------
+        prior : ndarray, shape (n, beacons)
+        """
+        # What leaves more out explains more; each number is worth two (Akaike).
+        cost = np.where(self.determined & (prior > 0.0), self.cost + 2.0 * self.rows, np.inf)
+        least = np.min(cost, axis=1, keepdims=True)
+        weight = prior * np.exp(-0.5 * (cost - np.where(np.isfinite(least), least, 0.0)))
+        total = np.sum(weight, axis=1, keepdims=True)
+        return weight / np.where(total > 0.0, total, 1.0)
+
+
+def linear_separation(
+    jacobian: Array, error: Array, covariance: Array | None, owner: IntArray, beacons: int
+) -> Separation:
+    """Separate the estimates of linear least squares with whitened rows, each epoch on its own.
+
+    Parameters
+    ----------
+    jacobian : ndarray, shape (n, rows, 6 + nuisances)
+        By the pose, then by what else is found.  Zero rows are missing ones.
+    error : ndarray, shape (n, rows)
+        Predicted minus measured.
+    covariance : ndarray, shape (n, rows, rows), optional
+        What the rows' covariance really is where their whitening only stands in for it.
+    owner : int ndarray, shape (rows,)
+        Beacon of each row; negative of what is no beacon's.
+    beacons : int
+    """
+    step, gain, _ = _estimate(jacobian, error)
+    known = np.any(jacobian != 0.0, axis=2)
+    parts = []
+    for beacon in range(beacons):
+        kept = np.where((owner == beacon)[:, None], 0.0, jacobian)
+        other, other_gain, determined = _estimate(kept, error)
+        left = np.where(owner == beacon, 0.0, error)
+        cost = np.sum((left + (kept @ other[..., None])[..., 0]) ** 2, axis=1)
+        moved, difference = other[:, :POSE] - step[:, :POSE], other_gain - gain
+        count = np.sum(known & (owner == beacon), axis=1)
+        covs = spread(other_gain, covariance), spread(difference, covariance)
+        parts.append((moved, *covs, determined, cost, count))
+    moved, *others = (np.stack(part, axis=1) for part in zip(*parts, strict=True))
+    return Separation(moved, spread(gain, covariance), *others)
+
+
+def spread(gain: Array, covariance: Array | None) -> Array:
+    """Return the covariance of a linear estimate, shape (n, k, k).
+
+    Parameters
+    ----------
+    gain : ndarray, shape (n, k, rows)
+    covariance : ndarray, shape (n, rows, rows), optional
+        The identity where there is none.
+    """
+    carried = gain if covariance is None else gain @ covariance
+    return carried @ np.swapaxes(gain, -1, -2)
+
+
+def _estimate(jacobian: Array, error: Array) -> tuple[Array, Array, BoolArray]:
+    """Return step, gain of the pose, and whether the pose is determined."""
+    transposed = np.swapaxes(jacobian, 1, 2)
+    inverse, determined = open_inverse(transposed @ jacobian)
+    gain = -inverse @ transposed
+    return (gain @ error[..., None])[..., 0], gain[:, :POSE], determined
+
+
+def unmonitored(prior: Array) -> Array:
+    """Return the probability that more than one beacon is false, shape (n,).
+
+    Parameters
+    ----------
+    prior : ndarray, shape (n, beacons)
+    """
+    none = np.prod(1.0 - prior, axis=1)
+    one = none * np.sum(prior / np.maximum(1.0 - prior, np.finfo(np.float64).tiny), axis=1)
+    return np.maximum(1.0 - none - one, 0.0)
+
+
+def protection_levels(
+    separation: Separation, risk: Risk, slack: float = 0.0, prior: Array | None = None
+) -> tuple[Array, Array]:
+    """Return the radii that position (m) and attitude (deg) stay within, each of shape (n,).
+
+    Each has half of the risk.  NaN where there is none: without some beacon that may be false
+    nothing determines the pose, or two may be false too often.
+
+    Parameters
+    ----------
+    slack : float
+        As of `Separation.thresholds`.
+    prior : ndarray, shape (n, beacons), optional
+        Probability that each beacon is false, where more is known than `Risk.fault`.
+    """
+    prior = separation.prior(risk) if prior is None else prior
+    share = (1.0 - risk.mirrors) * risk.total - unmonitored(np.minimum(prior, risk.fault))
+    covered = np.all(separation.determined | (prior == 0.0), axis=1) & (share > 0.0)
+    level = _levels(
+        separation.sigma,
+        separation.subset_sigma,
+        separation.thresholds(risk, slack),
+        prior[..., None],
+        np.where(covered, share, 1.0)[:, None] / len(PARTS),
+    )
+    level = np.where(covered[:, None], level, np.nan)
+    degrees = level[:, 0] / DEGREE
+    return level[:, 1], np.where(degrees <= MOST_DEG, degrees, np.nan)
+
+
+def _levels(sigma: Radius, without: Radius, threshold: Array, prior: Array, risk: Array) -> Array:
+    """Return what is exceeded unseen with no more than a risk, shape (n, 2).
+
+    It solves ``P(error > L) + sum_j p_j P(error_j > L - T_j) = risk``, shapes (n, beacons, 2) of
+    the faults j.
+    """
+    terms = prior.shape[1] + 1
+    tail = np.minimum(risk[:, None] / (terms * np.where(prior > 0.0, prior, 1.0)), 1.0)
+    faulted = np.where(prior > 0.0, threshold + without.beyond(tail), 0.0)
+    high = np.maximum(sigma.beyond(risk / terms), np.max(faulted, axis=1))
+    low = np.zeros_like(high)
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        missed = np.sum(prior * without.tail(middle[:, None] - threshold), axis=1)
+        more = sigma.tail(middle) + missed > risk
+        low, high = np.where(more, middle, low), np.where(more, high, middle)
+    return high
+
+
+def with_rivals(level: Array, distance: Array, weight: Array, share: float) -> Array:
+    """Return levels that reach to every rival pose that is too likely to be passed over.
+
+    Parameters
+    ----------
+    level : ndarray, shape (n,)
+    distance : ndarray, shape (n, rivals)
+        Of each rival hypothesis from the best.
+    weight : ndarray, shape (n, rivals)
+        Posterior share, falling.
+    share : float
+        Of the risk that the rivals may take together.
+    """
+    rest = np.cumsum(weight[:, ::-1], axis=1)[:, ::-1]
+    reach = np.where(rest > share, distance + level[:, None], level[:, None])
+    return np.max(np.concatenate([level[:, None], reach], axis=1), axis=1)

@@ -1,0 +1,168 @@
+"""How well each beacon is heard along a log: never, not for a while, or hardly."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.integrity.detection import DETECTION_CHI_SQUARE
+from magfusion.estimation.integrity.samples import runs
+from magfusion.model.noise import whitening
+from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Verdict
+from magfusion.receiver.receiver import received
+from magfusion.receiver.slots import has_schedule
+from magfusion.receiver.windows import LockinSettings
+from magfusion.units import Array, BoolArray
+
+HARDLY = 0.05  # share of the epochs; heard in fewer, a beacon is taken for silent
+UNHEARD = 0.1  # share of the epochs without any beacon, from which it casts doubt
+SILENCE = 1.0  # s; a shorter one is not said
+FALLEN = 0.2  # of the amplitude beside it, what is left of a beacon that is switched off
+LISTED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """How well the beacons are heard.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    beacons : tuple of str
+    snr : ndarray, shape (n, beacons)
+        Amplitude of the strongest tone over its noise, a component each; NaN where it is missing.
+    amplitude : ndarray, shape (n, beacons)
+        Of all its tones (T), noise and all.
+    loud : bool ndarray, shape (n, beacons)
+        Whether it is told from noise.
+    """
+
+    time: Array
+    beacons: tuple[str, ...]
+    snr: Array
+    amplitude: Array
+    loud: BoolArray
+
+
+def heard(samples: FieldSamples, site: Site) -> Heard:
+    """Return how well each beacon is heard in phasors.
+
+    A phasor that is missing is one that was not detected; where coils are driven in turn it may
+    only be another's turn.
+    """
+    names = tuple(dict.fromkeys(name for name, _ in samples.channels))
+    sqrt_information = whitening(samples.phasor_cov, samples.valid)
+    phasor = np.nan_to_num(samples.phasor_sensor)[..., None]
+    square = np.sum(np.abs(sqrt_information @ phasor) ** 2, axis=(-1, -2))
+    square = np.where(samples.valid, square, -np.inf)
+    best = np.stack(
+        [np.max(square[:, [n == name for n, _ in samples.channels]], axis=1) for name in names],
+        axis=1,
+    )
+    power = np.nansum(
+        np.abs(np.where(samples.valid[..., None], samples.phasor_sensor, 0.0)) ** 2, 2
+    )
+    amplitude = np.stack(
+        [
+            np.sqrt(np.sum(power[:, [n == name for n, _ in samples.channels]], axis=1))
+            for name in names
+        ],
+        axis=1,
+    )
+    there = np.isfinite(best)
+    if not has_schedule(site):
+        best, there = np.maximum(best, 0.0), np.ones_like(there)
+    snr = np.where(there, np.sqrt(np.maximum(best, 0.0) / 6.0), np.nan)
+    return Heard(samples.time, names, snr, amplitude, there & (best > DETECTION_CHI_SQUARE))
+
+
+def heard_in(log: Log, site: Site, lockin: LockinSettings | None = None) -> Heard | None:
+    """Return how well each beacon is heard in a log; None where no window is usable."""
+    if log.waveform is None:
+        return None if log.fields is None else heard(log.fields, site)
+    try:
+        return heard(received(log.waveform, log.imu, site, lockin)[0], site)
+    except InputError:
+        return None
+
+
+def unheard(found: Heard, site: Site) -> Iterator[Finding]:
+    """Yield the beacons that are silent, all along or for a while, and a log in which all are."""
+    if len(found.time) == 0:
+        return
+    share = np.sum(found.loud, axis=0) / np.maximum(np.sum(np.isfinite(found.snr), axis=0), 1)
+    if np.all(share < HARDLY):
+        best = float(np.nanmax(np.nanmedian(np.where(np.isnan(found.snr), 0.0, found.snr), axis=0)))
+        yield Finding(
+            "low_signal",
+            f"no beacon is heard: the strongest is {best:.2g} times its noise. All are switched off"
+            " or far away, their frequencies are others, or the noise is large.",
+            Verdict.FAILED,
+            1e3,
+        )
+        return
+    told = np.isfinite(found.snr).any(axis=1)
+    alone = float(np.mean(~found.loud[told].any(axis=1)))
+    if alone > UNHEARD:
+        yield Finding(
+            "low_signal",
+            f"no beacon is told from noise in {100.0 * alone:.0f} % of the epochs: all are far away"
+            " then, or the noise is large.",
+            Verdict.DOUBTFUL,
+            100.0,
+        )
+    frequency = {b.name: b.tone_frequencies_hz for b in site.beacons}
+    for k, name in enumerate(found.beacons):
+        tones = " and ".join(f"{f:g} Hz" for f in frequency[name])
+        if share[k] < HARDLY:
+            yield Finding(
+                "silent_beacon",
+                f"beacon {name} is never heard at {tones}: it is switched off, out of reach, or its"
+                " frequency is another. Switch it on, or take it out of the site's file.",
+                weight=400.0,
+            )
+        else:
+            yield from _silences(found, k, tones)
+
+
+def _silences(found: Heard, k: int, tones: str) -> Iterator[Finding]:
+    there = np.isfinite(found.snr[:, k])
+    time, loud, amplitude = found.time[there], found.loud[there, k], found.amplitude[there, k]
+    if len(time) < 2:
+        return
+    step = float(np.median(np.diff(time)))
+    quiet = runs(~loud)
+    long = (quiet.last - quiet.first) * step > SILENCE
+    off: list[tuple[float, float]] = []
+    drowned: list[tuple[float, float]] = []
+    for first, last in zip(quiet.first[long], quiet.last[long], strict=True):
+        beside = np.concatenate(
+            [amplitude[max(first - 10, 0) : first], amplitude[last : last + 10]]
+        )
+        gone = float(np.median(amplitude[first:last])) < FALLEN * float(np.median(beside))
+        stretch = (float(time[first] - 0.5 * step), float(time[last - 1] + 0.5 * step))
+        (off if gone else drowned).append(stretch)
+    name = found.beacons[k]
+    if off:
+        yield Finding(
+            "silent_beacon",
+            f"beacon {name} ({tones}) is silent from {_places(off)}: it was switched off then.",
+            Verdict.DOUBTFUL,
+            50.0 + sum(end - begin for begin, end in off),
+        )
+    if drowned:
+        yield Finding(
+            "low_signal",
+            f"beacon {name} ({tones}) cannot be told from noise from {_places(drowned)}: it is far"
+            " away there, or motion and other fields are larger.",
+            Verdict.TRUSTWORTHY,
+        )
+
+
+def _places(stretches: list[tuple[float, float]]) -> str:
+    more = f" and {len(stretches) - LISTED} more" if len(stretches) > LISTED else ""
+    return ", ".join(f"{a:.1f} to {b:.1f} s" for a, b in stretches[:LISTED]) + more

@@ -1,0 +1,290 @@
+"""A smoothed trajectory without the stretches of time in which one beacon is false."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.ndimage import binary_closing, binary_dilation
+from scipy.stats import chi2
+
+from magfusion.estimation.batch import Smoothed, solved_again
+from magfusion.estimation.integrity.separation import Separation, protection_levels, radii
+from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
+from magfusion.estimation.log_graph import overlap
+from magfusion.estimation.measurements.measurement import robust_weight
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.state import states_in
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict, alike
+from magfusion.units import Array, BoolArray, IntArray
+
+SLACK = 3.0  # sigma; a step below it is covered, and no alarm
+UNEXPECTED = 1e-4  # probability of a larger deviation of a field from what the others predict
+JOINED = 1.0  # s; what lies between two false stretches so near is false too
+BETTER = 0.8  # of the largest separation, above which leaving out has not explained it
+MOST_FALSE = 0.9  # share of a log; a beacon that is false for longer is false as it was declared
+LEFT_OUT = 0.1  # robust weight of a field below which it has no say
+ROUNDS = 3  # of exclusions
+SPANS = 3  # in a sentence
+TOGETHER = 3.0  # s; stretches of a sentence that are nearer are told as one
+TOLD = 5  # field epochs of a beacon that are left out; fewer are outliers
+OF_A_LOG = 5e-4  # false alarms of a whole log
+
+
+@dataclass(frozen=True, eq=False)
+class SeparatedSmooth:
+    """A smoothed trajectory after what is false was left out.
+
+    Parameters
+    ----------
+    result : Smoothed
+        Where an alarm remains, with a covariance that covers it.
+    states : StateTrust
+        Of each state.
+    trust : Trust
+        Of the whole.
+    """
+
+    result: Smoothed
+    states: StateTrust
+    trust: Trust
+
+
+def separated_smooth(result: Smoothed, risk: Risk | None = None) -> SeparatedSmooth:
+    """Compare a smoothed trajectory with those without each beacon; leave out what is false."""
+    risk = Risk() if risk is None else risk
+    names = tuple(beacon.name for beacon in result.declared.site.beacons)
+    found = separate_smoothed(result)
+    if found is None or result.states.pose_cov is None:
+        return _without_level(result)
+    out = np.zeros((len(result.fields.time), len(names)), dtype=bool)
+    first = found
+    for _ in range(ROUNDS):
+        # What is significant is looked for, whether or not it is covered.
+        before = float(np.max(found.excess(risk)))
+        if before <= 1.0:
+            break
+        beacon = int(np.argmin(np.mean(found.cost + 2.0 * found.rows, axis=0)))
+        false = _false_stretches(result, found, beacon)
+        if not np.any(false & ~out[:, beacon]) or np.mean(false) > MOST_FALSE:
+            break
+        trial = _resolved(result, names[beacon], false)
+        again = None if trial is None else separate_smoothed(trial)
+        if trial is None or again is None or np.max(again.excess(risk)) > BETTER * before:
+            break  # it was not this beacon, or not it alone
+        result, found = trial, again
+        out[:, beacon] |= false
+    excess = found.excess(risk, SLACK)
+    alarmed = np.any(excess > 1.0, axis=1)
+    level_m, level_deg = protection_levels(found, risk, SLACK)
+    level_m[alarmed] = level_deg[alarmed] = np.nan
+    out |= _without_say(result, names)
+    trust = Trust(
+        (
+            *_excluded_findings(result, first, out, names),
+            *_alarm_findings(result, found, excess, names, risk),
+            *_redundancy_findings(level_m, alarmed),
+        )
+    )
+    if np.any(alarmed):
+        result = _covering(result, found, alarmed)
+    verdict = tuple(Verdict.DOUBTFUL if a else Verdict.TRUSTWORTHY for a in alarmed.tolist())
+    excluded = _names_by_state(result, out, names)
+    return SeparatedSmooth(result, StateTrust(verdict, level_m, level_deg, excluded), trust)
+
+
+def states_judged(separated: SeparatedSmooth, result: Smoothed, whole: Verdict) -> StateTrust:
+    """Return what is to be said of each state, after all witnesses were heard.
+
+    Parameters
+    ----------
+    result : Smoothed
+        With the covariance that they allow.
+    """
+    before, after = separated.result.states.pose_cov, result.states.pose_cov
+    assert before is not None
+    assert after is not None
+    ratio = radii(after).whole / radii(before).whole
+    return separated.states.within(whole, np.maximum(ratio, 1.0))
+
+
+def states_between(states: StateTrust, known: Trajectory, dense: Trajectory) -> StateTrust:
+    """Return what is to be said at other times: what is at the nearest state, as far as it goes.
+
+    Parameters
+    ----------
+    known : Trajectory
+        Of the states.
+    """
+    if known is dense:
+        return states
+    assert known.pose_cov is not None
+    assert dense.pose_cov is not None
+    middle = 0.5 * (known.time[1:] + known.time[:-1])
+    nearest = np.searchsorted(middle, dense.time)
+    ratio = radii(dense.pose_cov).whole / radii(known.pose_cov[nearest]).whole
+    return states.rows(nearest).within(Verdict.TRUSTWORTHY, np.maximum(ratio, 1.0))
+
+
+def _without_level(result: Smoothed) -> SeparatedSmooth:
+    """Return a result that nothing was compared with."""
+    text = (
+        "There are no protection levels: they are made of the beacons' phasors in one solution,"
+        " which neither loose coupling nor a log of hours has."
+    )
+    trust = Trust((Finding("no_redundancy", text, Verdict.TRUSTWORTHY, 0.0),))
+    return SeparatedSmooth(result, alike(len(result.states), Verdict.TRUSTWORTHY), trust)
+
+
+def _phasors(result: Smoothed) -> FieldPhasors:
+    return next(m for m in result.graph.measurements if isinstance(m, FieldPhasors))
+
+
+def _owner(result: Smoothed, names: tuple[str, ...]) -> IntArray:
+    return np.array([names.index(name) for name, _ in result.fields.channels])
+
+
+def _false_stretches(result: Smoothed, found: Separation, beacon: int) -> BoolArray:
+    """Return at which field epochs a beacon deviates from what the others predict, shape (m,)."""
+    names = tuple(b.name for b in result.declared.site.beacons)
+    own = _owner(result, names) == beacon
+    phasors, states = _phasors(result).alone(), states_in(result.estimate.values)
+    rows = phasors.linearize(states.rows(phasors.epoch), result.calibration, ())
+    jacobian = rows.jacobian(0)[:, own][..., :6]
+    jacobian = jacobian.reshape(len(phasors.epoch), -1, 6)
+    error = rows.error[:, own].reshape(len(phasors.epoch), -1)
+    at = phasors.epoch
+    error = error + (jacobian @ found.step[at, beacon][..., None])[..., 0]
+    cov = jacobian @ found.subset_cov[at, beacon] @ np.swapaxes(jacobian, 1, 2)
+    repeats = overlap(result.fields)
+    spread = cov + np.eye(error.shape[1]) / repeats
+    square = np.sum(error * np.linalg.solve(spread, error[..., None])[..., 0], axis=1)
+    heard = np.any(phasors.sqrt_information[:, own] != 0.0, axis=(1, 2, 3))
+    deviates = heard & (square > chi2.isf(UNEXPECTED, error.shape[1]))
+    step = float(np.median(np.diff(result.fields.time)))
+    near = np.ones(2 * int(np.ceil(JOINED / step)) + 1, dtype=bool)
+    window = np.ones(2 * int(np.ceil(repeats)) + 1, dtype=bool)
+    joined = binary_closing(np.pad(deviates, len(near)), near)[len(near) : -len(near)]
+    return np.asarray(binary_dilation(joined | deviates, window) & heard)
+
+
+def _resolved(result: Smoothed, name: str, false: BoolArray) -> Smoothed | None:
+    """Return the result without a beacon at some field epochs; None where that is none."""
+    own = np.array([owner == name for owner, _ in result.fields.channels])
+    phasors = _phasors(result)
+    left_out = (false[:, None] & own)[..., None, None]
+    kept = replace(phasors, sqrt_information=np.where(left_out, 0.0, phasors.sqrt_information))
+    try:
+        return solved_again(
+            result, tuple(kept if m is phasors else m for m in result.graph.measurements)
+        )
+    except RuntimeError:  # GTSAM's own: without it the pose is open
+        return None
+
+
+def _without_say(result: Smoothed, names: tuple[str, ...]) -> BoolArray:
+    """Return at which field epochs the robust loss leaves a beacon no say, (m, beacons)."""
+    loss, owner = _phasors(result).loss, _owner(result, names)
+    out = np.zeros((len(result.residual), len(names)), dtype=bool)
+    if loss is None:
+        return out
+    # Each epoch as it is, not as it is weighed among those that are alike.
+    square = np.sum(np.nan_to_num(result.residual) ** 2, axis=2)
+    weight, _ = robust_weight(square, loss.kind)
+    for j in range(len(names)):
+        own = np.any(weight[:, owner == j] < LEFT_OUT, axis=1)
+        # What has no say all the time is declared wrong, and others say so.
+        out[:, j] = own & (np.mean(own) <= MOST_FALSE)
+    return out
+
+
+def _names_by_state(
+    result: Smoothed, out: BoolArray, names: tuple[str, ...]
+) -> tuple[tuple[str, ...], ...]:
+    by_state = np.zeros((len(result.states), len(names)), dtype=bool)
+    by_state[result.epoch] = out
+    return tuple(
+        tuple(name for name, is_out in zip(names, row, strict=True) if is_out)
+        for row in by_state.tolist()
+    )
+
+
+def _covering(result: Smoothed, found: Separation, alarmed: BoolArray) -> Smoothed:
+    """Return the result with a covariance that covers those without each beacon."""
+    assert result.states.pose_cov is not None
+    cov = result.states.pose_cov.copy()
+    step = np.where(found.determined[..., None], found.step, 0.0)[alarmed]
+    cov[alarmed] += np.einsum("nbi,nbj->nij", step, step)
+    return replace(result, states=replace(result.states, pose_cov=cov))
+
+
+def _largest(found: Separation, beacon: int | None = None) -> float:
+    shift = np.where(found.determined, found.shift[..., 1], 0.0)
+    return float(np.max(shift if beacon is None else shift[:, beacon]))
+
+
+def _excluded_findings(
+    result: Smoothed, found: Separation, out: BoolArray, names: tuple[str, ...]
+) -> list[Finding]:
+    findings = []
+    time = result.fields.time
+    for j in np.flatnonzero(np.sum(out, axis=0) >= TOLD).tolist():
+        spans = [
+            f"{time[a]:.1f} to {time[b]:.1f} s"
+            for a, b in _stretches(np.flatnonzero(out[:, j]), time)
+        ]
+        more = f" and {len(spans) - SPANS} more times" if len(spans) > SPANS else ""
+        findings.append(
+            Finding(
+                "beacon_excluded",
+                f"Beacon {names[j]} contradicts the others from {', '.join(spans[:SPANS])}{more}:"
+                f" the trajectory without it is up to {1e3 * _largest(found, j):.3g} mm away, so it"
+                " was left out there. Check its drive current, and iron or a screen near it.",
+                Verdict.TRUSTWORTHY,
+            )
+        )
+    return findings
+
+
+def _stretches(epochs: IntArray, time: Array) -> list[tuple[int, int]]:
+    """Return first and last epoch of stretches, those joined that are near each other."""
+    apart = np.flatnonzero(np.diff(time[epochs]) > TOGETHER)
+    begins, ends = epochs[np.r_[0, apart + 1]], epochs[np.r_[apart, len(epochs) - 1]]
+    return list(zip(begins.tolist(), ends.tolist(), strict=True))
+
+
+def _alarm_findings(
+    result: Smoothed, found: Separation, excess: Array, names: tuple[str, ...], risk: Risk
+) -> list[Finding]:
+    worst = float(np.max(excess))
+    if worst <= _of_a_whole_log(found, risk):
+        return []
+    state, beacon = np.unravel_index(np.argmax(excess), excess.shape)
+    text = (
+        f"The trajectory with and without beacon {names[int(beacon)]} differ by up to"
+        f" {1e3 * _largest(found, int(beacon)):.3g} mm, {worst:.3g} times what noise and survey"
+        f" explain, most at {result.states.time[int(state)]:.1f} s: the beacons contradict each"
+        " other. Check their positions and moments in the site, and iron in the room."
+    )
+    return [Finding("separation", text, weight=worst)]
+
+
+def _of_a_whole_log(found: Separation, risk: Risk) -> float:
+    """Return which excess of its threshold no more than one log in many has by chance."""
+    tests = 2 * found.step.shape[1]
+    alone = found.separation_sigma.beyond(risk.false_alarm / tests)
+    every = found.separation_sigma.beyond(OF_A_LOG / (tests * len(found.step)))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.maximum(every / alone, 1.0)
+    return float(np.nanmax(np.where(np.isfinite(ratio), ratio, 1.0)))
+
+
+def _redundancy_findings(level_m: Array, alarmed: BoolArray) -> list[Finding]:
+    without = ~np.isfinite(level_m) & ~alarmed
+    if not np.any(without):
+        return []
+    text = (
+        f"{int(np.sum(without))} of {len(level_m)} states have no protection level: without one of"
+        " the beacons nothing determines the pose, so that a false one would not be noticed. Add a"
+        " beacon."
+    )
+    return [Finding("no_redundancy", text, Verdict.TRUSTWORTHY, 0.0)]

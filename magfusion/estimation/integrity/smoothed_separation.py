@@ -1,0 +1,250 @@
+"""The smoothed trajectory without each beacon: alarms and protection levels by state."""
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.convergence import OPEN_ROTATION
+from magfusion.estimation.factors import CALIBRATION_KEY, CONSIDERED_KEY
+from magfusion.estimation.graph import Estimate, Graph
+from magfusion.estimation.integrity.separation import Separation
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.solve.chain import Chain, ChainSolution, solve_chain
+from magfusion.estimation.state import MOTION, states_in
+from magfusion.model.parameters import Block, difference, dimension
+from magfusion.model.prior import prior_sqrt_covariance, prior_sqrt_information
+from magfusion.units import Array, BoolArray, IntArray
+
+AT_ONCE = 2e8  # bytes; variants are solved in groups of so much
+# A prior that keeps what is open finite: far wider than anything that is of use.
+OPEN = np.repeat([30.0, 300.0, 300.0, 30.0, 3.0], 3)  # rad, m, m/s, m/s^2, rad/s
+_FIRST, _WIDTH = {"x": 0, "v": 6, "b": 9}, {"x": 6, "v": 3, "b": 6}  # in a state's tangent vector
+
+
+class _Normal:
+    """Normal equations of a chain that grow by rows.
+
+    The right sides are the step, then what one sigma of each considered parameter does.
+    """
+
+    def __init__(self, states: int, calibration: int, considered: int) -> None:
+        self.diagonal = np.zeros((states, MOTION, MOTION))
+        self.following = np.zeros((max(states - 1, 0), MOTION, MOTION))
+        self.border = np.zeros((states, MOTION, calibration))
+        self.corner = np.zeros((calibration, calibration))
+        self.right = np.zeros((states, MOTION, 1 + considered))
+        self.right_border = np.zeros((calibration, 1 + considered))
+
+    def add(
+        self, epoch: IntArray, own: Array, after: Array | None, border: Array, right: Array
+    ) -> None:
+        """Add rows of some states, each at most once.
+
+        Parameters
+        ----------
+        epoch : int ndarray, shape (m,)
+        own, after : ndarray, shape (m, rows, 15)
+            By the state, and by the next.
+        border : ndarray, shape (m, rows, calibration)
+        right : ndarray, shape (m, rows, 1 + considered)
+        """
+        back = np.swapaxes(own, 1, 2)
+        self.diagonal[epoch] += back @ own
+        self.border[epoch] += back @ border
+        self.right[epoch] += back @ right
+        self.corner += np.einsum("mrc,mrd->cd", border, border, optimize=True)
+        self.right_border += np.einsum("mrc,mrd->cd", border, right, optimize=True)
+        if after is not None:
+            ahead = np.swapaxes(after, 1, 2)
+            self.diagonal[epoch + 1] += ahead @ after
+            self.following[epoch] += back @ after
+            self.border[epoch + 1] += ahead @ border
+            self.right[epoch + 1] += ahead @ right
+
+
+@dataclass(frozen=True, eq=False)
+class _Fields:
+    """Rows of the fields (m, channels, 6, k), weighed as they were last."""
+
+    epoch: IntArray
+    by_pose: Array
+    by_calibration: Array
+    right: Array
+
+    def added_to(self, normal: _Normal, kept: BoolArray) -> None:
+        """Add the rows of some channels, shape (channels,)."""
+        flat = [
+            part[:, kept].reshape(len(part), 6 * int(np.sum(kept)), part.shape[-1])
+            for part in (self.by_pose, self.by_calibration, self.right)
+        ]
+        own = np.concatenate([flat[0], np.zeros((*flat[0].shape[:2], MOTION - 6))], axis=2)
+        normal.add(self.epoch, own, None, flat[1], flat[2])
+
+
+def separate_smoothed(result: Smoothed) -> Separation | None:
+    """Return the separation at every state, in body axes; None where there is none to be had.
+
+    That is with fixes in the graph (loose coupling), and of a log so long that its calibration
+    drifts.
+    """
+    graph = result.graph
+    fields = [f.measurement for f in graph.factors if isinstance(f.measurement, FieldPhasors)]
+    if len(fields) != 1 or len(graph.segments) > 1 or graph.declared is None:
+        return None
+    names = [beacon.name for beacon in result.declared.site.beacons]
+    owner = np.array([names.index(name) for name, _ in result.fields.channels])
+    every = range(len(names))
+    rest, rows = _linear(graph, result.estimate, result.considered)
+    kept = np.array([owner >= 0, *(owner != j for j in every)])
+    solved, cost = _without_each(rest, rows, kept)
+    heard = np.any(rows.by_pose != 0.0, axis=(0, 2, 3))
+    numbers = np.array([6 * np.sum(heard & (owner == j)) * len(rows.epoch) for j in every])
+    others = np.array([np.any(heard & (owner != j)) for j in every])
+    step, response = solved.states[:, :, :6, 0], solved.states[:, :, :6, 1:]
+    cov = solved.cov + response @ np.swapaxes(response, -1, -2)
+    moved = response[1:] - response[:1]
+    apart = solved.cov[1:] - solved.cov[:1] + moved @ np.swapaxes(moved, -1, -2)
+    variance = np.einsum("hnii->hni", cov[1:])
+    shift = step[1:] - step[:1]
+    determined = np.isfinite(shift).all(axis=2) & (variance > 0.0).all(axis=2)
+    determined &= np.sum(variance[..., :3], axis=2) < OPEN_ROTATION**2
+    determined &= others[:, None]
+    shape = (graph.epochs, len(names))
+    return Separation(
+        np.swapaxes(shift, 0, 1),
+        cov[0],
+        np.swapaxes(cov[1:], 0, 1),
+        np.swapaxes(apart, 0, 1),
+        np.swapaxes(determined, 0, 1),
+        np.broadcast_to(cost[1:], shape),
+        np.broadcast_to(numbers, shape),
+    )
+
+
+def _without_each(rest: _Normal, rows: _Fields, kept: BoolArray) -> tuple[ChainSolution, Array]:
+    """Solve variants with some of the channels, shape (h, channels); and what they leave."""
+    per_variant = 8.0 * 4.0 * (rest.diagonal.size + rest.border.size + rest.right.size)
+    group = max(1, int(AT_ONCE / per_variant))
+    parts, costs = [], []
+    for first in range(0, len(kept), group):
+        variants = []
+        for channels in kept[first : first + group]:
+            normal = _copied(rest)
+            rows.added_to(normal, channels)
+            variants.append(normal)
+        chain = Chain(
+            *(
+                np.stack([getattr(v, name) for v in variants])
+                for name in ("diagonal", "following", "border", "corner", "right", "right_border")
+            )
+        )
+        found = solve_chain(chain, 6)
+        gain = np.einsum("hns,hns->h", chain.right[..., 0], found.states[..., 0])
+        gain += np.einsum("hc,hc->h", chain.right_border[..., 0], found.border[..., 0])
+        square = np.array(
+            [np.sum(rows.right[:, c, :, 0] ** 2) for c in kept[first : first + group]]
+        )
+        parts.append(found._replace(states=found.states[:, :, :6]))
+        costs.append(square - gain)
+    joined = ChainSolution(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    return joined, np.concatenate(costs)
+
+
+def _copied(normal: _Normal) -> _Normal:
+    out = object.__new__(_Normal)
+    for name, value in vars(normal).items():
+        setattr(out, name, value.copy())
+    return out
+
+
+def _linear(
+    graph: Graph, estimate: Estimate, considered: tuple[Block, ...]
+) -> tuple[_Normal, _Fields]:
+    """Return the normal equations of all but the fields, and the rows of the fields."""
+    assert graph.declared is not None
+    size, others = dimension(graph.blocks), dimension(considered)
+    spread = prior_sqrt_covariance(graph.declared.site, considered) if others else np.zeros((0, 0))
+    normal = _Normal(graph.epochs, size, others)
+    normal.diagonal += np.diag(1.0 / OPEN**2)
+    if size:
+        whitening = prior_sqrt_information(graph.declared.site, graph.blocks)
+        step = difference(graph.declared, estimate.calibration, graph.blocks)
+        normal.corner += whitening.T @ whitening
+        normal.right_border[:, 0] -= whitening.T @ (whitening @ step)
+    for rows in _native_rows(graph, estimate, spread, size):
+        normal.add(*rows)
+    states, fields = states_in(estimate.values), None
+    for factors in graph.factors:
+        found = factors.rows(states, estimate.calibration, graph.blocks)
+        jacobian = found.jacobian(size)
+        right = np.zeros((*found.error.shape, 1 + others))
+        right[..., 0] = -found.error
+        if others:
+            by_other = factors.rows(states, estimate.calibration, considered).by_calibration
+            if by_other is not None:
+                right[..., 1:] = -by_other @ spread
+        epoch = factors.measurement.epoch
+        if isinstance(factors.measurement, FieldPhasors):
+            fields = _Fields(epoch, jacobian[..., :6], jacobian[..., MOTION:], right)
+            continue
+        flat = [part.reshape(len(epoch), -1, part.shape[-1]) for part in (jacobian, right)]
+        # A measurement may have several rows of one state.
+        for once in _each_once(epoch):
+            own = flat[0][once]
+            normal.add(epoch[once], own[..., :MOTION], None, own[..., MOTION:], flat[1][once])
+    assert fields is not None
+    return normal, fields
+
+
+def _each_once(epoch: IntArray) -> Iterator[IntArray]:
+    """Yield rows in groups in which no state comes twice."""
+    left = np.arange(len(epoch))
+    while len(left):
+        _, first = np.unique(epoch[left], return_index=True)
+        yield left[first]
+        left = np.delete(left, first)
+
+
+def _native_rows(
+    graph: Graph, estimate: Estimate, spread: Array, size: int
+) -> Iterator[tuple[IntArray, Array, Array | None, Array, Array]]:
+    """Yield the rows of inertial factors and priors of the motion, those alike together."""
+    linear = graph.inertial(estimate, graph.by_considered(spread) if len(spread) else None)
+    kinds: dict[tuple[tuple[str, int], ...], list[tuple[int, Array, Array]]] = defaultdict(list)
+    for i in range(linear.size()):
+        factor = linear.at(i)
+        assert isinstance(factor, gtsam.JacobianFactor)
+        symbols = [gtsam.Symbol(key) for key in list(factor.keys())]
+        names = [(chr(symbol.chr()), symbol.index()) for symbol in symbols]
+        first = min(index for name, index in names if name in _FIRST)
+        kind = tuple((name, index - first if name in _FIRST else 0) for name, index in names)
+        kinds[kind].append((first, factor.getA(), factor.getb()))
+    apart = {chr(gtsam.Symbol(CALIBRATION_KEY).chr()): size}
+    apart[chr(gtsam.Symbol(CONSIDERED_KEY).chr())] = len(spread)
+    for kind, found in kinds.items():
+        jacobian = np.array([by for _, by, _ in found])
+        rows = jacobian.shape[:2]
+        own, after = np.zeros((*rows, MOTION)), np.zeros((*rows, MOTION))
+        border, right = np.zeros((*rows, size)), np.zeros((*rows, 1 + len(spread)))
+        right[..., 0] = np.array([b for _, _, b in found])
+        column = 0
+        for name, later in kind:
+            width = _WIDTH[name] if name in _WIDTH else apart[name]
+            part = jacobian[..., column : column + width]
+            column += width
+            if name in _FIRST:
+                target = own if later == 0 else after
+                target[..., _FIRST[name] : _FIRST[name] + width] = part
+            elif name == "c":
+                border[...] = part
+            else:
+                right[..., 1:] = -part
+        epoch = np.array([first for first, _, _ in found])
+        linked = any(later for _, later in kind)
+        for once in _each_once(epoch):
+            ahead = after[once] if linked else None
+            yield epoch[once], own[once], ahead, border[once], right[once]

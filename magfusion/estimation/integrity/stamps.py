@@ -1,0 +1,170 @@
+"""What the stamps of the streams say: rates, gaps, samples lost, jitter, and how long both run."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import Array, IntArray
+
+GAP = 0.5  # s; from which the estimators can no longer take it for samples lost
+GAP_STEPS = 8.0  # samples, where the stream is slower than that
+LOST = 0.01  # share of the samples from which it is said
+JITTER = 0.05  # of a step
+LATTICE = 0.15  # of a step: up to here stamps lie on a lattice, in which a missing one is counted
+BLOCK = 64  # samples over which a clock is taken for even
+ALIKE = 0.9  # share of the longer stream that the shorter one covers
+ROUNDING = 1e-6  # of a step
+LISTED = 3  # gaps that are named
+
+
+@dataclass(frozen=True, eq=False)
+class Timing:
+    """Stamps of one stream.
+
+    Parameters
+    ----------
+    stream : str
+    rate_hz : float
+        Usual.
+    begin, end : float
+        First and last stamp (s).
+    jitter : float
+        Of the stamps about an even clock, root mean square (s).
+    lost : float
+        Share of the samples that are missing outside the gaps.
+    gap_begin, gap_end : ndarray, shape (gaps,)
+        (s)
+    """
+
+    stream: str
+    rate_hz: float
+    begin: float
+    end: float
+    jitter: float
+    lost: float
+    gap_begin: Array
+    gap_end: Array
+
+
+def timing(stream: str, time: Array) -> Timing | None:
+    """Return what the stamps (s) of a stream say; None of fewer than three."""
+    if len(time) < 3:
+        return None
+    step = np.diff(time)
+    usual = float(np.median(step))
+    gap = np.flatnonzero(step > max(GAP, GAP_STEPS * usual))
+    inside = np.delete(step, gap)
+    turns = np.rint(inside / usual)
+    off = inside - usual * turns
+    if len(inside) and np.sqrt(np.mean(off**2)) < LATTICE * usual:
+        missing = float(np.sum(np.maximum(turns - 1.0, 0.0)))
+        jitter = float(np.sqrt(np.mean(off**2) / 2.0))
+        jitter = jitter if jitter > ROUNDING * usual else 0.0
+    else:
+        jitter = _unevenness(time, step, gap)
+        missing = max(0.0, float(np.sum(inside)) / usual - len(inside))
+    return Timing(
+        stream=stream,
+        rate_hz=1.0 / usual,
+        begin=float(time[0]),
+        end=float(time[-1]),
+        jitter=jitter,
+        lost=missing / (len(time) + missing),
+        gap_begin=time[gap],
+        gap_end=time[gap + 1],
+    )
+
+
+def _unevenness(time: Array, step: Array, gap: IntArray) -> float:
+    """Return the scatter of stamps about straight lines through short blocks (s)."""
+    within = np.zeros(len(time))
+    within[gap + 1] = step[gap]
+    even = time - np.cumsum(within)
+    count = len(even) // BLOCK
+    if count == 0:
+        return float(np.std(step) / np.sqrt(2.0))
+    block = even[: count * BLOCK].reshape(count, BLOCK)
+    number = np.arange(BLOCK) - 0.5 * (BLOCK - 1)
+    centred = block - np.mean(block, axis=1, keepdims=True)
+    slope = centred @ number / np.sum(number**2)
+    left = centred - slope[:, None] * number
+    return float(np.sqrt(np.median(np.sum(left**2, axis=1)) / (BLOCK - 2)))
+
+
+def timings(log: Log) -> tuple[Timing, ...]:
+    """Return the timing of the raw streams of a log."""
+    found = [timing("imu", log.imu.time)]
+    if log.waveform is not None:
+        found.append(timing("magnetometer", log.waveform.time))
+    return tuple(one for one in found if one is not None)
+
+
+def uneven_stamps(log: Log, _site: Site | None) -> Iterator[Finding]:
+    """Yield what is wrong with the stamps of a log."""
+    found = timings(log)
+    for one in found:
+        yield from _of_one(one)
+    for stream, clock in log.clocks.items():
+        if clock.replaced:
+            yield Finding(
+                "jitter",
+                f"{stream}: the stamps jitter by {1e3 * clock.scatter:.2g} ms (rms) about an even"
+                f" clock of {1.0 / clock.step:.4g} Hz, which has taken their place: they tell when"
+                " a sample arrived, not when it was taken. Stamp the samples in the sensor.",
+                Verdict.TRUSTWORTHY,
+                clock.scatter / clock.step / JITTER,
+            )
+    if len(found) == 2:
+        yield from _apart(*found)
+
+
+def _of_one(one: Timing) -> Iterator[Finding]:
+    usual, span = 1.0 / one.rate_hz, max(one.end - one.begin, 1e-9)
+    if len(one.gap_begin):
+        length = one.gap_end - one.gap_begin
+        longest = np.sort(np.argsort(-length)[:LISTED])
+        places = ", ".join(
+            f"{one.gap_begin[k]:.2f} to {one.gap_end[k]:.2f} s ({length[k]:.2f} s)" for k in longest
+        )
+        more = f" and {len(length) - LISTED} more" if len(length) > LISTED else ""
+        yield Finding(
+            "gap",
+            f"{one.stream}: no samples from {places}{more}: {float(np.sum(length)):.1f} s of"
+            f" {span:.0f} s are missing. The recorder or its link stalled; what lies within is"
+            " bridged by the other streams alone.",
+            weight=1.0 + float(np.max(length)),
+        )
+    if one.lost > LOST:
+        yield Finding(
+            "samples_lost",
+            f"{one.stream}: {100.0 * one.lost:.1f} % of the samples are missing, one or a few at a"
+            " time, all along the log: the link or the recorder cannot keep up with"
+            f" {one.rate_hz:.4g} Hz. Record with a larger buffer or at a lower rate.",
+            weight=one.lost / LOST,
+        )
+    if one.jitter > JITTER * usual:
+        yield Finding(
+            "jitter",
+            f"{one.stream}: the stamps jitter by {1e3 * one.jitter:.2g} ms (rms) about an even"
+            f" clock of {one.rate_hz:.4g} Hz, {100.0 * one.jitter / usual:.0f} % of a step:"
+            " probably they tell when a sample arrived, not when it was taken. Stamp the samples"
+            " in the sensor.",
+            weight=one.jitter / (JITTER * usual),
+        )
+
+
+def _apart(imu: Timing, field: Timing) -> Iterator[Finding]:
+    common = min(imu.end, field.end) - max(imu.begin, field.begin)
+    longest = max(imu.end - imu.begin, field.end - field.begin)
+    if common < ALIKE * longest:
+        yield Finding(
+            "streams_apart",
+            f"imu runs from {imu.begin:.1f} to {imu.end:.1f} s and magnetometer from"
+            f" {field.begin:.1f} to {field.end:.1f} s: both for {max(common, 0.0):.1f} s only."
+            " Either one was started late or their clocks differ; stamp both by one clock.",
+            weight=longest / max(common, 0.1 * longest),
+        )

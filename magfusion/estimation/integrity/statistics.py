@@ -1,0 +1,102 @@
+"""Tests that share one budget of false alarms.
+
+A result is tested many times, by parameter, beacon, axis and time.  What counts is that a clean one
+is called in question once in `FALSE_ALARMS`, by whatever test: Holm's procedure.
+Probabilities are kept as logarithms, since those of real faults cannot be held by a float.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import gammaln, ndtri_exp
+from scipy.stats import chi2
+
+from magfusion.units import Array, BoolArray
+
+FALSE_ALARMS = 0.005  # of all tests of one result together
+WITNESSES = 5  # that share it alike; each tests by Holm's procedure within its part
+WITNESS_BUDGET = FALSE_ALARMS / WITNESSES
+SURE = 1e-9  # probability of six sigma, either way: evidence that may fail a result
+_UNDERFLOW = -600.0  # log probability below which the exact function has no digits left
+
+
+def log_p_chi_square(value: Array | float, freedom: Array | float) -> Array:
+    """Return the logarithm of the probability of a chi square at least this large.
+
+    Parameters
+    ----------
+    value, freedom : float or ndarray
+        The degrees of freedom may be a fraction, of correlated numbers.
+
+    Returns
+    -------
+    ndarray
+        Finite for every finite value.
+    """
+    value, freedom = np.broadcast_arrays(
+        np.maximum(np.asarray(value, dtype=float), 0.0), np.asarray(freedom, dtype=float)
+    )
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        exact = np.asarray(chi2.logsf(value, freedom))
+        half, shape = 0.5 * value, 0.5 * freedom
+        # Far out: the first terms of the asymptotic series of the incomplete gamma function.
+        excess = np.maximum(half - shape + 1.0, 1.0)
+        tail = shape * np.log(np.maximum(half, 1e-300)) - half - np.log(excess) - gammaln(shape)
+    return np.where((exact > _UNDERFLOW) | (half < shape), exact, np.minimum(tail, 0.0))
+
+
+def sigmas(log_p: Array | float) -> Array:
+    """Return how many standard deviations, either way, are as rare as a probability."""
+    return np.asarray(-ndtri_exp(np.minimum(np.asarray(log_p, dtype=float) - np.log(2.0), -0.7)))
+
+
+def holm(log_p: Sequence[float] | Array, budget: float = FALSE_ALARMS) -> BoolArray:
+    """Tell which tests speak, so that all of them together raise a false alarm in ``budget``.
+
+    Parameters
+    ----------
+    log_p : sequence of float
+        Of every test that was made, also of those that found nothing.
+    """
+    given = np.asarray(log_p, dtype=float)
+    out = np.zeros(len(given), dtype=bool)
+    order = np.argsort(given, kind="stable")
+    left = np.log(budget) - np.log(np.arange(len(given), 0, -1, dtype=float))
+    missed = np.flatnonzero(~(given[order] <= left))
+    out[order[: missed[0] if len(missed) else len(given)]] = True
+    return out
+
+
+def effective_number(residual: Array) -> float:
+    """Return how many independent numbers a series along time holds, from its autocorrelation.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n, ...)
+        Along time first; the series side by side are taken to be correlated alike.  NaN is missing.
+
+    Returns
+    -------
+    float
+        Of the first axis, at most n: Bartlett's sum for the variance of a sum of squares, up to
+        where the correlation is lost in its own noise.
+    """
+    flat = residual.reshape(len(residual), -1)
+    known = np.isfinite(flat)
+    filled = np.where(known, flat, 0.0)
+    count = len(flat)
+    if count < 3 or not np.any(known):
+        return float(count)
+    squares = float(np.sum(filled**2))
+    if squares == 0.0:
+        return float(count)
+    total, mean_square = 1.0, squares / np.sum(known)
+    for lag in range(1, count // 2):
+        both = float(np.sum(known[lag:] & known[:-lag]))
+        if both == 0.0:
+            break
+        correlation = float(np.sum(filled[lag:] * filled[:-lag])) / (both * mean_square)
+        if correlation < 2.0 / np.sqrt(both):
+            break
+        total += 2.0 * (1.0 - lag / count) * correlation**2
+    return count / total

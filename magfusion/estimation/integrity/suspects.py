@@ -1,0 +1,273 @@
+"""What may be wrong with what an estimator takes for granted: every parameter that it holds.
+
+Beside the calibration parameters of the site there are some that no site declares, of the inertial
+sensors: for those the score of `magfusion.estimation.integrity.score` is the only witness.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from magfusion.model.parameters import (
+    BEACON_POSITION,
+    BEACON_ROTATION,
+    DECLINATION,
+    DEGREES,
+    DRIFT,
+    LOG_MOMENT,
+    MATRIX,
+    OFFSET,
+    PARAMETERS,
+    PERCENT,
+    PHASE,
+    SENSOR_POSITION,
+    SENSOR_ROTATION,
+    STRENGTH,
+    TIME_OFFSET,
+    BeaconParameter,
+    Block,
+    Parameter,
+    candidates,
+    placed,
+)
+from magfusion.model.parameters.parameter import AXES, PPM, PhasorView, Unit
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import Site
+from magfusion.units import DEGREE, Array, ComplexArray
+
+
+class Stream(NamedTuple):
+    """What a parameter of the inertial sensors is seen by."""
+
+    imu: ImuSamples
+    world_from_body: Array  # (states, 3, 3)
+
+
+class Inertial(Parameter):
+    """A parameter that acts on the inertial stream as a bias that changes would."""
+
+    owner = "imu"
+    group = "inertial"
+    size: ClassVar[int] = 3
+
+    def sigma(self, site: Site, owner: str) -> Array:
+        """Return zeros: no site declares it."""
+        return np.zeros(self.size)
+
+    def as_bias(self, stream: Stream) -> Array:
+        """Return what bias a unit of it looks like, shape (samples or states - 1, 6, columns).
+
+        Accelerometer, then gyro (m/s^2, rad/s), at each sample or already between the states.
+        """
+        raise NotImplementedError
+
+
+class _GyroScale(Inertial):
+    kind, components, spoken = "gyro_scale", AXES, PERCENT
+    words = "the scale of the gyro's {axis}"
+
+    def as_bias(self, stream: Stream) -> Array:
+        return _stacked(
+            np.zeros((len(stream.imu), 3, 3)), stream.imu.gyro_body[:, :, None] * np.eye(3)
+        )
+
+
+class _AccelScale(Inertial):
+    kind, components, spoken = "accel_scale", AXES, PERCENT
+    words = "the scale of the accelerometer's {axis}"
+
+    def as_bias(self, stream: Stream) -> Array:
+        return _stacked(
+            stream.imu.accel_body[:, :, None] * np.eye(3), np.zeros((len(stream.imu), 3, 3))
+        )
+
+
+class _GyroAlignment(Inertial):
+    kind, components, spoken = "gyro_alignment", AXES, DEGREES
+    words = "the turn of the gyro against the accelerometer about {axis}"
+
+    def as_bias(self, stream: Stream) -> Array:
+        turned = np.cross(np.eye(3)[None], stream.imu.gyro_body[:, None])  # by each unit turn
+        return _stacked(np.zeros((len(stream.imu), 3, 3)), np.swapaxes(turned, 1, 2))
+
+
+class _Gravity(Inertial):
+    owner, kind, spoken = "site", "gravity", Unit("m/s^2", 1.0)
+    words, size = "the size of gravity", 1
+
+    def as_bias(self, stream: Stream) -> Array:
+        up_body = 0.5 * (stream.world_from_body[1:, 2] + stream.world_from_body[:-1, 2])
+        # More gravity than declared is a specific force upwards, as a bias of it would be.
+        return _stacked(up_body[:, :, None], np.zeros((len(up_body), 3, 1)))
+
+
+class _ClockRate(Inertial):
+    kind, spoken = "clock_rate", PPM
+    words, size = "the rate of the IMU's clock", 1
+
+    def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
+        by_offset = view.whole.time_offset
+        assert by_offset is not None
+        return (by_offset * view.elapsed[:, None, None])[..., None]
+
+    def as_bias(self, stream: Stream) -> Array:
+        return np.zeros((len(stream.world_from_body) - 1, 6, 1))
+
+
+def _stacked(accel: Array, gyro: Array) -> Array:
+    return np.concatenate([accel, gyro], axis=1)
+
+
+GYRO_SCALE, ACCEL_SCALE, GYRO_ALIGNMENT = _GyroScale(), _AccelScale(), _GyroAlignment()
+GRAVITY, CLOCK_RATE = _Gravity(), _ClockRate()
+INERTIAL: tuple[Inertial, ...] = (GYRO_SCALE, ACCEL_SCALE, GYRO_ALIGNMENT, GRAVITY, CLOCK_RATE)
+
+# Typical error of an installation that nobody measured, in the unit of the tangent vector.
+TYPICAL: dict[Parameter, float] = {
+    BEACON_ROTATION: DEGREE,
+    BEACON_POSITION: 0.01,
+    LOG_MOMENT: 0.01,
+    PHASE: DEGREE,
+    DRIFT: 1e-6,
+    MATRIX: 0.01,
+    OFFSET: 0.1,
+    SENSOR_ROTATION: DEGREE,
+    SENSOR_POSITION: 0.01,
+    TIME_OFFSET: 1e-3,
+    DECLINATION: DEGREE,
+    STRENGTH: 0.5,
+    GYRO_SCALE: 0.01,
+    ACCEL_SCALE: 0.01,
+    GYRO_ALIGNMENT: DEGREE,
+    GRAVITY: 0.01,
+    CLOCK_RATE: 1e-5,
+}
+
+# What no site declares and every instrument has, one sigma: scales and axes of a MEMS, where in its
+# case the accelerometer is and how it is turned there.  It is no mistake, and no poses err by it
+# that are judged by the case.
+TOLERANCE: dict[Parameter, float] = {
+    GYRO_SCALE: 0.01,
+    ACCEL_SCALE: 0.01,
+    GYRO_ALIGNMENT: DEGREE,
+    GRAVITY: 0.01,
+    CLOCK_RATE: 2e-6,
+    SENSOR_ROTATION: 0.1 * DEGREE,
+    SENSOR_POSITION: 0.004,
+}
+
+# Of the finding that calls it in question; as in `magfusion.model.trust.CODES`.
+CODE: dict[Parameter, str] = {
+    BEACON_ROTATION: "beacon_pose",
+    BEACON_POSITION: "beacon_pose",
+    LOG_MOMENT: "moments",
+    PHASE: "phase",
+    DRIFT: "beacon_clock",
+    MATRIX: "magnetometer_matrix",
+    OFFSET: "magnetometer_offset",
+    SENSOR_ROTATION: "mounting",
+    SENSOR_POSITION: "lever_arm",
+    TIME_OFFSET: "time_offset",
+    DECLINATION: "earth_field",
+    STRENGTH: "earth_field",
+    GYRO_SCALE: "gyro_scale",
+    ACCEL_SCALE: "accel_scale",
+    GYRO_ALIGNMENT: "imu_axes",
+    GRAVITY: "gravity",
+    CLOCK_RATE: "imu_clock",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Suspect:
+    """Parameters that one mistake would have wrong together.
+
+    Parameters
+    ----------
+    name : str
+        In words.
+    blocks : tuple of Block
+        Among those that are held.
+    combine : ndarray, shape (dimension, columns)
+        Directions that are tried, of all that is held, in units of what is typical.
+    """
+
+    name: str
+    blocks: tuple[Block, ...]
+    combine: Array
+
+
+def held_blocks(site: Site, estimated: tuple[Block, ...], *, steady: bool) -> tuple[Block, ...]:
+    """Return every parameter that is not estimated, with its typical error for a sigma.
+
+    Parameters
+    ----------
+    steady : bool
+        Whether the steady field is measured.
+    """
+    known = {block.key for block in estimated}
+    kinds = [p for p in (*PARAMETERS, *INERTIAL) if steady or not p.steady_only]
+    return placed(
+        Block(kind, owner, slice(0), np.full(len(kind.sigma(site, owner)), TYPICAL[kind]))
+        for kind, owner in candidates(site, kinds)
+        if (kind, owner) not in known
+    )
+
+
+def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
+    """Yield what one mistake would have wrong: a block, or several of a kind."""
+    size = held[-1].columns.stop if held else 0
+
+    def together(name: str, chosen: list[Block]) -> Suspect:
+        columns = np.concatenate([np.arange(size)[b.columns] for b in chosen])
+        return Suspect(name, tuple(chosen), np.eye(size)[:, columns])
+
+    yield from (together(spoken_name(block), [block]) for block in held)
+    poses = {b.name: f"the pose of beacon {b.name}" for b in site.beacons}
+    sets = {
+        "the mounting and the lever arm of the magnetometer": (SENSOR_ROTATION, SENSOR_POSITION),
+        f"the positions of {_beacons(site)}": (BEACON_POSITION,),
+        f"the attitudes of {_beacons(site)}": (BEACON_ROTATION,),
+        f"the moments of {_beacons(site)}": (LOG_MOMENT,),
+    }
+    several = [(name, [b for b in held if b.parameter in kinds]) for name, kinds in sets.items()]
+    surveyed = [b for b in held if b.parameter in (BEACON_ROTATION, BEACON_POSITION)]
+    several += [(text, [b for b in surveyed if b.owner == name]) for name, text in poses.items()]
+    yield from (together(name, blocks) for name, blocks in several if len(blocks) > 1)
+    moments = [b for b in held if b.parameter == LOG_MOMENT]
+    if len(moments) > 1:
+        common = np.zeros((size, 1))
+        for block in moments:
+            common[block.columns] = 1.0
+        yield Suspect(f"the moments of {_beacons(site)}", tuple(moments), common)
+
+
+def _beacons(site: Site) -> str:
+    return "beacons " + ", ".join(beacon.name for beacon in site.beacons)
+
+
+def spoken_name(block: Block) -> str:
+    """Return what a block is called in a sentence."""
+    names = {
+        SENSOR_ROTATION: "the mounting of the magnetometer",
+        SENSOR_POSITION: "the lever arm of the magnetometer",
+        MATRIX: "the magnetometer's matrix (body iron, gains, axes)",
+        OFFSET: "the magnetometer's offset",
+        TIME_OFFSET: "the IMU's time offset",
+        DECLINATION: "the declination of the Earth field",
+        STRENGTH: "the strength of the Earth field",
+        GYRO_SCALE: "the scale of the gyro",
+        ACCEL_SCALE: "the scale of the accelerometer",
+        GYRO_ALIGNMENT: "the axes of the gyro",
+        GRAVITY: "the size of gravity",
+        CLOCK_RATE: "the rate of the IMU's clock",
+        BEACON_POSITION: "the position of beacon {owner}",
+        BEACON_ROTATION: "the attitude of beacon {owner}",
+        LOG_MOMENT: "the moments of beacon {owner}",
+        PHASE: "the drive phase of beacon {owner}",
+        DRIFT: "the clock of beacon {owner}",
+    }
+    own = block.owner if isinstance(block.parameter, BeaconParameter) else ""
+    return names.get(block.parameter, block.name).format(owner=own)

@@ -1,0 +1,201 @@
+"""The graph of a whole log at an estimate: the inertial stream, and all that was measured."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.estimation.demodulation import Demodulation
+from magfusion.estimation.drift_segments import segments_of
+from magfusion.estimation.graph import Graph, initial_estimate
+from magfusion.estimation.imu_decimation import preintegrate_stream
+from magfusion.estimation.inertial import Link, Preintegrated, inertial_graph, links_between
+from magfusion.estimation.initialization.chain import Start
+from magfusion.estimation.integrity.detection import only
+from magfusion.estimation.measurements.earth import earth_measurement, unheld
+from magfusion.estimation.measurements.measurement import Measurement
+from magfusion.estimation.measurements.model_error import alike_in_batch
+from magfusion.estimation.measurements.phasors import field_phasors
+from magfusion.estimation.measurements.pose_fix import pose_fixes
+from magfusion.estimation.measurements.zero_velocity import zero_velocity
+from magfusion.estimation.motion_compensation import MotionCompensated
+from magfusion.estimation.preintegration import low_passed_rate_at
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.parameters import Block, Calibration, corrected_imu, dimension, placed
+from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, BoolArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedLog:
+    """A log with a start found.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        Of the fields, before anything is known of the motion.
+    steady : SteadyFields, optional
+        Of the same epochs, where the Earth field is measured.
+    epoch : int ndarray, shape (n,)
+        States at which the fields are.
+    fixes : Fixes, optional
+        Where they enter the graph and not the phasors.
+    states : Trajectory
+        The start at all epochs.
+    blocks, considered : tuple of Block
+        What is estimated of the calibration, and what else is uncertain; of fixes the survey's
+        part is added at the end.
+    loss : {None, 'huber', 'cauchy'}
+        Of the fields.
+    others : tuple of (ndarray, Measurement)
+        Anything else that was measured, with the times of its rows (s).
+    rival_chi_square, rival : float, Trajectory, optional
+        As of `Smoothed`.
+    apart : bool
+        Whether every epoch's model error counts as one of its own: while it is tuned.
+    """
+
+    demodulation: Demodulation
+    samples: FieldSamples
+    steady: SteadyFields | None
+    epoch: IntArray
+    fixes: Fixes | None
+    start: Start
+    states: Trajectory
+    declared: Calibration
+    blocks: tuple[Block, ...]
+    considered: tuple[Block, ...]
+    loss: str | None
+    others: tuple[tuple[Array, Measurement], ...]
+    rival_chi_square: float | None = None
+    rival: Trajectory | None = None
+    apart: bool = False
+
+    @property
+    def imu(self) -> ImuSamples:
+        """The inertial stream as it was recorded."""
+        return self.demodulation.log.imu
+
+    def at_fields(self, states: Trajectory) -> Trajectory:
+        """Return the states at which the fields are."""
+        rows = {k: v[self.epoch] for k, v in vars(states).items() if v is not None}
+        return Trajectory(**rows)
+
+    def compensated(self, calibration: Calibration, states: Trajectory) -> MotionCompensated:
+        """Return the phasors with the motion taken off, by the stream that a calibration corrects.
+
+        Parameters
+        ----------
+        states : Trajectory
+            At all epochs.
+        """
+        imu, log = corrected_imu(calibration, self.blocks, self.imu), self.demodulation.log
+        known = replace(self.demodulation, log=log if imu is log.imu else replace(log, imu=imu))
+        wave = known.compensated(calibration, self.at_fields(states))
+        return replace(wave, fields=only(wave.fields, self.samples.valid))
+
+    def rests(self, standing: BoolArray) -> Measurement:
+        """Return the zero velocities of some epochs."""
+        motion = self.declared.site.platform.motion
+        return zero_velocity(np.flatnonzero(standing), motion.rest_speed_sigma)
+
+
+def graph_of(
+    log: PreparedLog,
+    states: Trajectory,
+    calibration: Calibration,
+    wave: MotionCompensated | None = None,
+    standing: BoolArray | None = None,
+) -> tuple[Graph, int]:
+    """Return the graph at an estimate, and the number of intervals bridged.
+
+    Parameters
+    ----------
+    wave : MotionCompensated, optional
+        Phasors that an estimate has been taken off from; those of before where there are none.
+    standing : bool ndarray, shape (states,), optional
+        Where the platform is known to stand.
+    """
+    links, bridged = _links(log, states, calibration)
+    measurements = [
+        replace(measurement, epoch=np.searchsorted(states.time, time)[measurement.epoch])
+        for time, measurement in log.others
+    ]
+    if standing is not None and np.any(standing):
+        measurements.append(log.rests(standing))
+    if log.fixes is not None:
+        measurements.append(_fixes(log, log.fixes))
+    else:
+        measurements += _fields(log, states, calibration, wave)
+    native = inertial_graph([link.measurement for link in links], log.declared.site.platform)
+    acting = links if links[0].by_calibration is not None else ()
+    segments = segments_of(states.time, log.declared, log.blocks)
+    graph = Graph(
+        native, tuple(measurements), log.declared, log.blocks, len(states), acting, segments
+    )
+    return graph, bridged
+
+
+def _links(
+    log: PreparedLog, states: Trajectory, calibration: Calibration
+) -> tuple[tuple[Link, ...], int]:
+    """Return the inertial stream between the states, and the number of intervals bridged.
+
+    Its derivatives are by what is estimated, then by what is considered.
+    """
+    site, offset = log.declared.site, calibration.time_offset
+    accel, gyro = states.accel_bias_body, states.gyro_bias_body
+    assert accel is not None
+    assert gyro is not None
+    blocks, bridged = (*log.blocks, *placed(log.considered, dimension(log.blocks))), []
+
+    def preintegrated(calibration: Calibration) -> list[Preintegrated]:
+        imu = corrected_imu(calibration, blocks, log.imu)
+        found, gaps = preintegrate_stream(
+            imu, offset, states.time, site.platform.imu, site.gravity, accel, gyro
+        )
+        bridged.append(int(np.sum(gaps)))
+        return found
+
+    start = initial_estimate(states, calibration).values
+    links = links_between(preintegrated, calibration, blocks, lambda _: start)
+    return tuple(links), bridged[0]
+
+
+def _fixes(log: PreparedLog, fixes: Fixes) -> Measurement:
+    """Return the fixes of the start as poses that were measured."""
+    cov = fixes.pose_cov[np.arange(len(fixes)), log.start.chosen] * overlap(log.samples)
+    return replace(pose_fixes(replace(log.start.states, pose_cov=cov), log.loss), epoch=log.epoch)
+
+
+def _fields(
+    log: PreparedLog, states: Trajectory, calibration: Calibration, wave: MotionCompensated | None
+) -> list[Measurement]:
+    """Return the phasors, and the Earth field where it is measured."""
+    samples = log.samples if wave is None else wave.fields
+    offset, here, site = calibration.time_offset, log.at_fields(states), calibration.site
+    assert here.gyro_bias_body is not None
+    imu = corrected_imu(calibration, log.blocks, log.imu)
+    rate_body = low_passed_rate_at(imu, offset, samples.time) - here.gyro_bias_body
+    by_offset = None if wave is None else wave.by_time_offset
+    length = 0.0 if log.apart else site.model_error_length
+    alike = alike_in_batch(here.position_world, length)
+    phasors = field_phasors(
+        site, samples, log.epoch, here, rate_body, offset, overlap(samples), by_offset, alike
+    )
+    out: list[Measurement] = [replace(phasors, robust=log.loss)]
+    if log.steady is not None:
+        steady, step = log.steady if wave is None else wave.steady, _step(samples)
+        out.append(earth_measurement(site, steady, log.epoch, rate_body, offset, step))
+        detected = np.any(samples.valid, axis=1)
+        out += unheld(states, log.epoch, detected, step, log.declared.site.platform.motion)
+    return out
+
+
+def overlap(samples: FieldSamples) -> float:
+    """Return how many windows hold each sample: their information must not be counted twice."""
+    return max(1.0, float(np.median(samples.window)) / _step(samples))
+
+
+def _step(samples: FieldSamples) -> float:
+    return float(np.median(np.diff(samples.time)))

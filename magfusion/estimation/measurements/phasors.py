@@ -1,0 +1,179 @@
+"""Phasors of the beacons as a measurement."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.measurements.measurement import Loss, Measurement, Rows
+from magfusion.estimation.state import States
+from magfusion.model.noise import (
+    measurement_cov,
+    paired_whitening,
+    sensor_positions,
+    stacked,
+)
+from magfusion.model.parameters import (
+    TIME_OFFSET,
+    Block,
+    Calibration,
+    linearize_channels,
+    predict_channels,
+)
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, BoolArray, ComplexArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class FieldPhasors(Measurement):
+    """Phasors of all channels, a group each.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    measured : ndarray, shape (n, channels, 6)
+        Real, then imaginary part (T); zero where missing.
+    sqrt_information : ndarray, shape (n, channels, 6, 6)
+        Whitening; zero where missing.
+    rate_body : ndarray, shape (n, 3)
+        Angular rate, for the time offset (rad/s).
+    by_time_offset : ndarray, shape (n, channels, 6)
+        What a change of it does to the lock-in at fixed states (T/s).
+    applied_offset : float
+        IMU time offset with which the inertial data were cut (s).
+    robust : {None, 'huber', 'cauchy'}
+        Loss of each channel.
+    excess : ndarray, shape (n, channels), optional
+        Variance with which it is weighed, since epochs close by have the same model error, in
+        units of that of an epoch alone.
+    """
+
+    time: Array
+    measured: Array
+    sqrt_information: Array
+    rate_body: Array
+    by_time_offset: Array
+    applied_offset: float
+    robust: str | None = None
+    excess: Array | None = None
+
+    @property
+    def loss(self) -> Loss | None:
+        """Robust loss of each channel: one that counts in part is an outlier no less."""
+        if self.robust is None:
+            return None
+        return Loss(self.robust, 1.0 if self.excess is None else self.excess)
+
+    def alone(self) -> "FieldPhasors":
+        """Return the measurement whitened as if no other epoch had the same model error."""
+        if self.excess is None:
+            return self
+        scale = np.sqrt(self.excess)[..., None, None]
+        return replace(self, sqrt_information=scale * self.sqrt_information, excess=None)
+
+    def error(self, states: States, calibration: Calibration) -> Array:
+        """Return the whitened error, shape (n, channels, 6), without a derivative."""
+        lag, world_from_body, position_world = self._at_field(states, calibration)
+        phasor = predict_channels(calibration, self.time, world_from_body, position_world)
+        value = np.concatenate([phasor.real, phasor.imag], axis=-1) + lag * self.by_time_offset
+        return (self.sqrt_information @ (value - self.measured)[..., None])[..., 0]
+
+    def linearize(
+        self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
+    ) -> Rows:
+        """Return the rows at an estimate, a group for each channel."""
+        velocity_body = np.swapaxes(states.world_from_body, 1, 2) @ states.velocity_world[..., None]
+        lag, world_from_body, position_world = self._at_field(states, calibration)
+        value, by_pose, by_calibration = linearize_channels(
+            calibration,
+            blocks,
+            self.time,
+            world_from_body,
+            position_world,
+            np.concatenate([self.rate_body, velocity_body[..., 0]], axis=1),
+        )
+        value += lag * self.by_time_offset
+        for block in blocks:
+            if block.parameter == TIME_OFFSET:
+                by_calibration[..., block.columns.start] += self.by_time_offset
+        return Rows(
+            error=(self.sqrt_information @ (value - self.measured)[..., None])[..., 0],
+            by_pose=self.sqrt_information @ by_pose,
+            by_calibration=self.sqrt_information @ by_calibration,
+        )
+
+    def without(self, rejected: BoolArray) -> "FieldPhasors":
+        """Return the measurement without some channels, shape (channels,)."""
+        kept = np.where(rejected[:, None, None], 0.0, self.sqrt_information)
+        return replace(self, sqrt_information=kept)
+
+    def _at_field(self, states: States, calibration: Calibration) -> tuple[float, Array, Array]:
+        """Return lag, attitude and position where the field was taken.
+
+        The states carry the IMU's clock: that was a little before or after.
+        """
+        lag = calibration.time_offset - self.applied_offset
+        turn = Rotation.from_rotvec(-lag * self.rate_body).as_matrix()
+        return (
+            lag,
+            states.world_from_body @ turn,
+            states.position_world - lag * states.velocity_world,
+        )
+
+
+def field_phasors(
+    site: Site,
+    samples: FieldSamples,
+    epoch: IntArray,
+    poses: Trajectory,
+    rate_body: Array,
+    applied_offset: float,
+    repeats: float,
+    by_time_offset: ComplexArray | None = None,
+    alike: Array | float = 1.0,
+) -> FieldPhasors:
+    """Return phasors as a measurement, weighed at poses that are about right.
+
+    Parameters
+    ----------
+    epoch : int ndarray, shape (n,)
+        States that they belong to.
+    poses : Trajectory
+        Of the same epochs.
+    rate_body : ndarray, shape (n, 3)
+        Angular rate without its bias (rad/s).
+    applied_offset : float
+        IMU time offset with which the inertial data were cut (s).
+    repeats : float
+        How many epochs hold each sample of overlapping windows: that must not count twice.
+    by_time_offset : complex ndarray, shape (n, channels, 3), optional
+        As of `magfusion.estimation.motion_compensation.WaveFields`.
+    alike : ndarray, shape (n,), or float
+        How many epochs have the same model error; no fewer than windows hold a sample.
+    """
+    place = sensor_positions(site, poses)
+    together = np.maximum(alike, repeats)
+    cov = measurement_cov(site, samples, sensor_world=place, windows=repeats, alike=together)
+    single = repeats * measurement_cov(site, samples, sensor_world=place)
+    more, own = (np.trace(c, axis1=2, axis2=3) for c in (cov, single))
+    excess = np.divide(more, own, out=np.ones_like(own), where=samples.valid)
+    phasor = samples.phasor_sensor
+    by = np.zeros_like(phasor) if by_time_offset is None else by_time_offset
+    return FieldPhasors(
+        epoch=epoch,
+        time=samples.time,
+        measured=stacked(phasor),
+        sqrt_information=paired_whitening(cov, samples.valid),
+        rate_body=rate_body,
+        by_time_offset=stacked(by),
+        applied_offset=applied_offset,
+        excess=excess,
+    )
+
+
+def alone(measurement: Measurement) -> Measurement:
+    """Return a measurement whitened as its epochs are, not as they are weighed."""
+    return measurement.alone() if isinstance(measurement, FieldPhasors) else measurement

@@ -1,0 +1,90 @@
+"""Zero velocity: when the platform may be said to stand, and what that measures."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.estimation.measurements.measurement import Measurement, Rows
+from magfusion.estimation.state import States
+from magfusion.model.parameters import Block, Calibration
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import MotionModel
+from magfusion.model.strapdown import resting
+from magfusion.units import Array, BoolArray, IntArray
+
+REST_GATE = 30.7  # chi square of three components, one in a million: days have many rests
+LONGEST_SILENCE = 0.1  # s; a gap looks quiet
+FEWEST_SAMPLES = 10
+REACH = 0.1  # s, beyond the span, that the samples should cover
+
+
+@dataclass(frozen=True, eq=False)
+class ZeroVelocity(Measurement):
+    """The velocity is zero: the platform is at rest.
+
+    Parameters
+    ----------
+    sigma : ndarray, shape (n,)
+        (m/s)
+    """
+
+    sigma: Array
+
+    def linearize(
+        self,
+        states: States,
+        calibration: Calibration,
+        blocks: tuple[Block, ...],
+    ) -> Rows:
+        """Return the rows at an estimate, one group of three."""
+        weight = 1.0 / self.sigma[:, None, None]
+        return Rows(
+            error=weight * states.velocity_world[:, None],
+            by_velocity=weight[..., None] * np.eye(3),
+        )
+
+
+def zero_velocity(epoch: IntArray, sigma: float) -> ZeroVelocity:
+    """Return that the platform stands at some epochs, alike (m/s)."""
+    return ZeroVelocity(epoch, np.full(len(epoch), sigma))
+
+
+def quiet_before(imu: ImuSamples, stamps: Array, motion: MotionModel) -> BoolArray:
+    """Tell at which times the IMU has been quiet for the motion's span of rest, without a gap.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (n,)
+        On the IMU's clock (s).
+    """
+    time, count, span = imu.time, len(imu), motion.rest_span
+    if count < FEWEST_SAMPLES:
+        return np.zeros(len(stamps), dtype=bool)
+    first = np.searchsorted(time, stamps - span - REACH)
+    last = np.searchsorted(time, stamps + REACH, side="right")
+    enough = last - first >= FEWEST_SAMPLES
+    first, last = np.minimum(first, count - 1), np.maximum(np.minimum(last, count), 1)
+    covered = (time[first] <= stamps - span) & (time[last - 1] >= stamps - REACH)
+    silent = np.concatenate([[0], np.cumsum(np.diff(time) > LONGEST_SILENCE)])
+    still = resting(time, imu.gyro_body, imu.accel_body, span - REACH, motion=motion)
+    middle = np.minimum(np.searchsorted(time, stamps - span / 2), count - 1)
+    return enough & covered & (silent[last - 1] == silent[first]) & still[middle]
+
+
+def may_stand(velocity_world: Array, cov: Array, motion: MotionModel) -> BoolArray:
+    """Tell where nothing that is known says that the platform moves.
+
+    A slow steady motion is as quiet as a rest: the velocity decides, and one that nobody knows
+    contradicts nothing, nor does it tell anything.
+
+    Parameters
+    ----------
+    velocity_world : ndarray, shape (..., 3)
+        (m/s)
+    cov : ndarray, shape (..., 3, 3)
+        Of it (m^2/s^2).
+    """
+    known = np.max(np.diagonal(cov, axis1=-2, axis2=-1), axis=-1) < motion.rest_known_speed**2
+    cov = cov + motion.rest_speed_sigma**2 * np.eye(3)
+    solved = np.linalg.solve(cov, velocity_world[..., None])[..., 0]
+    return known & (np.sum(velocity_world * solved, axis=-1) < REST_GATE)

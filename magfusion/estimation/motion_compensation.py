@@ -1,0 +1,148 @@
+"""What the lock-in makes of motion inside its window, predicted and taken off."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.estimation.preintegration import low_passed, motion_at
+from magfusion.estimation.state import State, as_trajectory
+from magfusion.model.field import observe_earth
+from magfusion.model.parameters import Calibration, predict_channels
+from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
+from magfusion.model.trajectory import Trajectory
+from magfusion.receiver.admission import Windows
+from magfusion.receiver.lockin import WindowOperator, window_operator
+from magfusion.receiver.receiver import LockinReceiver
+from magfusion.receiver.turn import on_clock
+from magfusion.units import Array, ComplexArray
+
+OFFSET_STEP = 5e-4  # s; of the difference quotient
+
+
+def predicted_waveform(
+    motion: Trajectory, calibration: Calibration, earth_field_world: Array
+) -> Array:
+    """Return the samples that a magnetometer takes along a motion.
+
+    Parameters
+    ----------
+    motion : Trajectory
+        At the sample times.
+    earth_field_world : ndarray, shape (3,)
+        (T)
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        (T), measured axes, without noise.
+    """
+    site = calibration.site
+    phasor = predict_channels(
+        calibration, motion.time, motion.world_from_body, motion.position_world
+    )
+    frequencies = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
+    carrier = np.exp(2j * np.pi * frequencies * motion.time[:, None])
+    beacons = np.einsum("ncx,nc->nx", phasor, carrier).real
+    earth = observe_earth(site.platform.magnetometer, motion.world_from_body, earth_field_world)
+    return beacons + earth.measured_sensor
+
+
+@dataclass(frozen=True, eq=False)
+class MotionCompensated:
+    """Phasors at the centres of the windows, freed of what motion inside the window does.
+
+    Parameters
+    ----------
+    by_time_offset : complex ndarray, shape (n, channels, 3)
+        Derivative of what was taken off by the IMU's time offset at fixed states (T/s).
+    steady : SteadyFields
+        The Earth field and the offset.
+    """
+
+    fields: FieldSamples
+    by_time_offset: ComplexArray
+    steady: SteadyFields
+
+    @staticmethod
+    def of_slots(fields: FieldSamples) -> "MotionCompensated":
+        """Return phasors of slots: too short for motion, and without a steady field."""
+        none = np.full((len(fields), 3), np.nan)
+        steady = SteadyFields(fields.time, none, np.full((*none.shape, 3), np.nan))
+        return MotionCompensated(fields, np.zeros_like(fields.phasor_sensor), steady)
+
+
+def demodulate_about(
+    operator: WindowOperator,
+    measured_sensor: Array,
+    states: Trajectory,
+    imu: ImuSamples,
+    calibration: Calibration,
+    path: Trajectory | None = None,
+) -> MotionCompensated:
+    """Demodulate what a prediction of the waveform leaves, and add the phasors at the centres.
+
+    The raw samples of each window are predicted from the state and from the IMU's motion inside
+    the window; only what they differ by from the measured ones passes through the lock-in.
+
+    Parameters
+    ----------
+    measured_sensor : ndarray, shape (samples, 3)
+        (T)
+    states : Trajectory
+        At the centres of the windows.
+    path : Trajectory, optional
+        States between which the motion is interpolated, where they are not those of the windows.
+    """
+    site, known = calibration.site, states if path is None else path
+    earth = np.zeros(3) if site.earth_field_world is None else site.earth_field_world
+
+    def predicted(stream: ImuSamples, time_offset: float) -> Array:
+        motion = motion_at(known, stream, time_offset, site.gravity, operator.time)
+        return predicted_waveform(motion, calibration, earth)
+
+    offset, slow = calibration.time_offset, low_passed(imu)
+    rest, left = operator.demodulate(measured_sensor - predicted(imu, offset))
+    change = predicted(slow, offset + OFFSET_STEP) - predicted(slow, offset - OFFSET_STEP)
+    at_centre = predict_channels(
+        calibration, states.time, states.world_from_body, states.position_world
+    )
+    steady = observe_earth(site.platform.magnetometer, states.world_from_body, earth)
+    return MotionCompensated(
+        fields=replace(rest, phasor_sensor=rest.phasor_sensor + at_centre),
+        by_time_offset=operator.apply(change / (2.0 * OFFSET_STEP)),
+        steady=replace(left, measured_sensor=left.measured_sensor + steady.measured_sensor),
+    )
+
+
+def demodulate_predicted(
+    receiver: LockinReceiver,
+    number: int,
+    waveform: Waveform,
+    imu: ImuSamples,
+    before: State,
+    predicted: State,
+    offset: float,
+) -> MotionCompensated:
+    """Demodulate one window about a prediction.
+
+    Parameters
+    ----------
+    number : int
+        Of the window.
+    waveform, imu : Waveform, ImuSamples
+        Covering the window and, of the IMU, the interval before it.
+    before, predicted : State
+        At the epoch before and at the centre.
+    offset : float
+        IMU time offset with which the states were propagated (s).
+    """
+    assert receiver.grid is not None
+    window = receiver.grid.windows(np.array([number]), waveform.time)
+    inside = slice(int(window.first[0]), int(window.first[0] + window.count[0]))
+    samples = Waveform(waveform.time[inside], waveform.measured_sensor[inside])
+    alone = Windows(window.number, window.centre, np.zeros(1, dtype=np.int64), window.count)
+    calibration = replace(predicted.calibration, time_offset=offset)
+    known = on_clock(imu, offset, predicted.gyro_bias_body)
+    operator = window_operator(samples, known, calibration.site, receiver.settings, alone)
+    centre, path = as_trajectory([predicted]), as_trajectory([before, predicted])
+    return demodulate_about(operator, samples.measured_sensor, centre, imu, calibration, path)

@@ -1,0 +1,403 @@
+"""Navigation as the data arrive: one interface for the fixed-lag smoother and the filter.
+
+`Navigator` knows no files.  Samples go in as they come; a state comes out at every field epoch, and
+on request at any time since.
+"""
+
+from collections import Counter, deque
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.batch import LONGEST_STEP
+from magfusion.estimation.ekf import ErrorStateFilter
+from magfusion.estimation.epoch_update import EpochUpdate, Estimator
+from magfusion.estimation.fixed_lag import SlidingWindow
+from magfusion.estimation.initialization.online import NoStart, find_online_start
+from magfusion.estimation.input_queue import Arrivals
+from magfusion.estimation.integrity.bank import SubsetBank
+from magfusion.estimation.integrity.judgement import JudgedState, Judgement, Told, judged_state
+from magfusion.estimation.integrity.summary import Summary
+from magfusion.estimation.measurements.earth import check_earth
+from magfusion.estimation.measurements.measurement import Measurement
+from magfusion.estimation.navigator_data import navigator_rules
+from magfusion.estimation.process_noise import calibration_process_noise
+from magfusion.estimation.propagation import Propagated, propagate
+from magfusion.estimation.settings import EstimatorSettings
+from magfusion.estimation.state import State
+from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
+from magfusion.model.parameters import dimension, placed
+from magfusion.model.samples import FieldSamples, SteadyFields
+from magfusion.model.site import Site
+from magfusion.model.trust import Risk
+from magfusion.receiver.receiver import Receiver
+from magfusion.units import Array
+
+
+@dataclass(frozen=True)
+class NavigatorSettings(EstimatorSettings):
+    """How to navigate.
+
+    Parameters
+    ----------
+    estimator : {'smoother', 'ekf'}
+    lag : float
+        Window of the smoother (s).
+    delay : float
+        How late samples may come and still be used in their order (s); so much later are states.
+    start_duration : float
+        Data gathered before the first state (s); longer where they leave it ambiguous.
+    longest_step : float
+        Without any field a state is made after so long (s).
+    risk : Risk, optional
+        What the protection levels promise; without it there are none, and an update costs less.
+    """
+
+    estimator: Literal["smoother", "ekf"] = "smoother"
+    lag: float = 4.0
+    delay: float = 0.0
+    start_duration: float = 6.0
+    longest_step: float = LONGEST_STEP
+    risk: Risk | None = None
+
+
+class Navigator:
+    """A running estimate of the platform's motion.
+
+    Raises
+    ------
+    InputError
+        Where the Earth field is to be measured but the site has none.
+    """
+
+    # What a checkpoint holds, beside the estimator.
+    _arrived: Arrivals
+    _update: EpochUpdate
+    _next_start: float
+    _judgement: Judgement
+    _made: list[JudgedState]
+    _told: deque[Told]
+    summary: Summary
+    why_no_start: NoStart
+    rival_chi_square: float | None
+
+    def __init__(self, site: Site, settings: NavigatorSettings | None = None) -> None:
+        self.site = site
+        self.settings = NavigatorSettings() if settings is None else settings
+        if self.settings.earth:
+            check_earth(site)
+        # In the estimator's tangent what is estimated comes first, then what is only considered.
+        estimated, considered = self.settings.blocks(site)
+        self.blocks = (*estimated, *placed(considered, dimension(estimated)))
+        self._considered = dimension(considered)
+        risk, bank = self.settings.risk, None
+        if risk is not None:
+            bank = SubsetBank(site, self.blocks, self._considered, risk)
+        self._update = EpochUpdate(site, estimated, self.blocks, self.settings.earth, bank)
+        self._process_noise = calibration_process_noise(site, self.blocks, self._considered)
+        receiver = Receiver.of(site, self.settings.lockin)
+        self._arrived = Arrivals(receiver, site.platform.imu.time_offset)
+        self._estimator: Estimator | None = None
+        self._next_start = self.settings.start_duration
+        self._judgement, self._made, self._told = Judgement(), [], deque()
+        self.summary = Summary()
+        self.why_no_start = NoStart()
+        self.rival_chi_square = None
+
+    # What goes in
+
+    def add_imu(self, time: Array, gyro_body: Array, accel_body: Array) -> None:
+        """Take inertial samples: times (k,), rates and specific forces (k, 3).
+
+        Raises
+        ------
+        InputError
+            Where a number is not finite or the clock jumped.
+        """
+        self._arrived.add_imu(time, gyro_body, accel_body)
+        self._advance()
+
+    def add_magnetometer(self, time: Array, measured_sensor: Array) -> None:
+        """Take raw samples of the magnetometer: times (k,), fields (k, 3) (T).
+
+        Raises
+        ------
+        InputError
+            Where a number is not finite or the clock jumped.
+        """
+        self._arrived.add_magnetometer(time, measured_sensor)
+        self._advance()
+
+    def add_fields(self, samples: FieldSamples, steady: SteadyFields | None = None) -> None:
+        """Take demodulated phasors, channels in the site's order, and the steady fields with them.
+
+        Raises
+        ------
+        InputError
+            Where the clock jumped.
+        """
+        after = -np.inf if self._estimator is None else self._estimator.state.time
+        late = self._arrived.add_fields(samples, steady if self.settings.earth else None, after)
+        if late:
+            self.counts["field too late"] += late
+        self._advance()
+
+    def add_measurement(self, time: float, measurement: Measurement) -> None:
+        """Take in anything else that was measured, of one epoch: a state is made at its time (s).
+
+        It passes no gate; a robust loss is its own.
+
+        Raises
+        ------
+        InputError
+            Where the clock jumped.
+        """
+        after = -np.inf if self._estimator is None else self._estimator.state.time
+        if not self._arrived.add_measurement(time, measurement, after):
+            self.counts["measurement too late"] += 1
+        self._advance()
+
+    # What comes out
+
+    @property
+    def started(self) -> bool:
+        """Whether there is a state."""
+        return self._estimator is not None
+
+    @property
+    def judgement(self) -> Judgement:
+        """What is said of the newest state."""
+        return self._judgement
+
+    def take(self) -> list[JudgedState]:
+        """Return the states made since this was last asked.
+
+        Of one that is lost the pose is a guess that nobody should use.
+        """
+        made, self._made = self._made, []
+        return made
+
+    def state(self, time: float | None = None) -> JudgedState:
+        """Return the state at a time, carried on by the inertial stream from the last epoch.
+
+        Parameters
+        ----------
+        time : float, optional
+            (s); the newest inertial sample where it is not given.
+
+        Raises
+        ------
+        EstimationError
+            Before there is a state.
+        """
+        if self._estimator is None:
+            raise EstimationError("there is no state yet: the navigator is still gathering data")
+        last = self._estimator.state
+        wanted = self._arrived.inertial if time is None else time
+        state = last if wanted <= last.time else self._propagated(wanted).state
+        return judged_state(state, self._judgement)
+
+    @property
+    def distortion(self) -> dict[str, float]:
+        """By beacon, running mean of the squared innovation in units of its expectation."""
+        return self._update.gate.distortion
+
+    @property
+    def lagged(self) -> State | None:
+        """State that left the smoother's window last; that of the filter is of now."""
+        return None if self._estimator is None else self._estimator.lagged
+
+    def take_lagged(self) -> list[JudgedState]:
+        """Return the states that left the smoother's window since this was last asked.
+
+        Each is judged as the state of now was at its time.  A filter has none.
+        """
+        if not isinstance(self._estimator, SlidingWindow):
+            return []
+        left, self._estimator.left = self._estimator.left, []
+        return [judged_state(state, self._judgement_at(state.time)) for state in left]
+
+    def _judgement_at(self, time: float) -> Judgement:
+        """Return what was said of a time, and forget what was said before."""
+        while len(self._told) > 1 and self._told[1].time <= time:
+            self._told.popleft()
+        return self._told[0].judgement if self._told else Judgement()
+
+    @property
+    def counts(self) -> Counter[str]:
+        """What was refused, lost and recovered, with the reason."""
+        return self._update.gate.counts
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """All that was refused, lost or recovered, with the reason: `counts`, windows, samples."""
+        return {**self.counts, **self._arrived.losses}
+
+    def checkpoint(self) -> dict[str, Any]:
+        """Return everything needed to go on as plain data: `restored` makes a navigator of it."""
+        rules = navigator_rules(self.site, self.blocks)
+        self._arrived.imu.rows()
+        self._arrived.waveform.rows()
+        return {"parts": to_plain(self, rules), "estimator": to_plain(self._estimator, rules)}
+
+    def _go_on_from(self, data: Any, rules: Rules) -> None:
+        """Take the state that a checkpoint holds."""
+        if not isinstance(data, dict) or data.keys() != {"parts", "estimator"}:
+            raise InputError("holds no state of a navigator; run without --resume")
+        resume(self, data["parts"], "navigator", rules)
+        own = data["estimator"]
+        if own is not None:
+            state = own.get("state") if isinstance(own, dict) else None
+            self._start_at(from_plain(State, state, "estimator.state", rules))
+            resume(self._estimator, own, "estimator", rules)
+
+    # How it goes on
+
+    def _advance(self) -> None:
+        if self._estimator is None and not self._begin():
+            return
+        while self._step():
+            pass
+
+    def _begin(self) -> bool:
+        """Find the first state, once enough has come."""
+        arrived = self._arrived
+        reached = arrived.reached - self.settings.delay
+        if not reached - arrived.first >= self._next_start:
+            return False
+        start = find_online_start(
+            self.site,
+            arrived.inertial_samples(),
+            arrived.waveform,
+            arrived.fields,
+            list(arrived.steady.values()),
+            reached,
+            self.settings,
+        )
+        longest = 4.0 * self.settings.start_duration
+        if isinstance(start, NoStart):
+            self.why_no_start = start
+            self._next_start *= 2.0 if start.trust.findings else 1.5
+            arrived.forget_before_start(longest)
+            return False
+        if start.ambiguous and self._next_start < longest:
+            self._next_start += 0.5 * self.settings.start_duration
+            return False
+        self._arrived.start(start, self.settings.delay)
+        self.rival_chi_square = start.rival_chi_square
+        self._start_at(start.state)
+        self.summary.unverified = start.trust.unverified
+        self._tell(start.state, self._update.begin(start))
+        return True
+
+    def _start_at(self, state: State) -> None:
+        if self.settings.estimator == "ekf":
+            self._estimator = ErrorStateFilter(state, self.blocks, self._considered)
+        else:
+            self._estimator = SlidingWindow(
+                state, self.blocks, self.settings.lag, self._process_noise, self._considered
+            )
+
+    def _step(self) -> bool:
+        """Process the next epoch, if all that it needs has come."""
+        assert self._estimator is not None
+        now = self._estimator.state.time
+        arrived, delay = self._arrived, self.settings.delay
+        arrived.receive(self._estimator.state, delay)
+        inertial, other = arrived.awaited - delay, arrived.next_other
+        if other <= now:
+            self.counts["measurement too late"] += len(arrived.others_at(other))
+            return True
+        if other <= inertial and other < arrived.next_field:
+            self._absorb(other, None)
+            return True
+        centre = arrived.next_window()
+        if centre is not None:
+            self._step_window(centre)
+            return True
+        if arrived.fields and arrived.fields[0].time[0] <= inertial:
+            return self._step_fields(arrived.fields.pop(0))
+        if arrived.window_to_come:
+            return False
+        if inertial - now >= self.settings.longest_step:
+            self._absorb(now + self.settings.longest_step, None)
+            return True
+        return False
+
+    def _step_window(self, centre: float) -> None:
+        assert self._estimator is not None
+        if centre <= self._estimator.state.time:
+            self.counts["window too late"] += 1
+        else:
+            self._absorb(centre, None)
+
+    def _step_fields(self, samples: FieldSamples) -> bool:
+        assert self._estimator is not None
+        if samples.time[0] <= self._estimator.state.time:
+            self.counts["field too late"] += 1
+            self._arrived.steady.pop(float(samples.time[0]), None)
+            return True
+        self._absorb(float(samples.time[0]), samples)
+        return True
+
+    def _absorb(self, time: float, samples: FieldSamples | None) -> None:
+        """Go on to a time and take in what was measured there."""
+        assert self._estimator is not None
+        predicted = self._propagated(time)
+        judgement = self._update.take_in(self._estimator, self._arrived, predicted, samples)
+        state = self._estimator.state
+        self._tell(state, judgement)
+        lag = self._arrived.apply_offset_anew(state, self.blocks)
+        if lag:
+            self._estimator.replace_state(replace(state, time=state.time + lag))
+            self.counts["time offset applied anew"] += 1
+        self._arrived.forget(self._estimator.state.time)
+
+    def _tell(self, state: State, judgement: Judgement) -> None:
+        self._judgement = judgement
+        self._made.append(judged_state(state, judgement))
+        self.summary.note(state.time, judgement)
+        if self.settings.estimator == "smoother":
+            self._told.append(Told(state.time, judgement))
+
+    def _propagated(self, time: float) -> Propagated:
+        assert self._estimator is not None
+        state = self._estimator.state
+        offset, usual = self._arrived.applied_offset, self._arrived.usual
+        imu = self._arrived.inertial_samples(state.time - offset, time - offset)
+        return propagate(
+            state, imu, time, self.site, offset, self._process_noise, usual, self.blocks
+        )
+
+
+def restored(
+    site: Site,
+    settings: NavigatorSettings,
+    checkpoint: Any,
+    measurements: tuple[type[Measurement], ...] = (),
+) -> Navigator:
+    """Return the navigator of a checkpoint.
+
+    Parameters
+    ----------
+    site, settings
+        Of the navigator that made it.
+    checkpoint : dict
+        What `Navigator.checkpoint` returned.
+    measurements : tuple of type
+        Kinds of measurements from outside the package that were given to it.
+
+    Raises
+    ------
+    InputError
+        Where it is none, or does not fit the site.
+    """
+    navigator = Navigator(site, settings)
+    rules = navigator_rules(site, navigator.blocks, measurements)
+    try:
+        navigator._go_on_from(checkpoint, rules)
+    except np.linalg.LinAlgError as error:
+        raise InputError(f"its covariance is none ({error}); run without --resume") from error
+    return navigator

@@ -1,0 +1,262 @@
+"""Inertial data between field epochs: preintegration, and the motion inside an interval."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+from scipy.ndimage import uniform_filter1d
+from scipy.spatial.transform import Rotation, Slerp
+
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import ImuModel
+from magfusion.model.strapdown import attitude_at, attitude_from_gyro
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, BoolArray, IntArray
+
+# What may happen while the IMU is silent: the motion of a person or a vehicle.
+BRIDGE_GYRO_NOISE = 1.0  # rad/s/sqrt(Hz)
+BRIDGE_ACCEL_NOISE = 3.0  # m/s^2/sqrt(Hz)
+RATE_SPAN = 0.08  # s; motion is slower, noise is not
+GAP_SAMPLES = 5.0  # a gap is this many times the usual sampling interval
+
+
+@dataclass(frozen=True, eq=False)
+class Increments:
+    """Mean rate and specific force over short steps, cut at the epochs.
+
+    Parameters
+    ----------
+    gyro_body, accel_body : ndarray, shape (steps, 3)
+        (rad/s, m/s^2)
+    dt : ndarray, shape (steps,)
+        (s)
+    first : int ndarray, shape (epochs,)
+        First step after each epoch.
+    bridged : bool ndarray, shape (epochs - 1,)
+        Intervals in which the stream has a gap.
+    """
+
+    gyro_body: Array
+    accel_body: Array
+    dt: Array
+    first: IntArray
+    bridged: BoolArray
+
+
+def cut_at_epochs(
+    imu: ImuSamples, time_offset: float, epochs: Array, usual: float | None = None
+) -> Increments:
+    """Cut the inertial stream into steps that never straddle an epoch.
+
+    Parameters
+    ----------
+    time_offset : float
+        Added to its stamps to bring them to the log's clock (s).
+    epochs : ndarray, shape (n,)
+        (s); where they lie outside the stream its end values are extended.
+    usual : float, optional
+        Sampling interval (s); the median where it is not given: of a stretch inside a gap there
+        is none.
+    """
+    time = imu.time + time_offset
+    known = float(np.median(np.diff(time))) if usual is None else usual
+    # One long step would tie the position to the velocity: its noise would be singular.
+    stamps = np.concatenate([time, _between_samples(time, epochs, known)])
+    inside = (stamps > epochs[0]) & (stamps < epochs[-1])
+    grid = np.union1d(stamps[inside], epochs)
+    samples = [
+        np.stack([np.interp(grid, time, axis) for axis in stream.T], axis=1)
+        for stream in (imu.gyro_body, imu.accel_body)
+    ]
+    gyro, accel = (0.5 * (s[:-1] + s[1:]) for s in samples)
+    first = np.searchsorted(grid, epochs)
+    silent = np.flatnonzero(_in_gap(time, grid, known))
+    bridged = np.zeros(len(epochs) - 1, dtype=bool)
+    bridged[np.searchsorted(first, silent, side="right") - 1] = True
+    return Increments(gyro, accel, np.diff(grid), first, bridged)
+
+
+def _between_samples(time: Array, epochs: Array, usual: float) -> Array:
+    """Return stamps that fill the gaps of a stream, as far as the epochs reach."""
+    edges = np.concatenate([[min(time[0], epochs[0])], time, [max(time[-1], epochs[-1])]])
+    filled = [np.empty(0)]
+    for k in np.flatnonzero(np.diff(edges) > GAP_SAMPLES * usual):
+        begin, end = max(edges[k], epochs[0]), min(edges[k + 1], epochs[-1])
+        if end > begin:
+            filled.append(np.linspace(begin, end, int((end - begin) / usual) + 2)[1:-1])
+    return np.concatenate(filled)
+
+
+def _in_gap(time: Array, grid: Array, usual: float) -> BoolArray:
+    """Tell which steps of the grid lie in a gap of the stream, however short the step itself is."""
+    edges = np.concatenate([[min(time[0], grid[0])], time, [max(time[-1], grid[-1])]])
+    spacing = np.diff(edges)
+    holding = np.clip(np.searchsorted(edges, grid[:-1], side="right") - 1, 0, len(spacing) - 1)
+    return np.asarray(spacing[holding] > GAP_SAMPLES * usual)
+
+
+def preintegration_parameters(
+    imu: ImuModel, gravity: float, *, bridge: bool
+) -> gtsam.PreintegrationCombinedParams:
+    """Return GTSAM's noise of an inertial stream; ``bridge`` for a stretch without samples."""
+    parameters = gtsam.PreintegrationCombinedParams.MakeSharedU(gravity)
+    gyro = max(imu.gyro_noise, BRIDGE_GYRO_NOISE) if bridge else imu.gyro_noise
+    accel = max(imu.accel_noise, BRIDGE_ACCEL_NOISE) if bridge else imu.accel_noise
+    parameters.setGyroscopeCovariance(gyro**2 * np.eye(3))
+    parameters.setAccelerometerCovariance(accel**2 * np.eye(3))
+    parameters.setIntegrationCovariance(1e-12 * np.eye(3))
+    parameters.setBiasOmegaCovariance(imu.gyro_bias_walk**2 * np.eye(3))
+    parameters.setBiasAccCovariance(imu.accel_bias_walk**2 * np.eye(3))
+    return parameters
+
+
+def preintegrate(
+    increments: Increments, imu: ImuModel, gravity: float, accel_bias: Array, gyro_bias: Array
+) -> list[gtsam.PreintegratedCombinedMeasurementsG]:
+    """Preintegrate every interval between two epochs on the Galilean group.
+
+    GTSAM's default class is first-order on the rotation vector and breaks at one full turn.
+
+    Parameters
+    ----------
+    gravity : float
+        (m/s^2)
+    accel_bias, gyro_bias : ndarray, shape (epochs, 3)
+        At which to linearise (m/s^2, rad/s).
+
+    Returns
+    -------
+    list
+        One for each interval.
+    """
+    usual = preintegration_parameters(imu, gravity, bridge=False)
+    wide = preintegration_parameters(imu, gravity, bridge=True)
+    gyro, accel, dt = increments.gyro_body, increments.accel_body, increments.dt.tolist()
+    out = []
+    for i, (lo, hi) in enumerate(
+        zip(increments.first[:-1].tolist(), increments.first[1:].tolist(), strict=True)
+    ):
+        bias = gtsam.imuBias.ConstantBias(accel_bias[i], gyro_bias[i])
+        measurement = gtsam.PreintegratedCombinedMeasurementsG(
+            wide if increments.bridged[i] else usual, bias
+        )
+        integrate = measurement.integrateMeasurement
+        for a, w, step in zip(accel[lo:hi], gyro[lo:hi], dt[lo:hi], strict=True):
+            integrate(a, w, step)
+        out.append(measurement)
+    return out
+
+
+def low_passed(imu: ImuSamples) -> ImuSamples:
+    """Return the stream averaged over `RATE_SPAN`: the rate that differentiates a measurement.
+
+    White noise in a derivative would pass for information on the time offset.
+    """
+    size = 2 * _reach(imu) + 1
+    gyro, accel = (
+        uniform_filter1d(stream, size, axis=0, mode="nearest")
+        for stream in (imu.gyro_body, imu.accel_body)
+    )
+    return ImuSamples(imu.time, gyro, accel)
+
+
+def low_passed_rate_at(imu: ImuSamples, time_offset: float, wanted: Array) -> Array:
+    """Return the rate of the stream of `low_passed` at some times, without the whole stream.
+
+    Parameters
+    ----------
+    time_offset : float
+        (s)
+    wanted : ndarray, shape (m,)
+        (s); outside the stream its end values are extended.
+
+    Returns
+    -------
+    ndarray, shape (m, 3)
+        (rad/s)
+    """
+    last, reach = len(imu) - 1, _reach(imu)
+    before = np.clip(np.searchsorted(imu.time, wanted - time_offset) - 1, 0, max(last - 1, 0))
+    after = np.minimum(before + 1, last)
+    ends = np.zeros((2, len(wanted), 3))
+    for k in range(-reach, reach + 1):
+        ends += imu.gyro_body[np.clip(np.stack([before, after]) + k, 0, last)]
+    span = np.maximum(imu.time[after] - imu.time[before], np.finfo(float).tiny)
+    share = np.clip((wanted - time_offset - imu.time[before]) / span, 0.0, 1.0)[:, None]
+    return np.asarray(((1.0 - share) * ends[0] + share * ends[1]) / (2 * reach + 1))
+
+
+def _reach(imu: ImuSamples) -> int:
+    usual = float(np.median(np.diff(imu.time)))
+    return int(0.5 * RATE_SPAN / usual)
+
+
+def motion_at(
+    states: Trajectory, imu: ImuSamples, time_offset: float, gravity: float, wanted: Array
+) -> Trajectory:
+    """Return the motion at any times: the IMU's shape between the states, through the states.
+
+    Parameters
+    ----------
+    states : Trajectory
+        With velocity and biases, at the field epochs.
+    time_offset : float
+        (s)
+    gravity : float
+        (m/s^2)
+    wanted : ndarray, shape (m,)
+        Strictly increasing (s).
+
+    Returns
+    -------
+    Trajectory
+        Pose and velocity at ``wanted``.  The IMU is integrated once over the log; what it then
+        lacks at the states is spread over the intervals, smoothly.
+    """
+    if states.velocity_world is None or states.gyro_bias_body is None:
+        raise ValueError("states must have velocity and biases")
+    assert states.accel_bias_body is not None
+    time = imu.time + time_offset
+    gyro = imu.gyro_body - _interpolated(time, states.time, states.gyro_bias_body)
+    accel = imu.accel_body - _interpolated(time, states.time, states.accel_bias_body)
+    chain = attitude_from_gyro(time, gyro)
+    at_states = attitude_at(chain, time, gyro, states.time)
+    world_from_start = Rotation.from_matrix(states.world_from_body) * at_states.inv()
+    turned = _turn_at(states.time, world_from_start, time) * chain
+    world_accel = turned.apply(accel) - [0.0, 0.0, gravity]
+    step = np.diff(time)[:, None]
+    gained = np.cumsum(0.5 * (world_accel[:-1] + world_accel[1:]) * step, axis=0)
+    velocity = np.concatenate([np.zeros((1, 3)), gained])
+    # Exact for an acceleration that is linear between samples.
+    inner = (2.0 * world_accel[:-1] + world_accel[1:]) * step**2 / 6.0
+    moved = np.cumsum(velocity[:-1] * step + inner, axis=0)
+    position = np.concatenate([np.zeros((1, 3)), moved])
+    path = CubicHermiteSpline(time, position, velocity)
+    lack = CubicHermiteSpline(
+        states.time,
+        states.position_world - path(states.time),
+        states.velocity_world - path.derivative()(states.time),
+    )
+    attitude = _turn_at(states.time, world_from_start, wanted) * attitude_at(
+        chain, time, gyro, wanted
+    )
+    inside = np.clip(wanted, states.time[0], states.time[-1])
+    beyond = (wanted - inside)[:, None]
+    return Trajectory(
+        time=wanted,
+        world_from_body=attitude.as_matrix(),
+        position_world=path(wanted) + lack(inside) + lack.derivative()(inside) * beyond,
+        velocity_world=path.derivative()(wanted) + lack.derivative()(inside),
+    )
+
+
+def _interpolated(time: Array, known: Array, values: Array) -> Array:
+    return np.stack([np.interp(time, known, axis) for axis in values.T], axis=1)
+
+
+def _turn_at(known: Array, rotations: Rotation, wanted: Array) -> Rotation:
+    """Interpolate slowly varying rotations, holding the ends."""
+    if len(known) == 1:
+        return Rotation.concatenate([rotations] * len(wanted))
+    return Slerp(known, rotations)(np.clip(wanted, known[0], known[-1]))

@@ -1,0 +1,65 @@
+"""What of a calibration does not stay as it is, and how fast it may go."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.model.parameters import Block, Calibration
+from magfusion.model.site import Site
+from magfusion.units import Array
+
+HOUR = 3600.0  # s
+
+
+@dataclass(frozen=True, eq=False)
+class ProcessNoise:
+    """Random walk of a calibration.
+
+    Parameters
+    ----------
+    variance : ndarray, shape (dimension,)
+        Gained in a second.
+    """
+
+    blocks: tuple[Block, ...]
+    variance: Array
+
+    def cov(self, calibration: Calibration, time: float, elapsed: float) -> Array:
+        """Return the covariance gained in a while, shape (dimension, dimension).
+
+        Parameters
+        ----------
+        time : float
+            At its end (s).
+        elapsed : float
+            (s)
+        """
+        gained = np.diag(self.variance * elapsed)
+        columns = {block.key: block.columns for block in self.blocks}
+        for block in self.blocks:
+            dragged = block.parameter.drags(calibration, block.owner, time)
+            if dragged is None or (dragged[0], block.owner) not in columns:
+                continue
+            rows, own, by_step = columns[dragged[0], block.owner], block.columns, dragged[1]
+            gained[rows, rows] += by_step @ gained[own, own] @ by_step.T
+            gained[rows, own] = by_step @ gained[own, own]
+            gained[own, rows] = gained[rows, own].T
+        return gained
+
+
+def calibration_process_noise(
+    site: Site, blocks: tuple[Block, ...], considered: int = 0
+) -> ProcessNoise:
+    """Return how a calibration walks; what is screwed down stays.
+
+    Parameters
+    ----------
+    considered : int
+        Parameters at the end that are only considered: they stay.
+    """
+    parts = [
+        np.full(len(b.sigma), b.parameter.walk_per_sqrt_hour(site) ** 2 / HOUR) for b in blocks
+    ]
+    variance = np.concatenate(parts) if parts else np.zeros(0)
+    variance[len(variance) - considered :] = 0.0
+    return ProcessNoise(blocks, variance)

@@ -1,0 +1,249 @@
+"""What an estimate leaves of errors in the residuals: drawn errors, given to its linear system."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from magfusion.estimation.graph import Estimate, Graph
+from magfusion.estimation.inertial import ROWS
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.solve.bordered import eliminate
+from magfusion.estimation.state import states_in
+from magfusion.model.field import model_error_cov
+from magfusion.model.noise import sensor_positions
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, BoolArray, IntArray
+
+WAVES = 64  # of a random model error
+FEWEST_CHANNELS = 3  # of an epoch; the pose of fewer explains too much
+LOOSE = 1e-9  # of what the fields know of a pose
+ORDINARY = 3.0  # of usual sigmas; an interval with larger ones has a gap
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelErrors:
+    """Whitened errors of one channel, in world axes, at the epochs that have it.
+
+    Parameters
+    ----------
+    epoch : int ndarray, shape (m,)
+        Rows of the samples.
+    seen : ndarray, shape (m, 6)
+        Residuals.
+    left : tuple of ndarray, shape (m, 6)
+        What is left of drawn noise, of a drawn model error, and of drawn inertial noise.
+    variance : tuple of ndarray, shape (m,)
+        Of noise and of model error of size one: the sum over the components.
+    size : tuple of float
+        Of noise and model error, with which they were drawn.
+    """
+
+    epoch: IntArray
+    seen: Array
+    left: tuple[Array, Array, Array]
+    variance: tuple[Array, Array]
+    size: tuple[float, float]
+
+
+class Leavings:
+    """The linear system of a solved graph, and what it leaves of errors.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        As they were measured in the graph.
+    poses : Trajectory
+        At the samples.
+    windows : float
+        How many windows hold each sample.
+    """
+
+    ordinary: BoolArray  # inertial intervals without a gap
+
+    def __init__(
+        self,
+        graph: Graph,
+        estimate: Estimate,
+        samples: FieldSamples,
+        poses: Trajectory,
+        windows: float,
+    ) -> None:
+        self._graph, self._samples = graph, samples
+        self._measured = next(m for m in graph.measurements if isinstance(m, FieldPhasors))
+        site = estimate.calibration.site
+        self._linear = graph.linearized(estimate)
+        self._factors = _jacobians(self._linear)
+        self._inertial_system()
+        error = graph.residual(self._measured, estimate)
+        weight = np.ones(error.shape[:2])
+        if self._measured.loss is not None:
+            weight, _ = self._measured.loss.weighed(np.sum(error**2, axis=2), 6)
+        self._weight = np.sqrt(weight)[..., None]
+        self._world_from_sensor = np.asarray(
+            poses.world_from_body @ site.platform.magnetometer.body_from_sensor
+        )
+        self._owner = np.array([i for i, b in enumerate(site.beacons) for _ in b.tones])
+        self._size = _sizes(site)
+        self._error = error
+        rows = self._measured.linearize(
+            states_in(estimate.values).rows(self._measured.epoch), estimate.calibration, ()
+        )
+        assert rows.by_pose is not None
+        self._by_pose = rows.by_pose.reshape(len(error), -1, 6)
+        self._inertial_error = self._rows_of([-f.getb() for f in self._inertial])
+        self._draw(site, sensor_positions(site, poses), windows)
+
+    def _inertial_system(self) -> None:
+        graph, end = self._graph, self._graph.native.size()
+        first = end - graph.epochs + 1
+        self._inertial = self._factors[first:end]
+        roots = [_root(graph.native.at(i)) for i in range(first, end)]
+        self._unwhitening = np.linalg.inv(np.array(roots).reshape(-1, ROWS, ROWS))
+        self.sigma = np.sqrt(np.sum(self._unwhitening**2, axis=2))
+        self.ordinary = np.all(self.sigma < ORDINARY * np.median(self.sigma, axis=0), axis=1)
+        self._fields, begin = [], end
+        for factors in graph.factors:
+            end = begin + len(factors.measurement.epoch)
+            if isinstance(factors.measurement, FieldPhasors):
+                self._fields += self._factors[begin:end]
+            begin = end
+
+    def _draw(self, site: Site, sensor_world: Array, windows: float) -> None:
+        rng = np.random.default_rng(0)  # the same log, the same result
+        samples, root = self._samples, self._measured.sqrt_information[..., :3, :3]
+        unit = model_error_cov(np.nan_to_num(samples.phasor_sensor), 1.0)
+        self._variance = [_spread(root, c) for c in (samples.phasor_cov, unit)]
+        noise, model = np.array(self._size)[:, self._owner]
+        drawn = noise[:, None] * _draw_noise(rng, samples, windows, root)
+        length = max(site.model_error_length, 1e-3)
+        world = _waves(rng, sensor_world / length, samples.valid.shape)
+        sensor = np.einsum("nji,ncpj->ncpi", self._world_from_sensor, world)
+        size = np.sqrt(np.trace(unit, axis1=2, axis2=3) / 3.0)[..., None, None]
+        false = model[:, None] * _six(np.einsum("ncij,ncpj->ncpi", root, size * sensor))
+        imu = rng.standard_normal((len(self._inertial), ROWS))
+        nothing, still = np.zeros_like(drawn), np.zeros_like(imu)
+        self._left = [self._of(*e) for e in ((drawn, still), (false, still), (nothing, imu))]
+        every = (self._error, *(field for field, _ in self._left))
+        self._apart = [self._without_pose(field) for field in every]
+
+    def _of(self, field: Array, inertial: Array) -> tuple[Array, Array]:
+        """Return what the estimate leaves of errors of fields and inertial factors."""
+        for factor in self._factors:
+            factor.getb()[...] = 0.0
+        for factor, own in zip(self._fields, self._weight * field, strict=True):
+            factor.getb()[: own.size] = own.ravel()
+        for factor, own in zip(self._inertial, inertial, strict=True):
+            factor.getb()[: own.size] = own
+        step = eliminate(self._linear, self._graph.ordering).optimize()
+        components = self._error[0].size
+        rows = [factor.error_vector(step)[:components] for factor in self._fields]
+        kept = np.array(rows).reshape(self._error.shape) / self._weight
+        return kept, self._rows_of([factor.error_vector(step) for factor in self._inertial])
+
+    def _rows_of(self, errors: list[Array]) -> Array:
+        """Return inertial errors in their units, shape (intervals, 15)."""
+        whitened = np.array([error[:ROWS] for error in errors]).reshape(-1, ROWS)
+        return np.asarray((self._unwhitening @ whitened[..., None])[..., 0])
+
+    def _without_pose(self, field: Array) -> Array:
+        """Return errors without what any other pose of their own epoch would explain.
+
+        What inertial errors leave in the fields is that of a pose, and must not pass for noise.
+        """
+        weight = np.repeat(self._weight[..., 0] ** 2, 6, axis=1)
+        several = np.sum(self._samples.valid, axis=1) >= FEWEST_CHANNELS
+        by, error = self._by_pose, field.reshape(len(field), -1)
+        normal = np.einsum("nri,nr,nrj->nij", by, weight, by)
+        scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), np.finfo(float).tiny))
+        normal = normal / scale[:, None] / scale[..., None] + LOOSE * np.eye(6)
+        right = np.einsum("nri,nr,nr->ni", by, weight, error) / scale
+        step = np.linalg.solve(normal, right[..., None])[..., 0] / scale
+        moved = error - np.einsum("nri,ni->nr", by, step)
+        return np.where(several[:, None], moved, error).reshape(field.shape)
+
+    def channels_of(self, beacon: int) -> list[ChannelErrors]:
+        """Return the errors of the channels of a beacon, given by its number."""
+        out = []
+        for channel in np.flatnonzero(self._owner == beacon).tolist():
+            rows = np.flatnonzero(self._samples.valid[:, channel])
+            turn = self._world_from_sensor[rows]
+            seen, noise, model, inertial = (
+                np.einsum("nij,npj->npi", turn, e[rows, channel].reshape(-1, 2, 3)).reshape(-1, 6)
+                for e in self._apart
+            )
+            by_noise, by_model = (v[rows, channel] for v in self._variance)
+            size = (float(self._size[0][beacon]), float(self._size[1][beacon]))
+            out.append(
+                ChannelErrors(rows, seen, (noise, model, inertial), (by_noise, by_model), size)
+            )
+        return out
+
+    def inertial(self) -> list[Array]:
+        """Return inertial residuals, and what is left there of noise, model error and IMU's own.
+
+        Each of shape (intervals, 15): rotation, position, velocity, biases.
+        """
+        return [self._inertial_error, *(inertial for _, inertial in self._left)]
+
+
+def _jacobians(linear: gtsam.GaussianFactorGraph) -> list[gtsam.JacobianFactor]:
+    out = []
+    for i in range(linear.size()):
+        factor = linear.at(i)
+        assert isinstance(factor, gtsam.JacobianFactor)
+        out.append(factor)
+    return out
+
+
+def _root(factor: gtsam.NonlinearFactor) -> Array:
+    assert isinstance(factor, gtsam.NoiseModelFactor)
+    noise = factor.noiseModel()
+    assert isinstance(noise, gtsam.noiseModel.Gaussian)
+    return np.asarray(noise.R())
+
+
+def _sizes(site: Site) -> tuple[list[float], list[float]]:
+    """Return noise factor and model error of each beacon."""
+    errors = [site.model_error if b.model_error is None else b.model_error for b in site.beacons]
+    return [b.noise_factor for b in site.beacons], errors
+
+
+def _spread(root: Array, cov: Array) -> Array:
+    """Return the variance of the whitened parts of phasors, summed, shape (n, channels)."""
+    return np.asarray(2.0 * np.einsum("ncij,ncjk,ncik->nc", root, np.nan_to_num(cov), root))
+
+
+def _draw_noise(
+    rng: np.random.Generator, samples: FieldSamples, windows: float, root: Array
+) -> Array:
+    """Return whitened noise, shape (n, channels, 6), that windows which overlap share."""
+    shared, (count, channels) = max(1, round(windows)), samples.valid.shape
+    cells = rng.standard_normal((count + shared - 1, channels, 2, 3)) / np.sqrt(shared)
+    drawn = np.sum([cells[k : k + count] for k in range(shared)], axis=0)
+    safe = np.where(samples.valid[..., None, None], samples.phasor_cov, np.eye(3))
+    scale = np.sqrt(np.trace(safe, axis1=2, axis2=3) / 3.0)[..., None, None]
+    spread = root @ (scale * np.linalg.cholesky(safe / scale**2))
+    return _six(np.einsum("ncij,ncpj->ncpi", spread, drawn))
+
+
+def _waves(rng: np.random.Generator, place: Array, shape: tuple[int, ...]) -> Array:
+    """Return random fields of correlation exp(-distance), shape (n, channels, 2, 3).
+
+    By waves of random vectors (random Fourier features), which are Cauchy's for that correlation.
+
+    Parameters
+    ----------
+    place : ndarray, shape (n, 3)
+    """
+    wave = rng.standard_normal((WAVES, 3)) / np.abs(rng.standard_normal((WAVES, 1)))
+    amplitude = rng.standard_normal((2, WAVES, shape[1] * 6)) / np.sqrt(WAVES)
+    angle = place @ wave.T
+    field = np.cos(angle) @ amplitude[0] + np.sin(angle) @ amplitude[1]
+    return np.asarray(field).reshape(*shape, 2, 3)
+
+
+def _six(parts: Array) -> Array:
+    return parts.reshape(*parts.shape[:2], 6)

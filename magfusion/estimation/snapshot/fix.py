@@ -1,0 +1,87 @@
+"""What a fix is: for each epoch the poses that explain it, best first; and what may help it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, BoolArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Gravity:
+    """Direction of the specific force, where the platform is at rest or nearly so.
+
+    Parameters
+    ----------
+    up_body : ndarray, shape (n, 3)
+        Unit vectors.
+    sigma : ndarray, shape (n,)
+        (rad); infinite where it says nothing.
+    """
+
+    up_body: Array
+    sigma: Array
+
+    def rows(self, chosen: IntArray | BoolArray | slice) -> "Gravity":
+        """Return it at some epochs, or at epochs repeated."""
+        return Gravity(self.up_body[chosen], self.sigma[chosen])
+
+
+@dataclass(frozen=True, eq=False)
+class Fixes:
+    """Hypotheses of the pose at each epoch in order of their posterior.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    world_from_body : ndarray, shape (n, hypotheses, 3, 3)
+    position_world : ndarray, shape (n, hypotheses, 3)
+        (m)
+    pose_cov : ndarray, shape (n, hypotheses, 6, 6)
+        Rotation, then position; body axes (rad, m).
+    cost : ndarray, shape (n, hypotheses)
+        Squared residual in units of its sigma, plus that of the prior; infinite where a row has
+        fewer hypotheses.
+    residual_rms : ndarray, shape (n, hypotheses)
+        Root mean square of the whitened residual; about one where noise and model are as declared.
+    phase : ndarray, shape (n, hypotheses, channels)
+        Drive phase (rad); zero where it was not sought.
+    determined : bool ndarray, shape (n, hypotheses)
+        False where the epoch leaves a direction of the pose open.
+    log_gain : ndarray, shape (n, hypotheses, channels)
+        Logarithm of each channel's gain; zero where it was not sought.
+    gravity_cost, prior_cost : ndarray, shape (n, hypotheses)
+        What gravity and the prior pose have of the cost; zero where nothing is known of them.
+    """
+
+    time: Array
+    world_from_body: Array
+    position_world: Array
+    pose_cov: Array
+    cost: Array
+    residual_rms: Array
+    phase: Array
+    determined: BoolArray
+    log_gain: Array
+    gravity_cost: Array
+    prior_cost: Array
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def probability(self) -> Array:
+        """Posterior share of each hypothesis, shape (n, hypotheses)."""
+        relative = np.exp(-0.5 * (self.cost - self.cost[:, :1]))
+        return relative / np.sum(relative, axis=1, keepdims=True)
+
+    def best(self) -> Trajectory:
+        """Return the first hypothesis of every epoch."""
+        return Trajectory(
+            time=self.time,
+            world_from_body=self.world_from_body[:, 0],
+            position_world=self.position_world[:, 0],
+            pose_cov=self.pose_cov[:, 0],
+        )

@@ -1,0 +1,145 @@
+"""Maximum-likelihood fix of one epoch: pose with covariance, every hypothesis that survives.
+
+Started without a prior guess from `candidates`, refined on the one measurement model by `refine`,
+all epochs and hypotheses at once.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.snapshot.candidates import attitudes, positions
+from magfusion.estimation.snapshot.fix import Fixes, Gravity
+from magfusion.estimation.snapshot.problem import GAIN_SIGMA, Epochs, Problem, State, epochs_of
+from magfusion.estimation.snapshot.refine import Solved, as_fixes, cost, joined, solved_from
+from magfusion.model.parameters import Calibration
+from magfusion.model.samples import FieldSamples
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, BoolArray, IntArray
+
+CANDIDATES = 10  # positions that get an attitude
+REFINED = 6  # of these, how many are refined
+HYPOTHESES = 4  # of these, how many are returned
+SAME_POSITION = 0.02  # m; two solutions closer than this and SAME_ROTATION are one
+SAME_ROTATION = 0.02  # rad
+
+
+def fix_epochs(
+    samples: FieldSamples,
+    calibration: Calibration,
+    *,
+    gravity: Gravity | None = None,
+    prior: Trajectory | None = None,
+    survey_error: bool = True,
+    free: tuple[str, ...] = (),
+    gain_sigma: float = GAIN_SIGMA,
+) -> Fixes:
+    """Fix the pose at every epoch, without a guess.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        Channels in the site's order.
+    prior : Trajectory, optional
+        With ``pose_cov``, at the same times: one more candidate, and a term of the posterior.
+    survey_error : bool
+        Weigh by the site's calibration sigmas too.
+    free : tuple of str
+        What is found beside the pose: ``phase``, the drive phase of synchronised beacons too;
+        ``gain``, one of each beacon.
+    gain_sigma : float
+        Prior of the logarithm of a gain.
+
+    Raises
+    ------
+    EstimationError
+        Where there is no epoch.
+    """
+    parts = epochs_of(
+        samples,
+        calibration,
+        gravity=gravity,
+        prior=prior,
+        survey_error=survey_error,
+        free=free,
+        gain_sigma=gain_sigma,
+    )
+    return joined([_solve(epochs) for epochs in parts])
+
+
+def _solve(epochs: Epochs) -> Fixes:
+    problem = epochs.problem
+    start, count = _starts(problem)
+    epoch = np.repeat(np.arange(len(problem.time)), count)
+    solved = solved_from(problem.rows(epoch), start)
+    best = np.argmin(solved.cost.reshape(-1, count), axis=1) + count * np.arange(len(problem.time))
+    again = epochs.reweighed(solved.state.rotation[best], solved.state.position[best])
+    if again is not None:
+        problem, solved = again, solved_from(again.rows(epoch), solved.state)
+    order, ranked = _ranked(
+        solved.state.rotation.reshape(-1, count, 3, 3),
+        solved.state.position.reshape(-1, count, 3),
+        solved.cost.reshape(-1, count),
+    )
+    kept = (order + count * np.arange(len(order))[:, None]).ravel()
+    found = Solved(solved.state.rows(kept), solved.cost[kept], solved.information[kept])
+    return replace(as_fixes(problem.rows(epoch[kept]), found, order.shape[1]), cost=ranked)
+
+
+def _starts(problem: Problem) -> tuple[State, int]:
+    """Return the most likely candidates, so many rows an epoch."""
+    site = problem.calibration.site
+    sensor = site.platform.magnetometer
+    raw = problem.measured[..., :3] + 1j * problem.measured[..., 3:]
+    raw = raw * np.exp(-problem.calibration.log_gain)[..., None]
+    phasor = raw @ np.linalg.inv(sensor.matrix).T
+    weight = np.sum(problem.sqrt_information**2, axis=(-1, -2)) / 3.0
+    beacons = {b.name: b.synchronised for b in site.beacons}
+    free = np.array([not beacons[name] for name, _ in site.channels])
+    up = up_weight = None
+    if problem.gravity is not None:
+        up = problem.gravity.up_body @ sensor.body_from_sensor
+        up_weight = 1.0 / problem.gravity.sigma**2
+    spots = positions(problem.calibration, phasor, weight, CANDIDATES)
+    world_from_sensor, phase = attitudes(
+        problem.calibration, spots, phasor, weight, free, up, up_weight
+    )
+    rotation = world_from_sensor @ sensor.body_from_sensor.T
+    position = spots - rotation @ sensor.position_body
+    phase = phase - problem.calibration.drive_phase(problem.time)[:, None] * free
+    if problem.prior is not None:
+        rotation = np.concatenate([problem.prior.rotation[:, None], rotation], axis=1)
+        position = np.concatenate([problem.prior.position[:, None], position], axis=1)
+        phase = np.concatenate([phase[:, :1], phase], axis=1)
+    n, count = rotation.shape[:2]
+    epoch = np.repeat(np.arange(n), count)
+    every = problem.start(
+        rotation.reshape(-1, 3, 3), position.reshape(-1, 3), phase.reshape(n * count, -1)
+    )
+    order = np.argsort(cost(problem.rows(epoch), every).reshape(n, count), axis=1)[:, :REFINED]
+    best = (order + count * np.arange(n)[:, None]).ravel()
+    return every.rows(best), order.shape[1]
+
+
+def _ranked(rotation: Array, position: Array, cost: Array) -> tuple[IntArray, Array]:
+    """Return the hypotheses to keep, best first, and their cost, infinite where one repeats."""
+    order = np.argsort(cost, axis=1)
+    rotation = np.take_along_axis(rotation, order[..., None, None], axis=1)
+    position = np.take_along_axis(position, order[..., None], axis=1)
+    cost = np.take_along_axis(cost, order, axis=1)
+    cost = np.where(_repeated(rotation, position), np.inf, cost)
+    again = np.argsort(cost, axis=1, kind="stable")[:, :HYPOTHESES]
+    return np.take_along_axis(order, again, axis=1), np.take_along_axis(cost, again, axis=1)
+
+
+def _repeated(rotation: Array, position: Array) -> BoolArray:
+    """Which hypotheses, sorted by cost, repeat an earlier one."""
+    repeated = np.zeros(rotation.shape[:2], dtype=bool)
+    for j in range(1, rotation.shape[1]):
+        for i in range(j):
+            near = np.linalg.norm(position[:, i] - position[:, j], axis=1) < SAME_POSITION
+            turn = np.swapaxes(rotation[:, i], 1, 2) @ rotation[:, j]
+            angle = Rotation.from_matrix(turn).magnitude()
+            repeated[:, j] |= near & (angle < SAME_ROTATION)
+    return repeated

@@ -1,0 +1,218 @@
+"""What a fix is sought from: the phasors of many epochs, weighed, and what else is known."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.errors import EstimationError
+from magfusion.estimation.snapshot.fix import Gravity
+from magfusion.model.noise import measurement_cov, stacked, whitening
+from magfusion.model.parameters import GAIN, PHASE, Block, Calibration, placed
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, BoolArray, IntArray
+
+FREE = ("phase", "gain")  # what may be found beside the pose, whatever the site says of it
+GAIN_SIGMA = 0.2  # of a log-gain; smooth errors of real installations (paper 004, Table 1)
+CHUNK = 1000  # epochs solved at once: they fit into the cache
+Chosen = IntArray | BoolArray | slice
+
+
+class Prior(NamedTuple):
+    """Where the body is thought to be."""
+
+    rotation: Array  # (m, 3, 3) world_from_body
+    position: Array  # (m, 3)
+    sqrt_information: Array | None  # (m, 6, 6) whitening; None where it is a candidate and no more
+
+    def rows(self, chosen: Chosen) -> "Prior":
+        """Return some rows, or rows repeated."""
+        sqrt_information = None if self.sqrt_information is None else self.sqrt_information[chosen]
+        return Prior(self.rotation[chosen], self.position[chosen], sqrt_information)
+
+
+def _prior(prior: Trajectory) -> Prior:
+    cov = prior.pose_cov
+    sqrt_information = None if cov is None else np.linalg.inv(np.linalg.cholesky(cov))
+    return Prior(prior.world_from_body, prior.position_world, sqrt_information)
+
+
+class State(NamedTuple):
+    """What is found in each row."""
+
+    rotation: Array  # (m, 3, 3) world_from_body
+    position: Array  # (m, 3)
+    phase: Array  # (m, channels), beyond the calibration's
+    log_gain: Array  # (m, channels), beyond the calibration's
+
+    def rows(self, chosen: IntArray | BoolArray) -> "State":
+        """Return some rows."""
+        return State(*(part[chosen] for part in self))
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Phasors with their weights, and what else is known; a row for each pose sought.
+
+    Parameters
+    ----------
+    time : ndarray, shape (m,)
+    measured : ndarray, shape (m, channels, 6)
+        Real parts, then imaginary parts (T).
+    sqrt_information : ndarray, shape (m, channels, 3, 3)
+        Whitening (1/T); zero where a channel is missing.
+    noise : ndarray, shape (m, channels, 3, 3), optional
+        Covariance of the whitened noise, where the whitening covers more than noise.
+    blocks : tuple of Block
+        Nuisances found beside the pose.
+    prior : optional
+        Poses with their whitening.
+    """
+
+    calibration: Calibration
+    time: Array
+    measured: Array
+    sqrt_information: Array
+    noise: Array | None
+    blocks: tuple[Block, ...]
+    gravity: Gravity | None
+    prior: Prior | None
+
+    def rows(self, chosen: Chosen) -> "Problem":
+        """Return some rows, or rows repeated."""
+        return replace(
+            self,
+            time=self.time[chosen],
+            measured=self.measured[chosen],
+            sqrt_information=self.sqrt_information[chosen],
+            noise=None if self.noise is None else self.noise[chosen],
+            gravity=None if self.gravity is None else self.gravity.rows(chosen),
+            prior=None if self.prior is None else self.prior.rows(chosen),
+        )
+
+    @property
+    def residuals(self) -> int:
+        """Number of residuals of each row."""
+        gains = sum(block.parameter == GAIN for block in self.blocks)
+        informed = self.prior is not None and self.prior.sqrt_information is not None
+        return (
+            6 * int(self.sqrt_information.shape[1])
+            + 3 * (self.gravity is not None)
+            + 6 * informed
+            + gains
+        )
+
+    def start(self, rotation: Array, position: Array, phase: Array | None = None) -> State:
+        """Return the state at given poses."""
+        none = np.zeros((len(position), self.sqrt_information.shape[1]))
+        return State(rotation, position, none if phase is None else phase, none)
+
+    def at(self, state: State) -> Calibration:
+        """Return the calibration with each row's own phases and gains."""
+        known = self.calibration
+        return replace(
+            known, phase=known.phase + state.phase, log_gain=known.log_gain + state.log_gain
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Epochs:
+    """A row for each epoch, and what its weights come from."""
+
+    problem: Problem
+    samples: FieldSamples
+    survey_error: bool
+
+    def reweighed(self, rotation: Array, position: Array) -> Problem | None:
+        """Return the problem as weighed at poses (n, ...); None where these make no difference.
+
+        A field map is not equally well known everywhere.
+        """
+        site = self.problem.calibration.site
+        if all(beacon.field_map is None for beacon in site.beacons):
+            return None
+        sensor_world = position + rotation @ site.platform.magnetometer.position_body
+        sqrt_information, noise = _weights(site, self.samples, self.survey_error, sensor_world)
+        return replace(self.problem, sqrt_information=sqrt_information, noise=noise)
+
+
+def nuisance_blocks(site: Site, gain_sigma: float | None = None) -> tuple[Block, ...]:
+    """Return the columns of what is found beside the pose.
+
+    Parameters
+    ----------
+    site : Site
+        The drive phases of its beacons that are not synchronised come first.
+    gain_sigma : float, optional
+        Prior of a log-gain of each beacon; None where gains are known.
+    """
+    blocks = [
+        Block(PHASE, beacon.name, slice(0), np.full(len(beacon.tones), np.inf))
+        for beacon in site.beacons
+        if not beacon.synchronised
+    ]
+    if gain_sigma is not None:
+        sigma = np.array([gain_sigma])
+        blocks += [Block(GAIN, beacon.name, slice(0), sigma) for beacon in site.beacons]
+    return placed(blocks)
+
+
+def epochs_of(
+    samples: FieldSamples,
+    calibration: Calibration,
+    *,
+    gravity: Gravity | None,
+    prior: Trajectory | None,
+    survey_error: bool,
+    free: tuple[str, ...],
+    gain_sigma: float,
+) -> Iterator[Epochs]:
+    """Yield the epochs of a log in chunks, weighed.
+
+    Raises
+    ------
+    EstimationError
+        Where there is no epoch.
+    """
+    if len(samples) == 0:
+        raise EstimationError("no epoch to fix: every window was dropped")
+    if not set(free) <= set(FREE):
+        raise ValueError(f"free must be among {FREE}; got {sorted(set(free) - set(FREE))}")
+    if "phase" in free:
+        site = calibration.site
+        loose = tuple(replace(b, synchronised=False) for b in site.beacons)
+        calibration = replace(calibration, site=replace(site, beacons=loose))
+    blocks = nuisance_blocks(calibration.site, gain_sigma if "gain" in free else None)
+    known = None if prior is None else _prior(prior)
+    for start in range(0, len(samples), CHUNK):
+        rows = slice(start, start + CHUNK)
+        some = samples.rows(rows)
+        sqrt_information, noise = _weights(calibration.site, some, survey_error, None)
+        problem = Problem(
+            calibration=calibration,
+            time=some.time,
+            measured=stacked(some.phasor_sensor),
+            sqrt_information=sqrt_information,
+            noise=noise,
+            blocks=blocks,
+            gravity=None if gravity is None else gravity.rows(rows),
+            prior=None if known is None else known.rows(rows),
+        )
+        yield Epochs(problem, some, survey_error)
+
+
+def _weights(
+    site: Site, samples: FieldSamples, survey_error: bool, sensor_world: Array | None
+) -> tuple[Array, Array | None]:
+    """Return the whitening, and the covariance of the whitened noise where the two differ."""
+    valid = samples.valid
+    known = measurement_cov(site, samples, sensor_world=sensor_world)
+    if not survey_error:
+        return whitening(known, valid), None
+    cov = measurement_cov(site, samples, survey_error=True, sensor_world=sensor_world)
+    sqrt_information = whitening(cov, valid)
+    noise = np.where(valid[..., None, None], known, 0.0)
+    return sqrt_information, sqrt_information @ noise @ np.swapaxes(sqrt_information, -1, -2)

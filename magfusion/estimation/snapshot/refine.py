@@ -1,0 +1,312 @@
+"""Refinement of given poses on the one measurement model, all epochs and hypotheses at once."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.snapshot.fix import Fixes, Gravity
+from magfusion.estimation.snapshot.problem import GAIN_SIGMA, Problem, State, epochs_of
+from magfusion.estimation.snapshot.survey_error import honest_covariance, survey_jacobians, whitened
+from magfusion.estimation.solve.batched import Normal, minimise, open_inverse
+from magfusion.model.field import skew
+from magfusion.model.field_map import block_diagonal
+from magfusion.model.noise import stacked
+from magfusion.model.parameters import (
+    GAIN,
+    PHASE,
+    Calibration,
+    Parameter,
+    dimension,
+    linearize_channels,
+    predict_channels,
+)
+from magfusion.model.samples import FieldSamples
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, BoolArray, IntArray
+
+Columns = tuple[Array, Array]  # Jacobian (m, rows, 6 + nuisances) and residual (m, rows)
+
+
+class Solved(NamedTuple):
+    """Where the rows ended."""
+
+    state: State
+    cost: Array  # (m,)
+    information: Array  # (m, 6 + nuisances, 6 + nuisances)
+
+
+def refine(
+    samples: FieldSamples,
+    calibration: Calibration,
+    start: Trajectory,
+    *,
+    gravity: Gravity | None = None,
+    prior: Trajectory | None = None,
+    survey_error: bool = True,
+    free: tuple[str, ...] = (),
+    gain_sigma: float = GAIN_SIGMA,
+) -> Fixes:
+    """Refine the pose at every epoch from where it is thought to be.
+
+    It ends in the minimum next to the start; mirrored poses are not looked for.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        Channels in the site's order.
+    start : Trajectory
+        Poses at the same times.
+    gravity, prior, survey_error, free, gain_sigma
+        As in `magfusion.estimation.snapshot.likelihood.fix_epochs`.
+
+    Returns
+    -------
+    Fixes
+        With one hypothesis.
+
+    Raises
+    ------
+    EstimationError
+        Where there is no epoch.
+    """
+    parts, first = [], 0
+    for epochs in epochs_of(
+        samples,
+        calibration,
+        gravity=gravity,
+        prior=prior,
+        survey_error=survey_error,
+        free=free,
+        gain_sigma=gain_sigma,
+    ):
+        problem, rows = epochs.problem, slice(first, first + len(epochs.samples))
+        first = rows.stop
+        at = problem.start(start.world_from_body[rows], start.position_world[rows])
+        solved = solved_from(problem, at)
+        again = epochs.reweighed(solved.state.rotation, solved.state.position)
+        if again is not None:
+            problem, solved = again, solved_from(again, solved.state)
+        parts.append(as_fixes(problem, solved, 1))
+    return joined(parts)
+
+
+def joined(parts: list[Fixes]) -> Fixes:
+    """Return the fixes of chunks as one."""
+    return Fixes(
+        *(np.concatenate([getattr(p, f) for p in parts]) for f in Fixes.__dataclass_fields__)
+    )
+
+
+def as_fixes(problem: Problem, solved: Solved, count: int) -> Fixes:
+    """Return rows as fixes of so many hypotheses each, in the order in which they are.
+
+    Parameters
+    ----------
+    problem : Problem
+        Every epoch repeated for each of its hypotheses.
+    """
+    state = solved.state
+    pose_cov, determined = posterior(problem, solved)
+
+    def split(rows: Array) -> Array:
+        return rows.reshape(-1, count, *rows.shape[1:])
+
+    return Fixes(
+        time=problem.time[::count],
+        world_from_body=split(state.rotation),
+        position_world=split(state.position),
+        pose_cov=split(pose_cov),
+        cost=split(solved.cost),
+        residual_rms=split(np.sqrt(solved.cost / problem.residuals)),
+        phase=split(state.phase),
+        determined=determined.reshape(-1, count),
+        log_gain=split(state.log_gain),
+        gravity_cost=split(_cost_of(_gravity(problem, state), problem)),
+        prior_cost=split(_cost_of(_prior_pose(problem, state), problem)),
+    )
+
+
+def _cost_of(known: Columns | None, problem: Problem) -> Array:
+    return np.zeros(len(problem.time)) if known is None else np.sum(known[1] ** 2, axis=1)
+
+
+def cost(problem: Problem, state: State) -> Array:
+    """Return the squared residual of each row, shape (m,), in units of its sigma."""
+    phasor = predict_channels(problem.at(state), problem.time, state.rotation, state.position)
+    error = whitened(problem.sqrt_information, (stacked(phasor) - problem.measured)[..., None])
+    total = np.einsum("mij,mij->m", error, error)
+    for _, known in _known(problem, state):
+        total += np.einsum("mi,mi->m", known, known)
+    return total
+
+
+def _gravity(problem: Problem, state: State) -> Columns | None:
+    if problem.gravity is None:
+        return None
+    up, share = state.rotation[:, 2], 1.0 / problem.gravity.sigma
+    block = np.zeros((len(up), 3, 6 + dimension(problem.blocks)))
+    block[:, :, :3] = share[:, None, None] * skew(up)
+    return block, share[:, None] * (up - problem.gravity.up_body)
+
+
+def _prior_pose(problem: Problem, state: State) -> Columns | None:
+    prior = problem.prior
+    if prior is None or prior.sqrt_information is None:
+        return None
+    step = _pose_difference(prior.rotation, prior.position, state.rotation, state.position)
+    block = np.zeros((len(step), 6, 6 + dimension(problem.blocks)))
+    block[:, :, :6] = prior.sqrt_information
+    return block, (prior.sqrt_information @ step[..., None])[..., 0]
+
+
+def _known(problem: Problem, state: State) -> Iterator[Columns]:
+    """Yield Jacobian and residual of what is no field."""
+    for known in (_gravity(problem, state), _prior_pose(problem, state)):
+        if known is not None:
+            yield known
+    m, width = len(problem.time), 6 + dimension(problem.blocks)
+    names = [name for name, _ in problem.calibration.site.channels]
+    for gain in problem.blocks:
+        if gain.parameter == GAIN:
+            block = np.zeros((m, 1, width))
+            block[:, 0, 6 + gain.columns.start] = 1.0 / gain.sigma[0]
+            yield block, state.log_gain[:, [names.index(gain.owner)]] / gain.sigma[0]
+
+
+def _pose_difference(rotation0: Array, position0: Array, rotation: Array, position: Array) -> Array:
+    """Perturbation from the first pose to the second, small-angle in its translation."""
+    inverse = np.swapaxes(rotation0, -1, -2)
+    turn = Rotation.from_matrix(inverse @ rotation).as_rotvec()
+    shift = (inverse @ (position - position0)[..., None])[..., 0]
+    return np.concatenate([turn, shift], axis=-1)
+
+
+def _columns(problem: Problem, state: State) -> Array:
+    """Return the whitened rows of the field: Jacobian, then residual as the last column."""
+    value, by_pose, by_nuisance = linearize_channels(
+        problem.at(state), problem.blocks, problem.time, state.rotation, state.position
+    )
+    error = (value - problem.measured)[..., None]
+    return whitened(
+        problem.sqrt_information, np.concatenate([by_pose, by_nuisance, error], axis=-1)
+    )
+
+
+def _normal(problem: Problem, state: State) -> Normal:
+    columns = _columns(problem, state)
+    normal = np.swapaxes(columns, 1, 2) @ columns
+    for block, known in _known(problem, state):
+        rows = np.concatenate([block, known[..., None]], axis=-1)
+        normal += np.swapaxes(rows, 1, 2) @ rows
+    return Normal(normal[:, -1, -1], normal[:, :-1, -1], normal[:, :-1, :-1])
+
+
+def rows_at(problem: Problem, state: State) -> tuple[Array, Array, Array | None]:
+    """Return every whitened row at a state, six of each channel first, then what is no field.
+
+    Returns
+    -------
+    jacobian : ndarray, shape (m, rows, 6 + nuisances)
+    error : ndarray, shape (m, rows)
+    covariance : ndarray, shape (m, rows, rows), optional
+        Of the error, the survey's in it, where the whitening only stands in for it.
+    """
+    parts = [_columns(problem, state)]
+    parts += [np.concatenate([by, e[..., None]], axis=-1) for by, e in _known(problem, state)]
+    columns = np.concatenate(parts, axis=1)
+    if problem.noise is None:
+        return columns[..., :-1], columns[..., -1], None
+    m, rows, of_field = len(columns), columns.shape[1], parts[0].shape[1]
+    _, by_survey = _survey(problem, state)
+    covariance = np.broadcast_to(np.eye(rows), (m, rows, rows)).copy()
+    noise = block_diagonal(np.repeat(problem.noise, 2, axis=1))
+    covariance[:, :of_field, :of_field] = noise + by_survey @ np.swapaxes(by_survey, 1, 2)
+    return columns[..., :-1], columns[..., -1], covariance
+
+
+def _spread(problem: Problem, kind: Parameter) -> Array:
+    """Return which channels a nuisance's column moves, shape (nuisances, channels)."""
+    names = np.array([name for name, _ in problem.calibration.site.channels])
+    out = np.zeros((dimension(problem.blocks), len(names)))
+    for block in problem.blocks:
+        if block.parameter == kind:
+            columns = np.arange(block.columns.start, block.columns.stop)
+            out[columns, np.flatnonzero(names == block.owner)] = 1.0
+    return out
+
+
+def solved_from(problem: Problem, start: State) -> Solved:
+    """Move every row to the minimum next to its start.
+
+    Parameters
+    ----------
+    start : State
+        Of the same rows.
+    """
+    spread = _spread(problem, PHASE), _spread(problem, GAIN)
+    count = start.phase.shape[1]
+    kept, narrowed = np.arange(len(problem.time)), problem
+
+    def model(rows: IntArray, flat: Array) -> Normal:
+        nonlocal kept, narrowed
+        if len(rows) < len(kept):  # rows only ever end
+            narrowed, kept = narrowed.rows(np.isin(kept, rows)), rows
+        return _normal(narrowed, _state(flat, count))
+
+    def moved(flat: Array, step: Array) -> Array:
+        return _flat(_moved(_state(flat, count), step, *spread))
+
+    found = minimise(model, _flat(start), moved, relative=1e-7, absolute=1e-4)
+    return Solved(_state(found.state, count), found.cost, found.information)
+
+
+def _flat(state: State) -> Array:
+    return np.concatenate([part.reshape(len(part), -1) for part in state], axis=1)
+
+
+def _state(flat: Array, channels: int) -> State:
+    rotation, position, phase, log_gain = np.split(flat, [9, 12, 12 + channels], axis=1)
+    return State(rotation.reshape(-1, 3, 3), position, phase, log_gain)
+
+
+def _moved(state: State, step: Array, by_phase: Array, by_gain: Array) -> State:
+    """Return the state moved by a step, shortened to a radian at most."""
+    angle = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
+    step = step * np.minimum(1.0, 1.0 / np.maximum(angle, 1e-12))
+    return State(
+        rotation=state.rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix(),
+        position=state.position + (state.rotation @ step[:, 3:6, None])[..., 0],
+        phase=state.phase + step[:, 6:] @ by_phase,
+        log_gain=state.log_gain + step[:, 6:] @ by_gain,
+    )
+
+
+def posterior(problem: Problem, solved: Solved) -> tuple[Array, BoolArray]:
+    """Return the covariance of each row's pose, (m, 6, 6), and whether it is determined."""
+    inverse, determined = open_inverse(solved.information)
+    if problem.noise is not None:
+        carried = _with_survey(problem, solved, inverse)
+        # Where a direction is open there is nothing for the survey to make worse.
+        inverse = np.where(determined[..., None, None], carried, inverse)
+    return inverse[..., :6, :6], determined
+
+
+def _with_survey(problem: Problem, solved: Solved, inverse: Array) -> Array:
+    """Covariance with the error of the survey carried through, rather than taken for noise."""
+    assert problem.noise is not None
+    by_found, by_survey = _survey(problem, solved.state)
+    noise = block_diagonal(np.repeat(problem.noise, 2, axis=1))
+    return honest_covariance(by_found, by_survey, noise, inverse, solved.information)
+
+
+def _survey(problem: Problem, state: State) -> tuple[Array, Array]:
+    return survey_jacobians(
+        problem.at(state),
+        problem.blocks,
+        problem.time,
+        state.rotation,
+        state.position,
+        problem.sqrt_information,
+    )

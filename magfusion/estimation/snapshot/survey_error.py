@@ -1,0 +1,98 @@
+"""What the error of the survey does to a fix, which takes the site as declared."""
+
+import numpy as np
+
+from magfusion.model.parameters import (
+    Block,
+    Calibration,
+    choose_blocks,
+    dimension,
+    linearize_channels,
+    placed,
+)
+from magfusion.model.prior import prior_sqrt_covariance
+from magfusion.units import Array
+
+SURVEY_GROUPS = ("beacons", "moments", "magnetometer", "extrinsics")
+
+
+def survey_jacobians(
+    calibration: Calibration,
+    nuisances: tuple[Block, ...],
+    time: Array,
+    world_from_body: Array,
+    position_world: Array,
+    sqrt_information: Array,
+) -> tuple[Array, Array]:
+    """Return the whitened Jacobians of what a fix finds, and of the survey it takes for granted.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Its ``phase`` and ``log_gain`` may have one row for each pose.
+    nuisances : tuple of Block
+        What is found beside the pose.
+    time : ndarray, shape (m,)
+    world_from_body : ndarray, shape (m, 3, 3)
+    position_world : ndarray, shape (m, 3)
+    sqrt_information : ndarray, shape (m, channels, 3, 3)
+        Whitening (1/T); zero where a channel is missing.
+
+    Returns
+    -------
+    by_found : ndarray, shape (m, rows, 6 + nuisances)
+        By the pose and by the nuisances.
+    by_survey : ndarray, shape (m, rows, parameters)
+        By each column of the spread of the survey's prior: one sigma of each parameter, where
+        these are independent.
+    """
+    survey, found = choose_blocks(calibration.site, SURVEY_GROUPS), dimension(nuisances)
+    _, by_pose, by_calibration = linearize_channels(
+        calibration, placed((*nuisances, *survey)), time, world_from_body, position_world
+    )
+    by_found = np.concatenate([by_pose, by_calibration[..., :found]], axis=-1)
+    by_survey = by_calibration[..., found:] @ prior_sqrt_covariance(calibration.site, survey)
+    return whitened(sqrt_information, by_found), whitened(sqrt_information, by_survey)
+
+
+def whitened(sqrt_information: Array, columns: Array) -> Array:
+    """Return columns of the phasors' rows in units of their sigma.
+
+    Parameters
+    ----------
+    sqrt_information : ndarray, shape (m, channels, 3, 3)
+    columns : ndarray, shape (m, channels, 6, k)
+        Of real parts, then imaginary parts (T).
+
+    Returns
+    -------
+    ndarray, shape (m, rows, k)
+    """
+    m, channels, _, width = columns.shape
+    halves = columns.reshape(m, channels, 2, 3, width)
+    return (sqrt_information[:, :, None] @ halves).reshape(m, 6 * channels, width)
+
+
+def honest_covariance(
+    by_found: Array, by_survey: Array, noise: Array, inverse: Array, information: Array
+) -> Array:
+    """Return the covariance of an estimate whose weights only stand in for the survey's error.
+
+    Parameters
+    ----------
+    by_found, by_survey : ndarray, shape (m, rows, ...)
+        From `survey_jacobians`.
+    noise : ndarray, shape (m, rows, rows)
+        Covariance of the whitened noise.
+    inverse, information : ndarray, shape (m, found, found)
+        Of the normal matrix, which may hold more than the field (gravity, a prior).
+
+    Returns
+    -------
+    ndarray, shape (m, found, found)
+    """
+    transposed = np.swapaxes(by_found, 1, 2)
+    spread = transposed @ noise @ by_found + information - transposed @ by_found
+    moved = inverse @ transposed @ by_survey
+    cov = inverse @ spread @ inverse + moved @ np.swapaxes(moved, 1, 2)
+    return 0.5 * (cov + np.swapaxes(cov, 1, 2))

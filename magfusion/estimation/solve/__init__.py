@@ -1,0 +1,1 @@
+"""The optimisation loops: many small problems at once, and poses with a dense border."""

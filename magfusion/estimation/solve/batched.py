@@ -1,0 +1,202 @@
+"""Nonlinear least squares of many small problems at once (Levenberg-Marquardt).
+
+The first axis of every array is the problem.  Each is solved as if it were alone, with its own
+damping; one that has converged costs nothing more.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.units import Array, BoolArray, IntArray
+
+PASSES = 100  # a bound; the few that creep along a valley need more than 25
+SETTLED = 1e-11  # relative fall of the cost below which a problem is solved
+ROUNDING = 1e-13  # relative rise of the cost that is no rise
+DAMPING_START, DAMPING_LEAST, DAMPING_STOP = 1e-3, 1e-12, 1e9
+EASED, TIGHTENED = 0.2, 10.0  # factors of the damping after a good step and after a bad one
+UNFELT = 1e-15  # of the largest column of a Jacobian: no residual feels this direction
+# Smallest over largest singular value of a Jacobian of unit columns.  Rounding makes 1e-16 of a
+# zero, whatever the processor; noise of a thousandth makes 1e-3 of it.
+SINGULAR = 1e-7
+
+
+class Normal(NamedTuple):
+    """Normal equations at some states; priors are residuals like any other.
+
+    A method with better curvature than Gauss-Newton's puts it into ``information``, which must not
+    be negative in any direction.
+    """
+
+    cost: Array  # (k,) sum of squares
+    gradient: Array  # (k, n) half of it
+    information: Array  # (k, n, n)
+
+
+class Solution(NamedTuple):
+    """Where the problems ended."""
+
+    state: Array  # (problems, ...) as the start
+    cost: Array  # (problems,) sum of squares
+    information: Array  # (problems, n, n) there
+    converged: BoolArray  # (problems,) False where the passes ran out or nothing is finite
+
+
+Model = Callable[[IntArray, Array], Normal]
+
+
+def normal_equations(residual: Array, jacobian: Array) -> Normal:
+    """Return the normal equations of residuals (k, d) and their Jacobian (k, d, n)."""
+    transposed = np.swapaxes(jacobian, -1, -2)
+    return Normal(
+        np.sum(residual**2, axis=-1),
+        (transposed @ residual[..., None])[..., 0],
+        transposed @ jacobian,
+    )
+
+
+def minimise(
+    model: Model,
+    start: Array,
+    move: Callable[[Array, Array], Array] = np.add,
+    *,
+    passes: int = PASSES,
+    relative: float = SETTLED,
+    absolute: float = 0.0,
+) -> Solution:
+    """Minimise the sum of squares of each problem.
+
+    Parameters
+    ----------
+    model : callable
+        Takes the numbers of the problems asked for, shape (k,), and their states, shape (k, ...);
+        returns the normal equations there.
+    start : ndarray, shape (problems, ...)
+        Of any type, objects too: only ``model`` and ``move`` look into it.
+    move : callable
+        Takes states (k, ...) and steps (k, n) and returns the states moved; addition by default.
+    passes : int
+        At most.
+    relative, absolute : float
+        A step that lowers the cost by less than this share of it, or by less than this, is the
+        last.
+    """
+    state = start.copy()
+    rows = np.arange(len(state))
+    normal = model(rows, state)
+    found = Solution(
+        state, normal.cost.copy(), normal.information.copy(), np.zeros(len(state), dtype=bool)
+    )
+    damping = np.full(len(rows), DAMPING_START)
+    for _ in range(passes):
+        if not len(rows):
+            break
+        trial = move(state[rows], _step(normal, damping))
+        new = model(rows, trial)
+        fall = normal.cost - new.cost
+        better = fall > 0.0  # false of a cost that is not finite
+        settled = fall <= relative * new.cost + absolute
+        settled &= fall >= -ROUNDING * normal.cost
+        state[rows[better]] = trial[better]
+        normal = Normal(
+            *(
+                np.where(better.reshape(-1, *[1] * (now.ndim - 1)), now, before)
+                for now, before in zip(new, normal, strict=True)
+            )
+        )
+        damping = np.maximum(damping * np.where(better, EASED, TIGHTENED), DAMPING_LEAST)
+        ended = settled | (damping > DAMPING_STOP)
+        if np.any(ended):
+            # Where no step lowers the cost, however short, it is least to rounding.
+            solved = settled | np.isfinite(normal.cost)
+            _keep(found, rows[ended], Normal(*(part[ended] for part in normal)), solved[ended])
+            rows, damping = rows[~ended], damping[~ended]
+            normal = Normal(*(part[~ended] for part in normal))
+    _keep(found, rows, normal, False)
+    return found
+
+
+def _keep(found: Solution, rows: IntArray, normal: Normal, settled: BoolArray | bool) -> None:
+    found.cost[rows], found.information[rows] = normal.cost, normal.information
+    found.converged[rows] = settled
+
+
+def _step(normal: Normal, damping: Array) -> Array:
+    """Return the damped step of each problem, shape (k, n), whatever the units of its unknowns."""
+    scale = _scale(np.sqrt(np.einsum("kii->ki", normal.information)))
+    scaled = normal.information / (scale[:, :, None] * scale[:, None, :])
+    # A direction that no residual feels stays where it is.
+    np.einsum("kii->ki", scaled)[...] += damping[:, None]
+    return -np.linalg.solve(scaled, (normal.gradient / scale)[..., None])[..., 0] / scale
+
+
+def _scale(size: Array) -> Array:
+    largest = np.max(size, axis=-1, keepdims=True)
+    return np.maximum(size, np.where(largest > 0.0, UNFELT * largest, 1.0))
+
+
+def moved_poses(pose: Array, step: Array) -> Array:
+    """Return poses (k, 12), rotation then position, moved by steps (k, 6) in their own axes."""
+    rotation = pose[:, :9].reshape(-1, 3, 3)
+    turned = rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
+    position = pose[:, 9:] + (rotation @ step[:, 3:, None])[..., 0]
+    return np.concatenate([turned.reshape(-1, 9), position], axis=1)
+
+
+def conditioning(jacobian: Array) -> Array:
+    """Return the smallest over the largest singular value of Jacobians, their columns made equal.
+
+    Parameters
+    ----------
+    jacobian : ndarray, shape (..., d, n)
+        Of any units.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        From 0 to 1: below `SINGULAR` the residuals leave a direction open.
+    """
+    if jacobian.shape[-2] < jacobian.shape[-1]:
+        return np.zeros(jacobian.shape[:-2])
+    scale = _scale(np.linalg.norm(jacobian, axis=-2))[..., None, :]
+    size = np.linalg.svd(jacobian / scale, compute_uv=False)
+    return size[..., -1] / np.maximum(size[..., 0], np.finfo(np.float64).tiny)
+
+
+def by_differences(
+    residual: Callable[[Array], Array], state: Array, step: float = 1e-6
+) -> tuple[Array, Array]:
+    """Return residuals (k, d) and their Jacobian (k, d, n) by central differences.
+
+    Parameters
+    ----------
+    residual : callable
+        Takes states (k, n), of size one, and returns residuals (k, d).
+    state : ndarray, shape (k, n)
+    """
+    n = state.shape[-1]
+    sides = state[:, None] + step * np.concatenate([np.zeros((1, n)), np.eye(n), -np.eye(n)])
+    value = residual(sides.reshape(-1, n)).reshape(len(state), 2 * n + 1, -1)
+    slope = (value[:, 1 : n + 1] - value[:, n + 1 :]) / (2.0 * step)
+    return value[:, 0], np.swapaxes(slope, -1, -2)
+
+
+def open_inverse(information: Array) -> tuple[Array, BoolArray]:
+    """Return the inverse of information matrices, and whether these determine the pose.
+
+    Flat directions are wide, not infinite.
+
+    Parameters
+    ----------
+    information : ndarray, shape (..., 6 + nuisances, 6 + nuisances)
+    """
+    value, vector = np.linalg.eigh(information)
+    largest = value[..., -1:]
+    # The phase of a channel that is missing is open too, but is no direction of the pose.
+    in_pose = np.sum(vector[..., :6, :] ** 2, axis=-2) > 1e-6
+    open_direction = (value <= 1e-10 * largest) & in_pose
+    safe = np.maximum(value, 1e-10 * largest + 1e-300)
+    cov = (vector / safe[..., None, :]) @ np.swapaxes(vector, -1, -2)
+    return cov, ~np.any(open_direction, axis=-1)

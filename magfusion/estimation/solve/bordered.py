@@ -1,0 +1,194 @@
+"""The optimisation loop of sparse poses with a dense calibration, over GTSAM's linear layer.
+
+Whatever problem it is: the problem linearises itself in batched calls, GTSAM eliminates.  Here is
+the only fallback from Cholesky to QR.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+import gtsam
+import numpy as np
+
+from magfusion.errors import EstimationError
+from magfusion.units import Array
+
+S = TypeVar("S")
+
+DAMPING_START, DAMPING_STOP = 1e-2, 1e10
+STALLED = 1e-9  # relative rise of the cost that is rounding
+UNDETERMINED = 1e12  # variance of a variable that a graph determines too badly to invert
+
+
+class Problem(Protocol[S]):
+    """A sum of squares of some estimate ``S``."""
+
+    @property
+    def ordering(self) -> gtsam.Ordering:
+        """Of elimination: the calibration last."""
+        ...
+
+    def cost(self, estimate: S) -> float:
+        """Return half the sum of squared whitened residuals, priors included."""
+        ...
+
+    def linearized(self, estimate: S) -> gtsam.GaussianFactorGraph:
+        """Return the linear graph at an estimate."""
+        ...
+
+    def moved(self, estimate: S, step: gtsam.VectorValues) -> S:
+        """Return the estimate moved by a step of every variable."""
+        ...
+
+    def damping_scales(self) -> Iterable[tuple[int, Array]]:
+        """Return, for each key, the step that a damping of one holds back."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Optimised(Generic[S]):
+    """Where the loop ended.
+
+    Parameters
+    ----------
+    cost : float
+        Half the sum of squares.
+    """
+
+    estimate: S
+    cost: float
+    iterations: int
+    converged: bool
+
+
+def eliminate(
+    graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
+) -> gtsam.GaussianBayesTree:
+    """Return the Bayes tree of a linear graph: by Cholesky, or by QR where that fails.
+
+    Raises
+    ------
+    RuntimeError
+        GTSAM's own, of a singular system.
+    """
+    try:
+        return graph.eliminateMultifrontal(ordering)
+    except RuntimeError:  # an ill-conditioned stretch: QR needs half the digits
+        return graph.eliminateMultifrontal(ordering, gtsam.EliminateQR)
+
+
+def eliminate_partial(
+    graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, *, orthogonal: bool = False
+) -> tuple[gtsam.GaussianBayesNet, gtsam.GaussianFactorGraph]:
+    """Return the conditionals of some variables, and what is left of the others.
+
+    Parameters
+    ----------
+    orthogonal : bool
+        By QR at once: what is left is then a square root.
+
+    Raises
+    ------
+    RuntimeError
+        GTSAM's own, of a singular system.
+    """
+    if not orthogonal:
+        try:
+            return graph.eliminatePartialSequential(ordering)
+        except RuntimeError:  # as in eliminate
+            pass
+    return graph.eliminatePartialSequential(ordering, gtsam.EliminateQR)
+
+
+def marginal(tree: gtsam.GaussianBayesTree, key: int, size: int) -> Array:
+    """Return the covariance of a variable; `UNDETERMINED` where the tree cannot invert for it."""
+    try:
+        return np.array(tree.marginalCovariance(key))
+    except RuntimeError:  # a tree takes Cholesky only
+        return UNDETERMINED * np.eye(size)
+
+
+def last_marginal(
+    tree: gtsam.GaussianBayesTree, graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
+) -> Array:
+    """Return the covariance of the last variable of an ordering.
+
+    Parameters
+    ----------
+    tree : gtsam.GaussianBayesTree
+        Of the graph, in this ordering.
+    """
+    kept, others = gtsam.Ordering(), gtsam.Ordering()
+    kept.push_back(ordering.at(ordering.size() - 1))
+    try:
+        return np.array(tree.marginalCovariance(kept.at(0)))
+    except RuntimeError:  # a tree takes Cholesky only
+        for i in range(ordering.size() - 1):
+            others.push_back(ordering.at(i))
+        _, rest = eliminate_partial(graph, others, orthogonal=True)
+        return np.array(np.linalg.inv(rest.hessian(kept)[0]))
+
+
+def optimise(
+    problem: Problem[S],
+    estimate: S,
+    *,
+    iterations: int = 30,
+    tolerance: float = 1e-6,
+    report: Callable[[int, float], None] | None = None,
+) -> Optimised[S]:
+    """Minimise the cost by Gauss-Newton steps, damped (Levenberg-Marquardt) where they fail.
+
+    Parameters
+    ----------
+    estimate : object
+        The start.
+    tolerance : float
+        Relative decrease of the cost that ends the loop.
+    report : callable, optional
+        Takes the iteration and its cost.
+
+    Raises
+    ------
+    EstimationError
+        Where the start itself has no finite cost or the graph cannot be solved.
+    """
+    cost = problem.cost(estimate)
+    if not np.isfinite(cost):
+        raise EstimationError("the start of the smoother has no finite cost")
+    damping, done = 0.0, 0
+    while done < iterations:
+        graph = problem.linearized(estimate)
+        while True:
+            system = graph if damping == 0.0 else _damped(problem, graph, damping)
+            try:
+                trial = problem.moved(estimate, eliminate(system, problem.ordering).optimize())
+                new_cost = problem.cost(trial)
+            except RuntimeError:
+                new_cost = np.inf
+            if new_cost <= cost:
+                break
+            if new_cost <= cost * (1 + STALLED) or damping > DAMPING_STOP:
+                return Optimised(estimate, cost, done, converged=damping <= DAMPING_STOP)
+            damping = max(DAMPING_START, 10.0 * damping)
+        decrease = cost - new_cost
+        estimate, cost, done = trial, new_cost, done + 1
+        damping = 0.0 if damping <= DAMPING_START else damping / 10.0
+        if report is not None:
+            report(done, cost)
+        if decrease <= tolerance * (1.0 + cost) and damping == 0.0:
+            return Optimised(estimate, cost, done, converged=True)
+    return Optimised(estimate, cost, done, converged=False)
+
+
+def _damped(
+    problem: Problem[S], graph: gtsam.GaussianFactorGraph, damping: float
+) -> gtsam.GaussianFactorGraph:
+    out = gtsam.GaussianFactorGraph()
+    out.push_back(graph)
+    for key, step in problem.damping_scales():
+        unit = gtsam.noiseModel.Unit.Create(len(step))
+        weight = np.diag(np.sqrt(damping) / step)
+        out.push_back(gtsam.JacobianFactor(key, weight, np.zeros(len(step)), unit))
+    return out

@@ -1,0 +1,97 @@
+"""Linear least squares of a chain of states with a border, many variants of it at once.
+
+GTSAM eliminates one system at a time; here the same system without each of some measurements is
+solved in one sweep, with the covariance of every state.  Block elimination along the chain, the
+border last; the covariance by the recursion of the selected inverse.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.units import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """Normal equations of variants h of a chain of n states of size s with a border of size c.
+
+    Parameters
+    ----------
+    diagonal : ndarray, shape (h, n, s, s)
+    following : ndarray, shape (h or 1, n - 1, s, s)
+        Between each state and the next.
+    border : ndarray, shape (h, n, s, c)
+        Between each state and the border.
+    corner : ndarray, shape (h, c, c)
+    right : ndarray, shape (h, n, s, r)
+    right_border : ndarray, shape (h, c, r)
+    """
+
+    diagonal: Array
+    following: Array
+    border: Array
+    corner: Array
+    right: Array
+    right_border: Array
+
+
+class ChainSolution(NamedTuple):
+    """Solution of every variant."""
+
+    states: Array  # (h, n, s, r)
+    border: Array  # (h, c, r)
+    cov: Array  # (h, n, k, k) of the first k of each state
+
+
+@np.errstate(all="ignore")
+def solve_chain(chain: Chain, kept: int) -> ChainSolution:
+    """Solve every variant.  What one leaves open comes out as not finite, or absurdly wide.
+
+    Parameters
+    ----------
+    kept : int
+        Of each state: how many of its first numbers' covariance is asked for.
+    """
+    n, size = chain.diagonal.shape[1:3]
+    wide = np.concatenate([chain.right, chain.border], axis=-1)
+    inverse, gain = [], []
+    pivot, swept = chain.diagonal[:, 0], [wide[:, 0]]
+    for i in range(n):
+        inverse.append(_inverse(pivot))
+        if i + 1 < n:
+            gain.append(inverse[i] @ chain.following[:, i])
+            back = np.swapaxes(gain[i], 1, 2)
+            pivot = chain.diagonal[:, i + 1] - back @ chain.following[:, i]
+            swept.append(wide[:, i + 1] - back @ swept[i])
+    found, cov = [inverse[-1] @ swept[-1]], [inverse[-1]]
+    for i in range(n - 2, -1, -1):
+        found.append(inverse[i] @ swept[i] - gain[i] @ found[-1])
+        cov.append(inverse[i] + gain[i] @ cov[-1] @ np.swapaxes(gain[i], 1, 2))
+    solved = np.stack(found[::-1], axis=1)
+    own = np.stack(cov[::-1], axis=1)[..., :kept, :kept]
+    count = chain.right.shape[-1]
+    alone, by_border = solved[..., :count], solved[..., count:]
+    if not chain.corner.shape[1]:
+        return ChainSolution(alone, chain.right_border, own)
+    # What the states leave of the border.
+    flat = chain.border.reshape(len(chain.border), n * size, -1)
+    left = np.swapaxes(flat, 1, 2)
+    corner = _inverse(chain.corner - left @ by_border.reshape(len(flat), n * size, -1))
+    rest = chain.right_border - left @ alone.reshape(len(flat), n * size, -1)
+    border = corner @ rest
+    states = alone - by_border @ border[:, None]
+    part = by_border[..., :kept, :]
+    return ChainSolution(states, border, own + part @ corner[:, None] @ np.swapaxes(part, -1, -2))
+
+
+def _inverse(matrix: Array) -> Array:
+    """Return inverses of symmetric positive matrices of any units, (h, k, k)."""
+    size = np.sqrt(np.maximum(np.einsum("hii->hi", matrix), np.finfo(np.float64).tiny))
+    scaled = matrix / (size[:, :, None] * size[:, None, :])
+    try:
+        inverse = np.linalg.inv(0.5 * (scaled + np.swapaxes(scaled, 1, 2)))
+    except np.linalg.LinAlgError:  # one of them is singular to the last digit
+        inverse = np.linalg.inv(scaled + 1e-12 * np.eye(matrix.shape[1]))
+    return 0.5 * (inverse + np.swapaxes(inverse, 1, 2)) / (size[:, :, None] * size[:, None, :])

@@ -1,0 +1,52 @@
+"""The order in which states are eliminated."""
+
+from collections.abc import Sequence
+
+import gtsam
+from gtsam.symbol_shorthand import B, V, X
+
+
+def nested_dissection(
+    epochs: int, last: int | None, segments: Sequence[tuple[int, int]] = ()
+) -> gtsam.Ordering:
+    """Return halves before what parts them, calibration last.
+
+    GTSAM's own orderings, and plain time order, are quadratic in the number of epochs once a
+    calibration variable touches all of them.
+
+    Parameters
+    ----------
+    last : int, optional
+        Key of the calibration.
+    segments : sequence of (int, int)
+        First epoch and key of stretches that have a variable of their own; it comes after them,
+        but where it is the last.
+    """
+    ordering = gtsam.Ordering()
+    begins = [begin for begin, _ in segments] or [0]
+    ends = [*begins[1:], epochs]
+    stack = [(0, len(begins), False)]
+    while stack:
+        low, high, split = stack.pop()
+        middle = (low + high) // 2
+        if split or high - low == 1:
+            _dissect(ordering, begins[middle], ends[middle])
+            if segments and segments[middle][1] != last:
+                ordering.push_back(segments[middle][1])
+        elif high > low:
+            stack += [(low, high, True), (middle + 1, high, False), (low, middle, False)]
+    if last is not None:
+        ordering.push_back(last)
+    return ordering
+
+
+def _dissect(ordering: gtsam.Ordering, begin: int, end: int) -> None:
+    stack = [(begin, end, False)]
+    while stack:
+        low, high, split = stack.pop()
+        middle = (low + high) // 2
+        if split or high - low == 1:
+            for key in (X(middle), V(middle), B(middle)):
+                ordering.push_back(key)
+        elif high > low:
+            stack += [(low, high, True), (middle + 1, high, False), (low, middle, False)]

@@ -1,0 +1,111 @@
+"""What has arrived and is not used up yet: streams in order, and how late they may be."""
+
+from collections import deque
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.units import Array
+
+LARGEST_JUMP = 60.0  # s; a stamp farther from the newest of all streams is a clock that jumped
+
+
+def check_clock(name: str, time: Array, newest: float) -> None:
+    """Refuse samples of a clock that jumped, ahead or back.
+
+    Parameters
+    ----------
+    name : str
+        Of the stream.
+    time : ndarray, shape (k,)
+    newest : float
+        Stamp of all streams (s): one that was silent for long has not jumped.
+
+    Raises
+    ------
+    InputError
+    """
+    if len(time) == 0 or not np.isfinite(newest):
+        return
+    later = np.sort(np.append(time[time > newest], newest))
+    ahead = float(np.max(np.diff(later), initial=0.0))
+    back = newest - float(np.max(time))
+    if max(ahead, back) > LARGEST_JUMP:
+        way = "back" if back > ahead else "ahead"
+        raise InputError(
+            f"{name}: its clock jumped {way} by {max(ahead, back):.4g} s at {newest:.3f} s;"
+            " start a new navigator, or correct the clock"
+        )
+
+
+class Buffer:
+    """One stream, sorted by time: stamps with rows of numbers.
+
+    Parameters
+    ----------
+    name : str
+        Of the stream, for refusals.
+    width : int
+        Numbers in a row.
+    """
+
+    newest: float
+    settled: float
+    late: int
+    _time: Array
+    _rows: Array
+
+    def __init__(self, name: str, width: int) -> None:
+        self.name, self.width = name, width
+        self._time, self._rows = np.empty(0), np.empty((0, width))
+        self._waiting: deque[tuple[Array, Array]] = deque()
+        self.newest = -np.inf
+        self.settled = -np.inf
+        self.late = 0
+
+    def add(self, time: Array, rows: Array) -> None:
+        """Take samples in, in any order but not from before what has been settled.
+
+        Raises
+        ------
+        InputError
+            Where a number is not finite.
+        """
+        if not (np.all(np.isfinite(time)) and np.all(np.isfinite(rows))):
+            raise InputError(f"{self.name}: a sample is not finite; leave it out of the stream")
+        if len(time) == 0:
+            return
+        fresh = time > self.settled
+        self.late += int(np.sum(~fresh))
+        self._waiting.append((time[fresh], rows[fresh]))
+        self.newest = max(self.newest, float(np.max(time)))
+
+    def rows(self) -> tuple[Array, Array]:
+        """Return all that is kept, in order of time; of equal stamps the first."""
+        if self._waiting:
+            time = np.concatenate([self._time, *(t for t, _ in self._waiting)])
+            rows = np.concatenate([self._rows, *(r for _, r in self._waiting)])
+            self._waiting.clear()
+            if np.any(np.diff(time) <= 0.0):
+                time, first = np.unique(time, return_index=True)
+                self.late += len(rows) - len(first)
+                rows = rows[first]
+            self._time, self._rows = time, rows
+        return self._time, self._rows
+
+    def between(self, begin: float, end: float) -> tuple[Array, Array]:
+        """Return the samples of a stretch, with the neighbours just outside it."""
+        time, rows = self.rows()
+        lo = max(int(np.searchsorted(time, begin, side="right")) - 1, 0)
+        hi = min(int(np.searchsorted(time, end)) + 1, len(time))
+        return time[lo:hi], rows[lo:hi]
+
+    def forget(self, before: float, settled: float) -> None:
+        """Drop what is older, but for the last sample of it; refuse what comes before settled."""
+        time, rows = self.rows()
+        lo = max(int(np.searchsorted(time, before, side="right")) - 1, 0)
+        self._time, self._rows = time[lo:], rows[lo:]
+        self.settled = max(self.settled, settled)
+
+    def __len__(self) -> int:
+        return len(self.rows()[0])

@@ -1,0 +1,82 @@
+"""Import of EuRoC MAV folders (ASL format), as visual-inertial benchmarks are published.
+
+Burri et al., The EuRoC micro aerial vehicle datasets, IJRR 35(10), 2016. Columns are known by
+their place: the headers' wording differs between the data sets that share the format.
+"""
+
+import csv
+from functools import partial
+from pathlib import Path
+
+from magfusion.errors import InputError
+from magfusion.files.inertial_tables import read_if_there, read_imu, read_waveform
+from magfusion.files.table import TIME, Span, find_table
+from magfusion.files.trajectory_table import read_trajectory
+from magfusion.model.samples import Log
+from magfusion.model.trajectory import Trajectory
+
+_IMU = (TIME, "gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
+_FIELD = (TIME, "field_x", "field_y", "field_z")
+_TRUTH = (
+    *(TIME, "position_x", "position_y", "position_z", "qw", "qx", "qy", "qz"),
+    *("velocity_x", "velocity_y", "velocity_z"),
+    *("gyro_bias_x", "gyro_bias_y", "gyro_bias_z"),
+    *("accel_bias_x", "accel_bias_y", "accel_bias_z"),
+)
+
+
+def is_euroc(path: Path) -> bool:
+    """Return whether a directory is a EuRoC folder."""
+    return (path / "mav0" / "imu0" / "data.csv").is_file()
+
+
+def read_euroc(path: Path, start: float | None = None, end: float | None = None) -> Log:
+    """Read a EuRoC folder: inertial samples, and magnetometer and ground truth where they are.
+
+    The first inertial stamp is the log's epoch.
+
+    Parameters
+    ----------
+    path : Path
+        The directory that holds ``mav0``.
+    start, end : float, optional
+        Seconds since the first inertial sample.
+
+    Raises
+    ------
+    InputError
+        Where a file cannot be read or holds what no instrument gives.
+    """
+    streams = path / "mav0"
+    imu = streams / "imu0" / "data.csv"
+    field = find_table(streams / "mag0", "data")
+    truth = find_table(streams / "state_groundtruth_estimate0", "data")
+    span = Span(_first_stamp(imu), start, end)
+    return Log(
+        name=path.resolve().name,
+        epoch_ns=span.epoch_ns,
+        source="EuRoC folder",
+        imu=read_imu(imu, span, _IMU),
+        waveform=read_if_there(field, partial(read_waveform, names=_FIELD), span),
+        truth=read_if_there(truth, _read_truth, span),
+    )
+
+
+def _read_truth(path: Path, span: Span) -> Trajectory:
+    return read_trajectory(path, span.epoch_ns, span.start, span.end, _TRUTH)
+
+
+def _first_stamp(path: Path) -> int:
+    found = "no row"
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            rows = csv.reader(stream)
+            next(rows)
+            found = next(rows)[0]
+        return int(found)
+    except (StopIteration, IndexError, ValueError) as error:
+        raise InputError(
+            f"{path}: first column, row 0 (counted from 0): found {found}; write nanoseconds."
+        ) from error
+    except (OSError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read ({error}); write the file again.") from error

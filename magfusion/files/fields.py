@@ -1,0 +1,134 @@
+"""Demodulated phasors: one row per window and channel in files, dense arrays in memory."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from magfusion.errors import InputError
+from magfusion.files.plausible import check_field
+from magfusion.files.table import TIME, Layout, Span, Table, read_table, write_table
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.units import Array, IntArray
+
+_REAL = ("re_x", "re_y", "re_z")
+_IMAGINARY = ("im_x", "im_y", "im_z")
+_UPPER = np.triu_indices(3)
+_COV = tuple(f"cov_{'xyz'[i]}{'xyz'[j]}" for i, j in zip(*_UPPER, strict=True))
+_LAYOUT = Layout(
+    numbers=(*_REAL, *_IMAGINARY, "sigma", "window"),
+    integers=(TIME, "tone"),
+    texts=("beacon",),
+    optional=(_COV,),
+    repeats=True,
+)
+
+
+def write_fields(fields: FieldSamples, path: Path, epoch_ns: int) -> None:
+    """Write phasors as Parquet, one row per window and channel that is there."""
+    row, channel = np.nonzero(fields.valid)
+    phasor, cov = fields.phasor_sensor[row, channel], fields.phasor_cov[row, channel]
+    columns: dict[str, object] = {TIME: Span(epoch_ns).stamps(fields.time)[row]}
+    names = pa.array([beacon for beacon, _ in fields.channels], pa.string())
+    columns["beacon"] = names.take(pa.array(channel))
+    columns["tone"] = np.array([tone for _, tone in fields.channels], dtype=np.int64)[channel]
+    columns |= dict(zip(_REAL, phasor.real.T, strict=True))
+    columns |= dict(zip(_IMAGINARY, phasor.imag.T, strict=True))
+    columns["sigma"] = np.sqrt(np.trace(cov, axis1=1, axis2=2) / 3.0)
+    columns["window"] = fields.window[row]
+    columns |= dict(zip(_COV, cov[:, *_UPPER].T, strict=True))
+    write_table(columns, path)
+
+
+def read_fields(path: Path, span: Span) -> FieldSamples:
+    """Read and check phasors in Parquet or CSV, within a span of time.
+
+    Channels are in the order in which the file first names them; the covariance is
+    ``sigma**2`` times the identity where the file does not hold one.
+
+    Raises
+    ------
+    InputError
+        As `read_table`; or where a number is not finite, a channel has two rows in one window,
+        the rows of one window differ in its length, or a sigma, window or covariance is not
+        positive.
+    """
+    table = read_table(path, _LAYOUT, span)
+    channels, column = _channels(table)
+    time_ns, first, row = np.unique(table.time_ns, return_index=True, return_inverse=True)
+    cell = row * len(channels) + column
+    repeated = np.ones(len(cell), dtype=bool)
+    repeated[np.unique(cell, return_index=True)[1]] = False
+    table.refuse(repeated, TIME, table.time_ns, "the channel has two rows: remove one of them")
+    window = _positive(table, "window")
+    differs = window != window[first][row]
+    table.refuse(differs, "window", window, "write the same in all rows of one time")
+    phasor = np.full((len(time_ns), len(channels), 3), np.nan, dtype=np.complex128)
+    phasor[row, column] = table.numbers(_REAL) + 1j * table.numbers(_IMAGINARY)
+    size = np.linalg.norm(phasor[row, column], axis=1)
+    check_field(size, str(path))
+    cov = np.full((*phasor.shape, 3), np.nan)
+    cov[row, column] = _covariance(table)
+    return FieldSamples(table.time[first], window[first], channels, phasor, cov)
+
+
+def order_channels(fields: FieldSamples, site: Site) -> FieldSamples:
+    """Arrange the channels as the site names them; those never measured are NaN.
+
+    Raises
+    ------
+    InputError
+        Where a channel is unknown to the site.
+    """
+    unknown = [channel for channel in fields.channels if channel not in site.channels]
+    if unknown:
+        known = _listed(site.channels)
+        raise InputError(
+            f"The fields hold {_listed(unknown)}, which the site does not know (it knows {known});"
+            " give the site in which the log was recorded."
+        )
+    present = np.array([c in fields.channels for c in site.channels], dtype=bool)
+    source = [fields.channels.index(c) for c in site.channels if c in fields.channels]
+    phasor = np.full((len(fields), len(site.channels), 3), np.nan, dtype=np.complex128)
+    cov = np.full((*phasor.shape, 3), np.nan)
+    phasor[:, present] = fields.phasor_sensor[:, source]
+    cov[:, present] = fields.phasor_cov[:, source]
+    return replace(fields, channels=site.channels, phasor_sensor=phasor, phasor_cov=cov)
+
+
+def _channels(table: Table) -> tuple[tuple[tuple[str, int], ...], IntArray]:
+    names, beacon = table.texts("beacon")
+    tone = table.integers("tone")
+    table.refuse(tone < 0, "tone", tone, "write an integer from 0")
+    pairs, first, row = np.unique(
+        np.stack([beacon, tone], axis=1), axis=0, return_index=True, return_inverse=True
+    )
+    order = np.argsort(first)
+    place = np.empty(len(order), dtype=np.int64)
+    place[order] = np.arange(len(order))
+    return tuple((names[b], int(t)) for b, t in pairs[order]), place[row.ravel()]
+
+
+def _covariance(table: Table) -> Array:
+    sigma = _positive(table, "sigma")
+    if not table.has(_COV):
+        return np.asarray(np.square(sigma)[:, None, None] * np.eye(3))
+    cov = np.empty((len(table), 3, 3))
+    upper = table.numbers(_COV)
+    cov[:, *_UPPER] = upper
+    cov[:, _UPPER[1], _UPPER[0]] = upper
+    smallest = np.linalg.eigvalsh(cov)[:, 0]
+    table.refuse(smallest <= 0.0, "cov_xx to cov_zz", smallest, "its eigenvalues must be positive")
+    return cov
+
+
+def _positive(table: Table, name: str) -> Array:
+    value = table.numbers((name,))[:, 0]
+    table.refuse(value <= 0.0, name, value, "write a positive number")
+    return value
+
+
+def _listed(channels: tuple[tuple[str, int], ...] | list[tuple[str, int]]) -> str:
+    return ", ".join(f"beacon {name} tone {tone}" for name, tone in channels)

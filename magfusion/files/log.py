@@ -1,0 +1,126 @@
+"""A log: a directory of tables and a header."""
+
+import shutil
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from magfusion.errors import InputError
+from magfusion.files.atomic import whole_directory
+from magfusion.files.fields import read_fields, write_fields
+from magfusion.files.inertial_tables import (
+    read_if_there,
+    read_imu,
+    read_waveform,
+    write_imu,
+    write_waveform,
+)
+from magfusion.files.table import LARGEST_TIME_NS, Span, find_table
+from magfusion.files.trajectory_table import read_trajectory, write_trajectory
+from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
+from magfusion.model.samples import Log
+from magfusion.model.trajectory import Trajectory
+
+HEADER = "log.yaml"
+STREAMS = ("imu", "magnetometer", "fields", "truth")
+
+
+class LogHeader(StrictModel):
+    """What ``log.yaml`` holds."""
+
+    magfusion_log: Literal[1]
+    name: str
+    epoch_ns: int = Field(ge=-LARGEST_TIME_NS, le=LARGEST_TIME_NS)
+    source: str
+
+
+def is_log(path: Path) -> bool:
+    """Return whether a directory has the header of a magfusion log."""
+    return (path / HEADER).is_file()
+
+
+def read_log(path: Path, start: float | None = None, end: float | None = None) -> Log:
+    """Read and check a log, or the part of it with start <= time < end.
+
+    Parameters
+    ----------
+    path : Path
+        A directory with ``log.yaml`` and a table per stream, Parquet or CSV.
+    start, end : float, optional
+        Seconds since the log's epoch. Rows outside are neither decoded nor checked.
+
+    Returns
+    -------
+    Log
+        Streams without a row in the span are None.
+
+    Raises
+    ------
+    InputError
+        Where a file is missing, cannot be read or holds what no instrument gives, or where the
+        span holds no inertial samples or no field.
+    """
+    if not path.is_dir():
+        found = "is a file" if path.exists() else "there is no such directory"
+        raise InputError(f"{path}: {found}; give the path of a log's directory.")
+    if not is_log(path):
+        raise InputError(f"{path}: holds no {HEADER}; give the path of a log's directory.")
+    header = read_yaml(path / HEADER, LogHeader)
+    span = Span(header.epoch_ns, start, end)
+    tables = {stem: find_table(path, stem) for stem in STREAMS}
+    if tables["imu"] is None:
+        raise InputError(f"{path}: holds no imu.parquet or imu.csv; add the inertial samples.")
+    if tables["magnetometer"] is None and tables["fields"] is None:
+        raise InputError(
+            f"{path}: holds no magnetometer.parquet and no fields.parquet (nor .csv); add one."
+        )
+    log = Log(
+        name=header.name,
+        epoch_ns=header.epoch_ns,
+        source=header.source,
+        imu=read_imu(tables["imu"], span),
+        waveform=read_if_there(tables["magnetometer"], read_waveform, span),
+        fields=read_if_there(tables["fields"], read_fields, span),
+        truth=read_if_there(tables["truth"], _read_truth, span),
+    )
+    if log.waveform is None and log.fields is None:
+        raise InputError(f"{path}: holds no field {span}; choose a span that the log covers.")
+    return log
+
+
+def write_log(log: Log, path: Path) -> None:
+    """Write a log as a directory of Parquet files; a log that is there is replaced.
+
+    Files of other names that lie in the former log are kept.
+
+    Raises
+    ------
+    InputError
+        Where something that is no log is at ``path``, or nothing can be written there.
+    """
+    with whole_directory(path, replaces=is_log) as unfinished:
+        if path.is_dir():
+            _keep_others(path, unfinished)
+        header = {"magfusion_log": 1, "name": log.name, "epoch_ns": log.epoch_ns}
+        write_yaml(header | {"source": log.source}, unfinished / HEADER)
+        write_imu(log.imu, unfinished / "imu.parquet", log.epoch_ns)
+        if log.waveform is not None:
+            write_waveform(log.waveform, unfinished / "magnetometer.parquet", log.epoch_ns)
+        if log.fields is not None:
+            write_fields(log.fields, unfinished / "fields.parquet", log.epoch_ns)
+        if log.truth is not None:
+            write_trajectory(log.truth, unfinished / "truth.parquet", log.epoch_ns)
+
+
+def _keep_others(former: Path, directory: Path) -> None:
+    ours = {HEADER, *(f"{stem}{s}" for stem in STREAMS for s in (".parquet", ".csv"))}
+    for entry in former.iterdir():
+        if entry.is_dir():
+            shutil.copytree(entry, directory / entry.name)
+        elif entry.name not in ours:
+            shutil.copy2(entry, directory / entry.name)
+
+
+def _read_truth(path: Path, span: Span) -> Trajectory:
+    return read_trajectory(path, span.epoch_ns, span.start, span.end)

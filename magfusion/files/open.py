@@ -1,0 +1,46 @@
+"""Any log that magfusion reads, by its path."""
+
+from pathlib import Path
+
+from magfusion.errors import InputError
+from magfusion.files.bag import Topics, is_bag, read_bag
+from magfusion.files.euroc import is_euroc, read_euroc
+from magfusion.files.log import HEADER, is_log, read_log
+from magfusion.model.samples import Log
+
+
+def open_log(
+    path: Path | str,
+    start: float | None = None,
+    end: float | None = None,
+    topics: Topics | None = None,
+) -> Log:
+    """Read a log, an EuRoC folder or a ROS 2 bag, whichever the path is.
+
+    Parameters
+    ----------
+    start, end : float, optional
+        The part with start <= time < end, in seconds since the log's epoch.
+    topics : Topics, optional
+        Of a bag that has several of one type.
+
+    Raises
+    ------
+    InputError
+        Where the path is none of them, or as the reader of its kind.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file or directory; give the path of a log.")
+    if is_log(path):
+        return read_log(path, start, end)
+    if is_euroc(path):
+        return read_euroc(path, start, end)
+    if is_bag(path):
+        return read_bag(path, start, end, topics)
+    if path.suffix == ".bag":
+        raise InputError(f"{path}: is a ROS 1 bag; convert it with rosbags-convert.")
+    raise InputError(
+        f"{path}: is no log: found neither {HEADER}, nor mav0/imu0/data.csv (EuRoC), nor"
+        " metadata.yaml, .mcap or .db3 (ROS 2 bag); give the path of one of them."
+    )

@@ -1,0 +1,366 @@
+"""A site as one YAML file: `load_site` believes nothing unchecked, `save_site` loses nothing."""
+
+import datetime
+from collections.abc import Mapping
+from dataclasses import MISSING, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.files.field_map import read_field_maps, write_field_maps
+from magfusion.files.site_correlation import load_correlation, save_correlation
+from magfusion.files.site_schema import (
+    BeaconEntry,
+    ClockEntry,
+    EarthEntry,
+    MagnetometerEntry,
+    MotionEntry,
+    SiteEntry,
+)
+from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
+from magfusion.model.field_map import FieldMap
+from magfusion.model.physics.earth import earth_field_world
+from magfusion.model.site import (
+    Beacon,
+    BeaconSigma,
+    ClockModel,
+    Coil,
+    EarthModel,
+    ImuModel,
+    Location,
+    Magnetometer,
+    MagnetometerSigma,
+    MotionModel,
+    Platform,
+    Site,
+    Slots,
+)
+from magfusion.units import DEGREE, Array
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+SAME_FIELD = 1e-12  # T; less is rounding
+Model = TypeVar("Model", bound="DataclassInstance")
+
+
+def load_site(path: Path | str, *, unknown: bool = False, without: bool = False) -> Site:
+    """Read a site from its YAML file.
+
+    Parameters
+    ----------
+    unknown : bool
+        Whether beacons that were never surveyed are accepted; few jobs can do with them.
+    without : bool
+        Whether a site without any beacon is accepted.
+
+    Returns
+    -------
+    Site
+        With ``earth_field_world`` by the IGRF, axes east, north, up, where the file gives a
+        location.
+
+    Raises
+    ------
+    InputError
+        Where the file is no YAML mapping, or a key is unknown, missing, of the wrong type or out
+        of range; the sentence names the file, the key's path, what was found and the remedy.
+    """
+    path = Path(path)
+    entry = read_yaml(path, SiteEntry)
+    if not entry.beacons and not without:
+        raise InputError(f"{path}: beacons: found []; describe at least one beacon.")
+    if not unknown:
+        _refuse_unknown(entry, path)
+    location, field_world = None, entry.world.earth_field_t
+    if entry.world.location is not None:
+        location = _model(Location, entry.world.location)
+        try:
+            field_world = _reference_field(location)
+        except InputError as error:
+            raise InputError(f"{path}: world.{error}") from error
+    maps = _field_maps(entry, path)
+    site = Site(
+        gravity=entry.world.gravity_m_s2,
+        model_error=entry.world.model_error,
+        model_error_length=entry.world.model_error_correlation_m,
+        beacons=tuple(replace(_beacon(b), field_map=maps.get(b.name)) for b in entry.beacons),
+        platform=Platform(
+            _model(ImuModel, entry.platform.imu),
+            _magnetometer(entry.platform.magnetometer),
+            _model(MotionModel, entry.platform.motion),
+        ),
+        earth_field_world=field_world,
+        location=location,
+        calibration=entry.calibration,
+        clock=_model(ClockModel, entry.clock),
+        earth=_model(EarthModel, entry.world.earth),
+    )
+    if entry.correlation is None:
+        return site
+    return replace(site, correlation=load_correlation(site, path.parent / entry.correlation))
+
+
+def _refuse_unknown(entry: SiteEntry, path: Path) -> None:
+    for i, beacon in enumerate(entry.beacons):
+        if beacon.unknown is not None:
+            raise InputError(
+                f"{path}: beacons[{i}].unknown: this job needs the {beacon.unknown} of beacon"
+                f" {beacon.name}; find it by magfusion smooth or calibrate log, which write it"
+                " into their site.yaml."
+            )
+
+
+def save_site(site: Site, path: Path | str) -> None:
+    """Write a site as YAML that `load_site` reads back to float precision.
+
+    Parameters
+    ----------
+    path : Path
+        Replaced as a whole, or left as it was if anything fails.  Field maps are written beside
+        it, as ``<stem>_field_map.parquet``, a correlation as ``<stem>_correlation.parquet``.
+    """
+    path = Path(path)
+    maps = {b.name: b.field_map for b in site.beacons if b.field_map is not None}
+    beside = path.with_name(f"{path.stem}_field_map.parquet")
+    content = {
+        "magfusion_site": 1,
+        "world": _world_entry(site) | ({"field_map": beside.name} if maps else {}),
+        "beacons": [_beacon_entry(b) for b in site.beacons],
+        "platform": {
+            "imu": _imu_entry(site.platform.imu),
+            "magnetometer": _magnetometer_entry(site.platform.magnetometer),
+            **_model_entry("motion", site.platform.motion, MotionEntry),
+        },
+        **_model_entry("clock", site.clock, ClockEntry),
+    }
+    if site.calibration is not None:
+        content["calibration"] = _plain(site.calibration)
+    if maps:
+        write_field_maps(maps, beside)
+    if site.correlation is not None:
+        correlation = path.with_name(f"{path.stem}_correlation.parquet")
+        content["correlation"] = correlation.name
+        save_correlation(site, correlation)
+    write_yaml(content, path)
+
+
+def _field_maps(entry: SiteEntry, path: Path) -> dict[str, FieldMap]:
+    if entry.world.field_map is None:
+        return {}
+    place = path.parent / entry.world.field_map
+    maps = read_field_maps(place)
+    known = [b.name for b in entry.beacons]
+    for name in maps:
+        if name not in known:
+            raise InputError(
+                f"{place}: maps beacon {name}, which {path} does not have (it has "
+                f"{', '.join(known)}); learn the map of this site."
+            )
+    return maps
+
+
+def _matrix(rpy_deg: Array) -> Array:
+    return Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix()
+
+
+def _reference_field(location: Location) -> Array:
+    day = datetime.date.fromisoformat(location.date)
+    return earth_field_world(location.latitude_deg, location.longitude_deg, location.height_m, day)
+
+
+def _is_reference(field_world: Array, location: Location) -> bool:
+    """Return whether a field is the one that a reader of the location will take."""
+    return float(np.max(np.abs(field_world - _reference_field(location)))) < SAME_FIELD
+
+
+def _beacon(entry: BeaconEntry) -> Beacon:
+    sigma = entry.sigma
+    return Beacon(
+        name=entry.name,
+        position_world=np.full(3, np.nan) if entry.position_m is None else entry.position_m,
+        world_from_beacon=np.full((3, 3), np.nan)
+        if entry.rpy_deg is None
+        else _matrix(entry.rpy_deg),
+        unknown=entry.unknown,
+        frequency_hz=entry.frequency_hz,
+        coils=tuple(_model(Coil, c) for c in entry.coils),
+        synchronised=entry.synchronised,
+        slots=None if entry.slots is None else _model(Slots, entry.slots),
+        model_error=entry.model_error,
+        noise_factor=entry.noise_factor,
+        sigma=BeaconSigma(
+            position_world=sigma.position_m,
+            rotation_beacon=sigma.rotation_deg * DEGREE,
+            log_moment=np.broadcast_to(sigma.log_moment, len(entry.coils)).copy(),
+        ),
+    )
+
+
+def _magnetometer(entry: MagnetometerEntry) -> Magnetometer:
+    return Magnetometer(
+        position_body=entry.body_from_sensor.position_m,
+        body_from_sensor=_matrix(entry.body_from_sensor.rpy_deg),
+        noise_density=entry.noise_density_t_rthz,
+        matrix=entry.matrix,
+        offset=entry.offset_t,
+        sigma=_model(MagnetometerSigma, entry.sigma),
+        coil_centres_sensor=entry.coil_centres_m,
+        offset_walk=entry.offset_walk_t,
+    )
+
+
+def _model(model: type[Model], entry: StrictModel) -> Model:
+    """Return a model from its entry, whose keys are the model's fields in order, with units."""
+    given = {
+        field.name: value * DEGREE if key.endswith("_deg") and key != field.name else value
+        for field, (key, value) in zip(fields(model), entry, strict=True)
+        if key in entry.model_fields_set or field.default is MISSING
+    }
+    return model(**given)
+
+
+def _model_entry(key: str, model: object, entry: type[StrictModel]) -> dict[str, Any]:
+    """Return what of a model is not as usual, as an entry under a key; nothing where all is."""
+    values = zip(
+        entry.model_fields, vars(model).values(), vars(type(model)()).values(), strict=True
+    )
+    changed = {
+        name: float(f"{value / DEGREE:.15g}") if name.endswith("_deg") else float(value)
+        for name, value, usual in values
+        if value != usual
+    }
+    return {key: changed} if changed else {}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    return value
+
+
+def _degrees(angle: Array | float) -> Any:
+    # 1e-12 deg is what arithmetic leaves of an angle: 2.0000000000000004 is written as 2.0.
+    return _plain(np.round(np.asarray(angle) / DEGREE, 12) + 0.0)
+
+
+def _rpy_deg(matrix: Array) -> Any:
+    """Return roll, pitch, yaw; Rotation.as_euler loses 1e-7 rad where the pitch is near 90 deg."""
+    yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
+    pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[0, 0], matrix[1, 0]))
+    rest = Rotation.from_euler("ZY", [yaw, pitch]).inv() * Rotation.from_matrix(matrix)
+    return _degrees(np.array([rest.as_rotvec()[0], pitch, yaw]))
+
+
+def _sigma_entry(sigma: Array) -> Any:
+    return _plain(sigma.flat[0] if np.all(sigma == sigma.flat[0]) else sigma)
+
+
+def _degree_sigma_entry(sigma: Array) -> Any:
+    # Relative here, where _degrees rounds absolutely: a sigma may be small.
+    return _sigma_entry(np.vectorize(lambda s: float(f"{s / DEGREE:.15g}"))(sigma))
+
+
+def _world_entry(site: Site) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "gravity_m_s2": float(site.gravity),
+        "model_error": float(site.model_error),
+    }
+    if site.model_error_length != Site.model_error_length:
+        entry["model_error_correlation_m"] = float(site.model_error_length)
+    field = site.earth_field_world
+    if site.location is not None and (field is None or _is_reference(field, site.location)):
+        day = datetime.date.fromisoformat(site.location.date)
+        entry["location"] = _plain(vars(site.location) | {"date": day})
+    elif field is not None:
+        entry["earth_field_t"] = _plain(field)
+    return entry | _model_entry("earth", site.earth, EarthEntry)
+
+
+def _beacon_entry(beacon: Beacon) -> dict[str, Any]:
+    place: dict[str, Any] = {}
+    if beacon.unknown is not None:
+        place["unknown"] = beacon.unknown
+    if beacon.unknown in (None, "attitude"):
+        place["position_m"] = _plain(beacon.position_world)
+    if beacon.unknown in (None, "position"):
+        place["rpy_deg"] = _rpy_deg(beacon.world_from_beacon)
+    return {
+        "name": beacon.name,
+        **place,
+        "frequency_hz": float(beacon.frequency_hz),
+        "coils": [_coil_entry(c) for c in beacon.coils],
+        **_slots_entry(beacon),
+        "synchronised": bool(beacon.synchronised),
+        **_noise_entry(beacon),
+        "sigma": {
+            "position_m": _sigma_entry(beacon.sigma.position_world),
+            "rotation_deg": _degree_sigma_entry(beacon.sigma.rotation_beacon),
+            "log_moment": _sigma_entry(beacon.sigma.log_moment),
+        },
+    }
+
+
+def _noise_entry(beacon: Beacon) -> dict[str, Any]:
+    entry = {} if beacon.model_error is None else {"model_error": float(beacon.model_error)}
+    if beacon.noise_factor != Beacon.noise_factor:
+        entry["noise_factor"] = float(beacon.noise_factor)
+    return entry
+
+
+def _slots_entry(beacon: Beacon) -> dict[str, Any]:
+    slots = beacon.slots
+    if slots is None:
+        return {}
+    times = {"duration_s": float(slots.duration), "count": int(slots.count)}
+    return {"slots": times | {"start_s": float(slots.start)}}
+
+
+def _coil_entry(coil: Coil) -> dict[str, Any]:
+    entry: dict[str, Any] = {
+        "moment_a_m2": _plain(coil.moment_beacon),
+        "phase_deg": _degrees(coil.phase),
+    }
+    if coil.centre_beacon.any():
+        entry["centre_m"] = _plain(coil.centre_beacon)
+    options = {
+        "radius_m": coil.radius,
+        "length_m": coil.length,
+        "frequency_hz": coil.frequency_hz,
+        "slot": coil.slot,
+    }
+    return entry | {k: _plain(v) for k, v in options.items() if v is not None}
+
+
+def _imu_entry(imu: ImuModel) -> dict[str, Any]:
+    renamed = {"time_offset": "time_offset_s", "time_offset_sigma": "time_offset_sigma_s"}
+    return {renamed.get(k, k): float(v) for k, v in vars(imu).items()}
+
+
+def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
+    sigma, centres = magnetometer.sigma, magnetometer.coil_centres_sensor
+    own = {} if centres is None else {"coil_centres_m": _plain(centres)}
+    if magnetometer.offset_walk != Magnetometer.offset_walk:
+        own["offset_walk_t"] = float(magnetometer.offset_walk)
+    return own | {
+        "body_from_sensor": {
+            "position_m": _plain(magnetometer.position_body),
+            "rpy_deg": _rpy_deg(magnetometer.body_from_sensor),
+        },
+        "noise_density_t_rthz": float(magnetometer.noise_density),
+        "matrix": _plain(magnetometer.matrix),
+        "offset_t": _plain(magnetometer.offset),
+        "sigma": {
+            "matrix": _sigma_entry(sigma.matrix),
+            "offset_t": _sigma_entry(sigma.offset),
+            "rotation_deg": _degree_sigma_entry(sigma.rotation_sensor),
+            "position_m": _sigma_entry(sigma.position_body),
+        },
+    }

@@ -1,0 +1,274 @@
+"""Samples as they go through a pipe: one record each, in JSON lines or MessagePack."""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any, BinaryIO, Literal
+
+import msgpack
+import numpy as np
+from pydantic import ConfigDict, Field, PlainValidator, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
+
+from magfusion.errors import InputError
+from magfusion.files.yaml_files import StrictModel, sentence
+from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
+from magfusion.units import Array, ComplexArray
+
+Format = Literal["json", "msgpack"]
+_CHUNK = 1 << 16  # bytes
+
+
+def _numbers(value: object, what: str) -> Array:
+    """Return finite numbers as an array; NumPy alone would take text and truth values too."""
+    try:
+        found = np.asarray(value)
+    except ValueError:
+        found = np.empty(0, dtype=object)
+    if found.dtype.kind not in "iuf" or not np.all(np.isfinite(found)):
+        raise PydanticCustomError("numbers", "it should be {what}, finite", {"what": what})
+    return np.asarray(found, dtype=float)
+
+
+def _times(value: object) -> Array:
+    found = np.atleast_1d(_numbers(value, "a time in seconds, or a list of them"))
+    if found.ndim != 1:
+        raise PydanticCustomError("times", "it should be a time in seconds, or a list of them")
+    return found
+
+
+def _vectors(value: object) -> Array:
+    found = np.atleast_2d(_numbers(value, "three numbers, or a list of such"))
+    if found.ndim != 2 or found.shape[1] != 3:
+        raise PydanticCustomError("vectors", "it should be three numbers, or a list of such")
+    return found
+
+
+def _phasor(value: object) -> ComplexArray:
+    """Return the phasors of a beacon's tones, (tones, 3); a tone that is null is missing."""
+    what = "for each tone null or [[re_x, re_y, re_z], [im_x, im_y, im_z]]"
+    if not isinstance(value, list):
+        raise PydanticCustomError("phasor", "it should be {what}", {"what": what})
+    out = np.full((len(value), 3), np.nan, dtype=complex)
+    for i, tone in enumerate(value):
+        if tone is None:
+            continue
+        found = _numbers(tone, what)
+        if found.shape != (2, 3):
+            raise PydanticCustomError("phasor", "it should be {what}", {"what": what})
+        out[i] = found[0] + 1j * found[1]
+    return out
+
+
+def _covariance(value: object) -> Array:
+    what = "a list of symmetric, positive 3 x 3 matrices (T^2), one for each tone"
+    found = _numbers(value, what)
+    if found.ndim != 3 or found.shape[1:] != (3, 3) or np.any(np.linalg.eigvalsh(found) <= 0.0):
+        raise PydanticCustomError("covariance", "it should be {what}", {"what": what})
+    return found
+
+
+class _Arrays(StrictModel):
+    model_config = ConfigDict(arbitrary_types_allowed=True)
+
+
+class ImuRecord(_Arrays):
+    """Inertial samples: stamps (k,), rates and specific forces (k, 3)."""
+
+    time: Annotated[Array, PlainValidator(_times)]
+    gyro: Annotated[Array, PlainValidator(_vectors)]
+    accel: Annotated[Array, PlainValidator(_vectors)]
+
+    @model_validator(mode="after")
+    def _alike(self) -> "ImuRecord":
+        _check_lengths(self.time, gyro=self.gyro, accel=self.accel)
+        return self
+
+
+class MagnetometerRecord(_Arrays):
+    """Raw samples of the magnetometer: stamps (k,), fields (k, 3) (T)."""
+
+    time: Annotated[Array, PlainValidator(_times)]
+    field: Annotated[Array, PlainValidator(_vectors)]
+
+    @model_validator(mode="after")
+    def _alike(self) -> "MagnetometerRecord":
+        _check_lengths(self.time, field=self.field)
+        return self
+
+
+class FieldsRecord(_Arrays):
+    """Phasors of one window; of every detected beacon, its tones.
+
+    ``sigma`` (T) is the standard deviation of each component's real and imaginary part;
+    ``covariance`` takes its place where the axes differ.
+    """
+
+    time: float
+    window: float = Field(gt=0.0)
+    phasors: dict[str, Annotated[ComplexArray, PlainValidator(_phasor)]]
+    sigma: float | None = Field(default=None, gt=0.0)
+    covariance: dict[str, Annotated[Array, PlainValidator(_covariance)]] | None = None
+
+    @model_validator(mode="after")
+    def _one_noise(self) -> "FieldsRecord":
+        if (self.sigma is None) == (self.covariance is None):
+            raise PydanticCustomError("noise", "it should have either sigma or covariance")
+        for name, phasor in self.phasors.items():
+            cov = None if self.covariance is None else self.covariance.get(name)
+            if self.covariance is not None and (cov is None or len(cov) != len(phasor)):
+                given = {"name": name}
+                raise PydanticCustomError("noise", "covariance lacks a tone of {name}", given)
+        return self
+
+
+class Record(StrictModel):
+    """One line of the stream; it may hold several kinds of samples."""
+
+    imu: ImuRecord | None = None
+    magnetometer: MagnetometerRecord | None = None
+    fields: FieldsRecord | None = None
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> "Record":
+        if self.imu is None and self.magnetometer is None and self.fields is None:
+            raise PydanticCustomError("empty", "it should hold imu, magnetometer or fields")
+        return self
+
+
+def _check_lengths(time: Array, **rows: Array) -> None:
+    for name, values in rows.items():
+        if len(values) != len(time):
+            given = {"name": name, "rows": len(values), "times": len(time)}
+            text = "{name} has {rows} rows for {times} times; they should be as many"
+            raise PydanticCustomError("lengths", text, given)
+
+
+def field_samples(entry: FieldsRecord, channels: tuple[tuple[str, int], ...]) -> FieldSamples:
+    """Return the phasors in the order of the site's channels; those not detected are NaN.
+
+    Raises
+    ------
+    InputError
+        Where a beacon or a tone is unknown to the site.
+    """
+    phasor = np.full((len(channels), 3), np.nan, dtype=complex)
+    cov = np.full((len(channels), 3, 3), np.nan)
+    for name, tones in entry.phasors.items():
+        for tone, value in enumerate(tones):
+            if (name, tone) not in channels:
+                known = ", ".join(f"{b} tone {t}" for b, t in channels)
+                raise InputError(f"holds beacon {name} tone {tone}; the site knows {known}")
+            row = channels.index((name, tone))
+            phasor[row] = value
+            if np.all(np.isfinite(value)):
+                cov[row] = _noise(entry, name, tone)
+    return FieldSamples(
+        time=np.array([entry.time]),
+        window=np.array([entry.window]),
+        channels=channels,
+        phasor_sensor=phasor[None],
+        phasor_cov=cov[None],
+    )
+
+
+def _noise(entry: FieldsRecord, name: str, tone: int) -> Array:
+    if entry.covariance is not None:
+        return np.asarray(entry.covariance[name][tone])
+    assert entry.sigma is not None
+    return entry.sigma**2 * np.eye(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Numbered:
+    """A record with its place in the stream, or the sentence that says why it is none."""
+
+    number: int
+    record: Record | None
+    refusal: str = ""
+
+
+def read_records(stream: BinaryIO, form: Format) -> Iterator[Numbered]:
+    """Yield the records of a stream as they come; blank lines are passed over.
+
+    Raises
+    ------
+    InputError
+        Where MessagePack breaks off inside: it is unknown where the next record begins.
+    """
+    if form == "json":
+        for number, line in enumerate(stream, 1):
+            if line.strip():
+                yield _checked(number, partial(Record.model_validate_json, line))
+        return
+    number, unpacker = 0, msgpack.Unpacker()
+    # As much as has come: read() would wait for all of a chunk.
+    while chunk := stream.read1(_CHUNK):  # type: ignore[attr-defined]
+        unpacker.feed(chunk)
+        try:
+            for content in unpacker:
+                number += 1
+                yield _checked(number, partial(Record.model_validate, content))
+        except (ValueError, msgpack.UnpackException) as error:
+            raise InputError(
+                f"standard input, record {number + 1}: is no MessagePack ({error}); write whole"
+                " records"
+            ) from error
+
+
+def _checked(number: int, read: Callable[[], Record]) -> Numbered:
+    try:
+        return Numbered(number, read())
+    except ValidationError as error:
+        return Numbered(number, None, sentence(error, Record, "record"))
+
+
+def write_record(content: dict[str, Any], stream: BinaryIO, form: Format) -> None:
+    """Write one record."""
+    if form == "json":
+        stream.write(json_line(content))
+    else:
+        stream.write(msgpack.packb(content))
+
+
+def json_line(content: dict[str, Any]) -> bytes:
+    """Return plain values as one line of JSON."""
+    return json.dumps(content, allow_nan=False).encode() + b"\n"
+
+
+def imu_content(samples: ImuSamples) -> dict[str, Any]:
+    """Return inertial samples as a record."""
+    gyro, accel = samples.gyro_body.tolist(), samples.accel_body.tolist()
+    return {"imu": {"time": samples.time.tolist(), "gyro": gyro, "accel": accel}}
+
+
+def magnetometer_content(waveform: Waveform) -> dict[str, Any]:
+    """Return raw samples of the magnetometer as a record."""
+    field = waveform.measured_sensor.tolist()
+    return {"magnetometer": {"time": waveform.time.tolist(), "field": field}}
+
+
+def fields_content(samples: FieldSamples) -> dict[str, Any]:
+    """Return the phasors of one window as a record, each with its covariance."""
+    phasors: dict[str, list[Any]] = {}
+    covariance: dict[str, list[Any]] = {}
+    tones: dict[str, dict[int, int]] = {}
+    for row, (name, tone) in enumerate(samples.channels):
+        tones.setdefault(name, {})[tone] = row
+    valid = samples.valid[0]
+    for name, rows in tones.items():
+        if not any(valid[row] for row in rows.values()):
+            continue
+        phasors[name], covariance[name] = [], []
+        for tone in range(max(rows) + 1):
+            if tone in rows and valid[rows[tone]]:
+                value = samples.phasor_sensor[0, rows[tone]]
+                phasors[name].append([value.real.tolist(), value.imag.tolist()])
+                covariance[name].append(samples.phasor_cov[0, rows[tone]].tolist())
+            else:
+                phasors[name].append(None)
+                covariance[name].append(np.eye(3).tolist())
+    time, window = float(samples.time[0]), float(samples.window[0])
+    content = {"time": time, "window": window, "phasors": phasors, "covariance": covariance}
+    return {"fields": content}

@@ -1,0 +1,319 @@
+"""One table of a log, Parquet or CSV: the columns asked for, checked, within a span of time."""
+
+import csv
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from magfusion.errors import InputError
+from magfusion.files.yaml_files import whole_file
+from magfusion.units import NANOSECOND, AnyArray, Array, IntArray
+
+TIME = "time_ns"
+ROWS_PER_GROUP = 1 << 17  # a slice reads whole groups
+# Larger than any clock's reading, and far enough from the ends of int64 to subtract.
+LARGEST_TIME_NS = 1 << 62
+LARGEST_NUMBER = 1e100  # whose square is still finite
+
+
+@dataclass(frozen=True)
+class Span:
+    """A part of a log: start <= time < end, in seconds since the log's epoch.
+
+    Parameters
+    ----------
+    epoch_ns : int
+        The log clock's zero.
+    start, end : float, optional
+        (s); None leaves that side open.
+    """
+
+    epoch_ns: int
+    start: float | None = None
+    end: float | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (("start", self.start), ("end", self.end)):
+            if value is not None and not np.isfinite(value):
+                raise InputError(f"{name}: found {value}; give a finite time in seconds.")
+        if self.start is not None and self.end is not None and self.start >= self.end:
+            raise InputError(f"start: found {self.start} s, which is not before end {self.end} s.")
+
+    @property
+    def bounds_ns(self) -> tuple[int, int]:
+        """First time within and first time beyond, as stamps."""
+        return self._stamp(self.start, -LARGEST_TIME_NS), self._stamp(self.end, LARGEST_TIME_NS)
+
+    def seconds(self, time_ns: IntArray) -> Array:
+        """Return stamps as seconds since the epoch."""
+        # Subtracted as integers: a double resolves today's date to a quarter of a microsecond.
+        return np.asarray((time_ns - self.epoch_ns) * NANOSECOND)
+
+    def stamps(self, time: Array) -> IntArray:
+        """Return seconds since the epoch as stamps."""
+        return np.rint(time / NANOSECOND).astype(np.int64) + self.epoch_ns
+
+    def __str__(self) -> str:
+        start = "the start" if self.start is None else f"{self.start} s"
+        return f"from {start} to {'the end' if self.end is None else f'{self.end} s'}"
+
+    def _stamp(self, time: float | None, default: int) -> int:
+        if time is None:
+            return default
+        stamp = self.epoch_ns + round(time / NANOSECOND)
+        return max(-LARGEST_TIME_NS, min(stamp, LARGEST_TIME_NS))
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Columns of a table.
+
+    Parameters
+    ----------
+    numbers, integers, texts : tuple of str
+        Columns that must be there.
+    optional : tuple of tuple of str
+        Groups of columns with numbers: each whole or absent.
+    repeats : bool
+        Whether several rows may have the same time.
+    """
+
+    numbers: tuple[str, ...]
+    integers: tuple[str, ...] = (TIME,)
+    texts: tuple[str, ...] = ()
+    optional: tuple[tuple[str, ...], ...] = ()
+    repeats: bool = False
+
+    def chosen(self, found: Sequence[str], path: Path) -> list[str]:
+        """Return the columns to read of those found; refuse a table that lacks one."""
+        groups = [g for g in self.optional if set(g) & set(found)]
+        wanted = [*self.integers, *self.texts, *self.numbers, *(name for g in groups for name in g)]
+        missing = [name for name in wanted if name not in found]
+        if missing:
+            raise InputError(
+                f"{path}: {_listed('column', missing)} missing (found {', '.join(found)});"
+                " add what is missing."
+            )
+        repeated = [name for name in wanted if list(found).count(name) > 1]
+        if repeated:
+            raise InputError(f"{path}: {_listed('column', repeated)} repeated; keep one of each.")
+        return wanted
+
+    def csv_type(self, name: str) -> pa.DataType:
+        """Return the type that a CSV's text must have."""
+        if name in self.integers:
+            return pa.int64()
+        return pa.string() if name in self.texts else pa.float64()
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Rows of a table within a span, not yet checked but for its times.
+
+    Parameters
+    ----------
+    data : pyarrow.Table
+    time_ns : ndarray of int, shape (n,)
+        Sorted; strictly increasing unless the layout lets them repeat.
+    time : ndarray, shape (n,)
+        The same in seconds since the log's epoch.
+    first_row : int
+        Row of the file, counted from 0, with which the span begins.
+    """
+
+    path: Path
+    data: pa.Table
+    time_ns: IntArray
+    time: Array
+    first_row: int
+
+    def __len__(self) -> int:
+        return len(self.time_ns)
+
+    def has(self, names: Iterable[str]) -> bool:
+        """Return whether the table holds these columns."""
+        return set(names) <= set(self.data.column_names)
+
+    def numbers(self, names: Sequence[str]) -> Array:
+        """Return columns side by side, shape (n, names); refuse what is not a finite number."""
+        values = np.empty((len(self), len(names)))
+        for k, name in enumerate(names):
+            column = self._present(name)
+            if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
+                raise InputError(f"{self.path}: column {name} holds {column.type}; write numbers.")
+            values[:, k] = column.to_numpy()
+            bad = ~(np.abs(values[:, k]) < LARGEST_NUMBER)  # NaN too
+            self.refuse(bad, name, values[:, k], "write a finite number")
+        return values
+
+    def integers(self, name: str) -> IntArray:
+        """Return a column of integers."""
+        column = self._present(name)
+        return _integers(column, name, self.path)
+
+    def texts(self, name: str) -> tuple[list[str], IntArray]:
+        """Return the distinct texts of a column as they first appear, and each row's index."""
+        column = self._present(name)
+        try:
+            encoded = column.cast(pa.string()).combine_chunks().dictionary_encode()
+        except pa.ArrowException:
+            encoded = None
+        if encoded is None or pa.types.is_integer(column.type) or pa.types.is_floating(column.type):
+            raise InputError(f"{self.path}: column {name} holds {column.type}; write text.")
+        if isinstance(encoded, pa.ChunkedArray):
+            encoded = encoded.combine_chunks()
+        return encoded.dictionary.to_pylist(), encoded.indices.to_numpy().astype(np.int64)
+
+    def refuse(self, bad: AnyArray, name: str, found: AnyArray, remedy: str) -> None:
+        """Raise an InputError that names the first bad row, if there is one."""
+        if bad.any():
+            k = int(np.argmax(bad))
+            raise InputError(
+                f"{self.path}: column {name}, row {self.first_row + k} (counted from 0):"
+                f" found {found[k]}; {remedy}."
+            )
+
+    def _present(self, name: str) -> pa.ChunkedArray:
+        column = self.data[name]
+        if column.null_count:
+            absent = column.is_null().to_numpy()
+            self.refuse(absent, name, np.full(len(self), "no value"), "write one")
+        return column
+
+
+def find_table(directory: Path, stem: str) -> Path | None:
+    """Return the path of a table that is Parquet or CSV, or None where there is neither."""
+    paths = [p for s in (".parquet", ".csv") if (p := directory / f"{stem}{s}").exists()]
+    if len(paths) > 1:
+        raise InputError(f"{directory}: holds {stem}.parquet and {stem}.csv; keep one of them.")
+    return paths[0] if paths else None
+
+
+def read_table(path: Path, layout: Layout, span: Span, names: tuple[str, ...] = ()) -> Table:
+    """Read the columns of a layout and the rows of a span.
+
+    A Parquet file is mapped, and only the row groups that the span needs are decoded.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Names of the first columns of a CSV whose own header uses others.
+
+    Raises
+    ------
+    InputError
+        Where the file is absent, no such table, empty, lacks a column, or its times are no
+        integers or not sorted.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; give the path of a table.")
+    try:
+        if path.suffix == ".csv":
+            data, first_row = _read_csv(path, layout, names), 0
+        else:
+            data, first_row = _read_parquet(path, layout, span)
+    except InputError:
+        raise
+    except (pa.ArrowException, OSError, ValueError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{path}: cannot be read ({reason}); write the file again.") from error
+    whole = Table(path, data, np.empty(len(data), dtype=np.int64), np.empty(len(data)), first_row)
+    time_ns = whole.integers(TIME)
+    _check_times(whole, time_ns, layout, span)
+    begin, end = np.searchsorted(time_ns, span.bounds_ns)
+    inside = data.slice(begin, end - begin)
+    within = time_ns[begin:end]
+    return Table(path, inside, within, span.seconds(within), first_row + int(begin))
+
+
+def write_table(columns: dict[str, object], path: Path) -> None:
+    """Write columns as one Parquet file with zstd compression."""
+    with whole_file(path) as unfinished:
+        pa.parquet.write_table(
+            pa.table(columns),
+            unfinished,
+            compression="zstd",
+            row_group_size=ROWS_PER_GROUP,
+            write_page_checksum=True,
+        )
+
+
+def _read_parquet(path: Path, layout: Layout, span: Span) -> tuple[pa.Table, int]:
+    with pa.parquet.ParquetFile(path, memory_map=True, page_checksum_verification=True) as file:
+        _refuse_empty(file.metadata.num_rows, path)
+        names = layout.chosen(file.schema_arrow.names, path)
+        _integer_type(file.schema_arrow.field(TIME).type, TIME, path)
+        groups = _groups_within(file, span)
+        if not groups:
+            return file.schema_arrow.empty_table().select(names), 0
+        skipped = sum(file.metadata.row_group(g).num_rows for g in range(groups[0]))
+        return file.read_row_groups(list(groups), columns=names), skipped
+
+
+def _groups_within(file: pa.parquet.ParquetFile, span: Span) -> range:
+    """Return the row groups that may hold rows of the span; consecutive, as times are sorted."""
+    begin, end = span.bounds_ns
+    column = file.schema_arrow.names.index(TIME)
+    within = []
+    for g in range(file.num_row_groups):
+        known = file.metadata.row_group(g).column(column).statistics
+        if known is None or not known.has_min_max or (known.max >= begin and known.min < end):
+            within.append(g)
+    return range(within[0], within[-1] + 1) if within else range(0)
+
+
+def _read_csv(path: Path, layout: Layout, renamed: tuple[str, ...]) -> pa.Table:
+    with path.open(newline="", encoding="utf-8-sig") as stream:
+        header = next(csv.reader(stream), [])
+    found = [*renamed[: len(header)], *(name.strip() for name in header[len(renamed) :])]
+    names = layout.chosen(found, path)
+    data = pa.csv.read_csv(
+        path,
+        read_options=pa.csv.ReadOptions(column_names=found, skip_rows=1),
+        convert_options=pa.csv.ConvertOptions(
+            include_columns=names, column_types={name: layout.csv_type(name) for name in names}
+        ),
+    )
+    _refuse_empty(data.num_rows, path)
+    return data
+
+
+def _check_times(whole: Table, time_ns: IntArray, layout: Layout, span: Span) -> None:
+    far = np.abs(time_ns) > LARGEST_TIME_NS
+    whole.refuse(far, TIME, time_ns, "write nanoseconds")
+    step = np.diff(time_ns, prepend=time_ns[:1] - 1)
+    whole.refuse(step < 0, TIME, time_ns, "which is before the row above: sort the rows by time")
+    if not layout.repeats:
+        remedy = "the time of the row above: remove one of the two"
+        whole.refuse(step == 0, TIME, time_ns, remedy)
+    seconds = span.seconds(time_ns)
+    merged = (np.diff(seconds, prepend=-np.inf) == 0.0) & (step > 0)
+    remedy = (
+        "too far from epoch_ns to distinguish it from the row above: set epoch_ns near the times"
+    )
+    whole.refuse(merged, TIME, time_ns, remedy)
+
+
+def _integers(column: pa.ChunkedArray, name: str, path: Path) -> IntArray:
+    _integer_type(column.type, name, path)
+    return np.asarray(column.to_numpy(), dtype=np.int64)
+
+
+def _integer_type(found: pa.DataType, name: str, path: Path) -> None:
+    if not pa.types.is_integer(found):
+        raise InputError(f"{path}: column {name} holds {found}; write integers (int64).")
+
+
+def _refuse_empty(rows: int, path: Path) -> None:
+    if rows == 0:
+        raise InputError(f"{path}: holds no rows; record at least one, or remove the file.")
+
+
+def _listed(noun: str, names: Sequence[str]) -> str:
+    plural = len(names) > 1
+    return f"{noun}{'s' if plural else ''} {', '.join(names)} {'are' if plural else 'is'}"

@@ -1,0 +1,113 @@
+"""Trajectories as tables: the truth of a log, and the estimate."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from scipy.spatial.transform import Rotation
+
+from magfusion.files.table import TIME, Layout, Span, Table, read_table, write_table
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import StateTrust
+from magfusion.units import Array, IntArray
+
+_POSITION = ("position_x", "position_y", "position_z")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+_VELOCITY = ("velocity_x", "velocity_y", "velocity_z")
+_GYRO_BIAS = ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")
+_ACCEL_BIAS = ("accel_bias_x", "accel_bias_y", "accel_bias_z")
+_UPPER = np.triu_indices(6)
+_COV = tuple(f"cov_{i}{j}" for i, j in zip(*_UPPER, strict=True))
+_LAYOUT = Layout(
+    numbers=(*_POSITION, *_QUATERNION), optional=(_VELOCITY, _GYRO_BIAS, _ACCEL_BIAS, _COV)
+)
+QUATERNION_TOLERANCE = 1e-3  # of its length from one
+
+
+def write_trajectory(
+    trajectory: Trajectory, path: Path, epoch_ns: int, trust: StateTrust | None = None
+) -> None:
+    """Write a trajectory as Parquet: ``trajectory.parquet`` of a run, ``truth.parquet`` of a log.
+
+    Parts that the trajectory does not have are left out.
+
+    Parameters
+    ----------
+    trust : StateTrust, optional
+        Of each state: ``verdict``, ``protection_level_m`` and ``protection_level_deg`` (null where
+        there is none), and ``excluded`` (names of beacons).
+    """
+    quaternion = Rotation.from_matrix(trajectory.world_from_body).as_quat(scalar_first=True)
+    parts: list[tuple[tuple[str, ...], Array | None]] = [
+        (_POSITION, trajectory.position_world),
+        (_QUATERNION, quaternion),
+        (_VELOCITY, trajectory.velocity_world),
+        (_GYRO_BIAS, trajectory.gyro_bias_body),
+        (_ACCEL_BIAS, trajectory.accel_bias_body),
+        (_COV, None if trajectory.pose_cov is None else trajectory.pose_cov[:, *_UPPER]),
+    ]
+    columns: dict[str, object] = {TIME: Span(epoch_ns).stamps(trajectory.time)}
+    for names, values in parts:
+        if values is not None:
+            columns |= dict(zip(names, values.T, strict=True))
+    if trust is not None:
+        columns |= trust_columns(trust, np.arange(len(trust.verdict)))
+    write_table(columns, path)
+
+
+def trust_columns(trust: StateTrust, rows: IntArray) -> dict[str, object]:
+    """Return verdict, levels and exclusions of some states as columns of a table."""
+    chosen = rows.tolist()
+    return {
+        "verdict": [str(trust.verdict[i]) for i in chosen],
+        "protection_level_m": pa.array(trust.protection_level_m[rows], from_pandas=True),
+        "protection_level_deg": pa.array(trust.protection_level_deg[rows], from_pandas=True),
+        "excluded": pa.array([trust.excluded[i] for i in chosen], type=pa.list_(pa.string())),
+    }
+
+
+def read_trajectory(
+    path: Path,
+    epoch_ns: int,
+    start: float | None = None,
+    end: float | None = None,
+    names: tuple[str, ...] = (),
+) -> Trajectory:
+    """Read and check a trajectory in Parquet or CSV, within start <= time < end (s).
+
+    ``names`` as in `read_table`.
+
+    Raises
+    ------
+    InputError
+        As `read_table`; or where a number is not finite or a quaternion not of unit length.
+    """
+    table = read_table(path, _LAYOUT, Span(epoch_ns, start, end), names)
+    quaternion = table.numbers(_QUATERNION)
+    length = np.linalg.norm(quaternion, axis=1)
+    off = np.abs(length - 1.0) > QUATERNION_TOLERANCE
+    table.refuse(off, "qw to qz", length, "the length of a rotation's quaternion is 1: scale it")
+    rotation = np.empty((0, 3, 3))
+    if len(table):
+        rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    cov = _numbers(table, _COV)
+    return Trajectory(
+        time=table.time,
+        world_from_body=rotation,
+        position_world=table.numbers(_POSITION),
+        velocity_world=_numbers(table, _VELOCITY),
+        gyro_bias_body=_numbers(table, _GYRO_BIAS),
+        accel_bias_body=_numbers(table, _ACCEL_BIAS),
+        pose_cov=None if cov is None else _symmetric(cov),
+    )
+
+
+def _numbers(table: Table, names: tuple[str, ...]) -> Array | None:
+    return table.numbers(names) if table.has(names) else None
+
+
+def _symmetric(upper: Array) -> Array:
+    matrix = np.zeros((len(upper), 6, 6))
+    matrix[:, *_UPPER] = upper
+    matrix[:, _UPPER[1], _UPPER[0]] = upper
+    return matrix

@@ -1,0 +1,90 @@
+"""Trajectories as text, as the TUM RGB-D benchmark lays them out: time x y z qx qy qz qw."""
+
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, Span
+from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
+from magfusion.files.yaml_files import whole_file
+from magfusion.model.trajectory import Trajectory
+
+_COLUMNS = "time_s x y z qx qy qz qw"
+_NS_PER_S = 1_000_000_000
+
+
+def write_tum(trajectory: Trajectory, path: Path, epoch_ns: int) -> None:
+    """Write the poses as a TUM file, which evo reads; times are on the log's clock."""
+    stamps = Span(epoch_ns).stamps(trajectory.time).tolist()
+    quaternion = Rotation.from_matrix(trajectory.world_from_body).as_quat()
+    poses = np.hstack([trajectory.position_world, quaternion]).tolist()
+    with whole_file(path) as unfinished, unfinished.open("w", encoding="utf-8") as stream:
+        stream.write(f"# {_COLUMNS}\n")
+        for stamp, pose in zip(stamps, poses, strict=True):
+            # A double cannot hold today's date to the nanosecond, decimal digits can.
+            time = f"{Decimal(stamp).scaleb(-9):.9f}"
+            stream.write(" ".join([time, *(f"{value:.9f}" for value in pose)]) + "\n")
+
+
+def read_tum(path: Path, epoch_ns: int = 0) -> Trajectory:
+    """Read and check a TUM file; times are seconds since ``epoch_ns``.
+
+    Raises
+    ------
+    InputError
+        Where the file is absent, not text, empty, a line does not hold eight finite numbers, a
+        quaternion is not of unit length, or the times do not increase.
+    """
+    lines = _lines(path)
+    values = np.array([_numbers(path, number, text) for number, text in lines])
+    stamps = np.array([_stamp(path, number, text) for number, text in lines], dtype=np.int64)
+    time = Span(epoch_ns).seconds(stamps)
+    for k in np.flatnonzero(np.diff(time) <= 0.0)[:1]:
+        _refuse(path, lines[k + 1][0], f"time {lines[k + 1][1].split()[0]}", "increasing times")
+    length = np.linalg.norm(values[:, 3:], axis=1)
+    for k in np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)[:1]:
+        _refuse(path, lines[k][0], f"a quaternion of length {length[k]:.6g}", "one of length 1")
+    rotation = Rotation.from_quat(values[:, 3:]).as_matrix()
+    return Trajectory(time, rotation, values[:, :3])
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; give the path of a TUM trajectory.")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text ({error}); give a TUM file.") from error
+    numbered = enumerate(text.splitlines(), 1)
+    lines = [(n, t) for n, line in numbered if (t := line.strip()) and not t.startswith("#")]
+    if not lines:
+        raise InputError(f"{path}: holds no poses; write lines of {_COLUMNS}.")
+    return lines
+
+
+def _numbers(path: Path, number: int, text: str) -> list[float]:
+    """Return position and quaternion."""
+    try:
+        values = [float(part) for part in text.split()]
+    except ValueError:
+        values = []
+    if len(values) != 8 or not (np.abs(values) < LARGEST_NUMBER).all():
+        _refuse(path, number, repr(text[:60]), f"eight finite numbers: {_COLUMNS}")
+    return values[1:]
+
+
+def _stamp(path: Path, number: int, text: str) -> int:
+    try:
+        stamp = round(Decimal(text.split()[0]) * _NS_PER_S)
+    except InvalidOperation:
+        stamp = LARGEST_TIME_NS + 1
+    if abs(stamp) > LARGEST_TIME_NS:
+        _refuse(path, number, f"time {text.split()[0]}", "seconds")
+    return stamp
+
+
+def _refuse(path: Path, number: int, found: str, wanted: str) -> None:
+    raise InputError(f"{path}: line {number}: found {found}; write {wanted}.")

@@ -1,1 +1,0 @@
-"""Fields and inertial data in one estimate."""

@@ -1,0 +1,118 @@
+"""The job that checks a log in seconds: streams, fields, compasses, first fixes; a verdict."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from magfusion.jobs.settings import Command, LogSettings, WindowSettings
+from magfusion.model.progress import Report, quiet
+from magfusion.results.figures import Figure, Figures, Section, heading
+
+if TYPE_CHECKING:
+    from magfusion.estimation.integrity.first_look import Look
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckSettings(LogSettings, WindowSettings):
+    """How a log is checked; without a site the recording alone is."""
+
+
+def run_check(
+    settings: CheckSettings, output: Path | None = None, report: Report = quiet
+) -> Figures:
+    """Check a log: what its streams, fields, compasses and first fixes say against it.
+
+    Parameters
+    ----------
+    output : Path, optional
+        Where report and picture are written; nowhere unless it is given.
+
+    Raises
+    ------
+    InputError
+    """
+    from contextlib import nullcontext
+
+    from magfusion.estimation.integrity.first_look import first_look
+    from magfusion.jobs.inputs import claim, found_in, read_recording
+    from magfusion.results.plots.check import write_check_plot
+    from magfusion.results.report import write_report
+    from magfusion.results.verdict import trust_figures
+
+    claimed = nullcontext(None) if output is None else claim(output, "check")
+    job = settings.job(Path() if output is None else output)
+    began = time.perf_counter()
+    report("reading", 0, 3)
+    log, site = read_recording(job)
+    report("checking", 1, 3)
+    lockin = None if site is None or not site.beacons else settings.lockin(job)
+    look = first_look(log, site, lockin)
+    figures = heading("check", log.name) | trust_figures(look.trust) | check_figures(look)
+    figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
+    with claimed as whole:
+        if whole is not None:
+            write_check_plot(found_in(whole, look.trust) / "check.png", look)
+            write_report(whole, figures)
+    report("done", 3, 3)
+    return figures
+
+
+def check_figures(look: Look) -> Figures:
+    """Return the figures of a look at a log."""
+    figures = Figures()
+    for one in look.timings:
+        figures |= Figures(
+            Figure(f"{one.stream}_rate_hz", one.rate_hz, "Hz"),
+            Figure(f"{one.stream}_duration_s", one.end - one.begin, "s"),
+            Figure(f"{one.stream}_jitter_ms", 1e3 * one.jitter, "ms"),
+            Figure(f"{one.stream}_lost_share", one.lost, section=Section.REPORT),
+            Figure(f"{one.stream}_gaps", len(one.gap_begin), section=Section.REPORT),
+            Figure(
+                f"{one.stream}_gap_s",
+                float((one.gap_end - one.gap_begin).sum()),
+                "s",
+                section=Section.REPORT,
+            ),
+        )
+    figures |= _of_compasses(look)
+    for name, snr, share in look.heard_as():
+        figures |= Figures(
+            Figure("snr_{beacon}", snr, beacon=name, label="signal to noise"),
+            Figure("heard_{beacon}", share, beacon=name, label="share of the epochs heard"),
+        )
+    if look.lines is not None:
+        words = [
+            f"{line.frequency_hz:.2f} Hz, {1e9 * line.amplitude:.3g} nT" for line in look.lines
+        ]
+        figures |= Figures(Figure("lines", words, label="lines in the field"))
+    if look.fixes is not None:
+        figures |= Figures(
+            Figure("fix_epochs", len(look.fixes), label="epochs fixed"),
+            Figure("fix_residual_rms", look.fix_residual, label="residual of the fixes"),
+        )
+    return figures
+
+
+def _of_compasses(look: Look) -> Figures:
+    """Return the sizes of gravity and field, and the angle between them."""
+    import numpy as np
+
+    means = look.means
+    if len(means) == 0:
+        return Figures()
+    force = float(np.median(np.linalg.norm(means.force_body, axis=1)))
+    figures = Figures(Figure("gravity_m_s2", force, "m/s^2", label="mean specific force"))
+    if np.any(np.isfinite(means.field_body)):
+        size = float(np.nanmedian(np.linalg.norm(means.field_body, axis=1)))
+        angle = float(np.degrees(np.nanmedian(means.angle)))
+        figures |= Figures(
+            Figure("steady_field_ut", 1e6 * size, "uT", label="steady field"),
+            Figure("field_from_vertical_deg", angle, "deg", label="steady field from the vertical"),
+        )
+    return figures
+
+
+COMMAND = Command(CheckSettings, run_check, output_optional=True)

@@ -1,0 +1,78 @@
+"""The job that demodulates a waveform: a log in, a log of phasors out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from magfusion.errors import InputError
+from magfusion.jobs.settings import Command, LogSettings, WindowSettings
+from magfusion.model.progress import Report, quiet
+from magfusion.results.figures import Figure, Figures, heading
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemodulateSettings(LogSettings, WindowSettings):
+    """How a waveform becomes phasors."""
+
+
+def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = quiet) -> Figures:
+    """Demodulate a waveform: a log that holds phasors in its place.
+
+    Raises
+    ------
+    InputError
+        Where the log has no waveform, or no window of it is usable.
+    """
+    import numpy as np
+
+    from magfusion.estimation.demodulation import phasors
+    from magfusion.estimation.integrity.recording import passed_on
+    from magfusion.files.log import write_log
+    from magfusion.files.site import save_site
+    from magfusion.jobs.inputs import claim, named, read_job
+    from magfusion.results.report import dropped_figures, write_report
+    from magfusion.results.verdict import trust_figures
+
+    claimed, job = claim(output, "demodulate"), settings.job(output)
+    lockin = settings.lockin(job)
+    log, site = read_job(job)
+    if log.waveform is None:
+        raise InputError(
+            f"{job.log_path}: holds no magnetometer.parquet to demodulate; give the raw log"
+        )
+    report("demodulating", 0, 1)
+    with named(job.log_path):
+        samples, dropped = phasors(log, site, lockin)
+    report("done", 1, 1)
+    sigma = np.sqrt(np.trace(samples.phasor_cov, axis1=2, axis2=3) / 3.0)
+    figures = (
+        heading("demodulate", log.name)
+        | trust_figures(passed_on(log, site))
+        | Figures(
+            Figure("epochs", len(samples)),
+            Figure("window_s", float(np.median(samples.window)), "s"),
+            *(
+                Figure(
+                    f"sigma_{{beacon}}_{tone}_t",
+                    float(np.median(sigma[samples.valid[:, c], c])),
+                    "T",
+                    beacon,
+                    label=f"sigma of a phasor of tone {tone}",
+                )
+                for c, (beacon, tone) in enumerate(samples.channels)
+            ),
+        )
+    )
+    figures |= dropped_figures(dropped)
+    with claimed as directory:
+        write_log(replace(log, waveform=None, fields=samples), directory)
+        save_site(site, directory / "site.yaml")
+        write_report(directory, figures)
+    return figures
+
+
+COMMAND = Command(
+    DemodulateSettings,
+    run_demodulate,
+)

@@ -1,0 +1,63 @@
+"""The job that compares a trajectory with a truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from magfusion.errors import InputError
+from magfusion.jobs.settings import Command, TopicSettings, argument
+from magfusion.results.figures import Figure, Figures, Section
+
+if TYPE_CHECKING:
+    from magfusion.model.trajectory import Trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateSettings(TopicSettings):
+    """What is compared; both as `magfusion.jobs.inputs.read_estimate`, or a log with truth."""
+
+    estimate: Path = argument("Result directory, TUM file or table")
+    truth: Path = argument("Log with truth, TUM file or table")
+
+
+def run_evaluate(settings: EvaluateSettings) -> Figures:
+    """Compare a trajectory with a truth.
+
+    Raises
+    ------
+    InputError
+        Where one of the two cannot be read, or they do not overlap in time.
+    """
+    from magfusion.jobs.inputs import named, read_estimate
+    from magfusion.results.errors import trajectory_errors
+    from magfusion.results.report import error_figures
+
+    true, epoch_ns = _read_truth(settings)
+    found = read_estimate(settings.estimate, epoch_ns)
+    with named(f"{settings.estimate} against {settings.truth}"):
+        errors = error_figures(trajectory_errors(found, true))
+    return Figures(Figure("job", "evaluate", section=Section.TITLE)) | errors
+
+
+def _read_truth(settings: EvaluateSettings) -> tuple[Trajectory, int]:
+    """Return the truth, and the zero of the clock (ns) from which its times count."""
+    from magfusion.files.bag import BAG_SUFFIXES
+    from magfusion.files.open import open_log
+    from magfusion.jobs.inputs import read_estimate, topics_option
+
+    path, topics = settings.truth, topics_option(settings.topics)
+    is_result = (path / "trajectory.parquet").is_file()
+    if is_result or not (path.is_dir() or path.suffix in BAG_SUFFIXES):
+        return read_estimate(path), 0
+    log = open_log(path, topics=topics)
+    if log.truth is None:
+        raise InputError(f"{path}: holds no truth; name a log, TUM file or table that does")
+    return log.truth, log.epoch_ns
+
+
+COMMAND = Command(
+    EvaluateSettings,
+    run_evaluate,
+)

@@ -1,0 +1,61 @@
+"""What is left of a job that failed: a report that says so, where a result would have been."""
+
+import json
+from pathlib import Path
+
+from magfusion.errors import EstimationError, InputError
+from magfusion.model.trust import Finding, Trust, Verdict
+from magfusion.results.figures import Figure, Figures, Section, heading
+from magfusion.results.verdict import trust_figures
+
+# They tell of it themselves, and what they were killed in can be gone on with.
+_OWN = ("navigate", "drift")
+_SHOWN = {"job": Section.TITLE, "log": Section.TITLE} | dict.fromkeys(
+    ("verdict", "reasons", "remarks", "unverified"), Section.VERDICT
+)
+
+
+def failed_figures(
+    job: str, log: str, output: Path, error: EstimationError, written: bool
+) -> Figures | None:
+    """Return the figures of a job that raised, and see that its output holds them.
+
+    Parameters
+    ----------
+    job, log : str
+        As in the heading of a report.
+    written : bool
+        Whether the job has written its report itself.
+
+    Returns
+    -------
+    Figures, optional
+        None where nothing can be written there.
+    """
+    if written:
+        return _read(output / "report.json")
+    if job in _OWN:
+        return None
+    from magfusion.jobs.inputs import claim, found_in
+    from magfusion.results.report import write_report
+
+    trust = Trust((Finding("no_solution", f"{error}.", Verdict.FAILED),))
+    figures = heading(job, log) | trust_figures(trust)
+    kinds = ("smooth", "fix") if job in ("smooth", "fix", "demo") else (job,)
+    try:
+        with claim(output, *kinds) as whole:
+            found_in(whole, trust)
+            write_report(whole, figures)
+    except (InputError, OSError):
+        return None
+    return figures
+
+
+def _read(path: Path) -> Figures:
+    told = json.loads(path.read_text(encoding="utf-8"))
+    return Figures(
+        *(
+            Figure(name, value, section=_SHOWN.get(name, Section.REPORT))
+            for name, value in told.items()
+        )
+    )

@@ -1,0 +1,284 @@
+"""The job that fixes the pose at every epoch on its own, by likelihood or as paper 004 does."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from magfusion.errors import InputError
+from magfusion.jobs.settings import Command, LogSettings, RiskSettings, WindowSettings, option
+from magfusion.model.progress import Report, quiet
+from magfusion.results.figures import Figure, Figures, heading
+
+if TYPE_CHECKING:
+    from magfusion.estimation.snapshot.fix import Fixes
+    from magfusion.jobs.inputs import Job
+    from magfusion.model.samples import Log
+    from magfusion.model.site import Site
+    from magfusion.model.trust import Risk, StateTrust, Trust
+    from magfusion.receiver.windows import LockinSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class FixSettings(LogSettings, WindowSettings, RiskSettings):
+    """How an epoch is located.
+
+    Parameters
+    ----------
+    survey : Path, optional
+        A survey's table, or the directory that ``magfusion survey`` wrote.
+    """
+
+    method: Literal[
+        "likelihood", "paper-lines", "paper-knn", "paper-knn-nt", "paper-fingerprint"
+    ] = option("likelihood", "Maximum likelihood, or an algorithm of paper 004")
+    survey: Path | None = option(None, "Fingerprint survey, which the paper's methods need")
+    block: float | None = option(
+        None, "Of paper-lines: a line for each block of this size", unit="m", above=0.0
+    )
+    free: str | None = option(
+        None,
+        "Find these of every beacon beside the pose, whatever the site says of them",
+        metavar="phase,gain",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.method != "likelihood" and self.free is not None:
+            raise InputError("--free belongs to --method likelihood; leave one of the two out")
+        if self.method != "likelihood" and self.risks != RiskSettings().risks:
+            raise InputError(
+                "--risk and --fault-prior belong to --method likelihood: the algorithms of"
+                " paper 004 have no covariance, and so no protection level"
+            )
+        if self.method == "likelihood" and self.survey is not None:
+            raise InputError(
+                "--survey belongs to the methods of paper 004; choose one with --method"
+            )
+        if self.method != "paper-lines" and self.block is not None:
+            raise InputError("--block belongs to --method paper-lines")
+        if self.method != "likelihood" and self.survey is None:
+            raise InputError(
+                f"--method {self.method} locates by a survey; name one with --survey SURVEY"
+            )
+
+
+def run(settings: FixSettings, output: Path, report: Report = quiet) -> Figures:
+    """Fix the pose at every epoch by the method that is asked."""
+    job = settings.job(output)
+    if settings.method != "likelihood":
+        return run_published_fix(job, settings)
+    free = _free(settings.free)
+    lockin = settings.lockin(job)
+    return run_fix(job, lockin=lockin, free=free, risk=settings.risks, report=report)
+
+
+def _free(text: str | None) -> tuple[str, ...]:
+    """Read ``phase,gain`` or either."""
+    from magfusion.estimation.snapshot.problem import FREE
+
+    chosen = () if text is None else tuple(part.strip() for part in text.split(","))
+    unknown = [part for part in chosen if part not in FREE]
+    if unknown:
+        raise InputError(
+            f"--free {text!r}: {unknown[0] or 'nothing'} is not among what a fix may find beside"
+            f" the pose; choose from {', '.join(FREE)}"
+        )
+    return chosen
+
+
+def run_fix(
+    job: Job,
+    *,
+    lockin: LockinSettings | None = None,
+    free: tuple[str, ...] = (),
+    risk: Risk | None = None,
+    report: Report = quiet,
+) -> Figures:
+    """Fix the pose at every epoch on its own: every hypothesis, best first.
+
+    Parameters
+    ----------
+    free : tuple of str
+        What is found beside the pose, as in `magfusion.estimation.snapshot.likelihood.fix_epochs`.
+    risk : Risk, optional
+        What the protection levels promise.
+
+    Raises
+    ------
+    InputError, EstimationError
+    """
+    import numpy as np
+
+    from magfusion.estimation.demodulation import fix_inputs, phasors
+    from magfusion.estimation.integrity.fix_separation import separate_fixes, separation_trust
+    from magfusion.estimation.integrity.fix_witness import judged_fixes
+    from magfusion.estimation.integrity.recording import BRIDGED, recorded
+    from magfusion.estimation.snapshot.likelihood import fix_epochs
+    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.model.parameters import initial_calibration
+    from magfusion.model.trust import Risk, Trust
+    from magfusion.results.report import dropped_figures, fix_figures
+    from magfusion.results.verdict import level_figures, trust_figures
+
+    risk = Risk() if risk is None else risk
+    claimed = claim(job.output, "smooth", "fix")
+    log, site = read_job(job)
+    began = time.perf_counter()
+    report("demodulating", 0, 3)
+    with named(job.log_path):
+        phasor_samples, dropped = phasors(log, site, lockin)
+    report("fixing", 1, 3)
+    calibration = initial_calibration(site, float(np.mean(phasor_samples.time)))
+    samples, gravity = fix_inputs(phasor_samples, log, site)
+    fixes = fix_epochs(samples, calibration, gravity=gravity, free=free)
+    report("fixing without each beacon", 2, 3)
+    separated = separate_fixes(samples, calibration, fixes, gravity=gravity, free=free, risk=risk)
+    heard = np.sum(samples.valid, axis=1)
+    fixes, states, trust = judged_fixes(separated.fixes, separated.states, heard)
+    report("done", 3, 3)
+    trust |= separation_trust(separated, tuple(beacon.name for beacon in site.beacons), risk)
+    trust |= Trust(recorded(log, site, BRIDGED, beacons=True))
+    figures = heading("fix", log.name) | trust_figures(trust) | fix_figures(fixes, site)
+    figures |= dropped_figures(dropped) | level_figures(states)
+    figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
+    with claimed as whole:
+        directory = found_in(whole, trust)
+        figures = write_fix_result(directory, log, site, fixes, figures, states, trust)
+        if directory != whole:
+            (directory / "report.json").rename(whole / "report.json")
+    refuse_failed(job.log_path, job.output, trust)
+    return figures
+
+
+def write_fix_result(
+    directory: Path,
+    log: Log,
+    site: Site,
+    fixes: Fixes,
+    figures: Figures,
+    states: StateTrust | None = None,
+    trust: Trust | None = None,
+) -> Figures:
+    """Write the fixes; return the figures with the errors against the truth."""
+    from magfusion.estimation.snapshot.ambiguity import relations
+    from magfusion.files.fix_table import write_hypotheses
+    from magfusion.files.trajectory_table import write_trajectory
+    from magfusion.files.tum import write_tum
+    from magfusion.results.recording import write_recording
+    from magfusion.results.report import compared_with_truth, write_report
+
+    best = fixes.best()
+    errors, compared = compared_with_truth(best, log)
+    write_tum(best, directory / "trajectory.tum", log.epoch_ns)
+    write_trajectory(best, directory / "trajectory.parquet", log.epoch_ns, states)
+    write_hypotheses(
+        directory / "fixes.parquet",
+        log.epoch_ns,
+        fixes.time,
+        fixes.world_from_body,
+        fixes.position_world,
+        fixes.cost,
+        fixes.probability,
+        fixes.determined,
+        relations(fixes, site).label,
+        states,
+    )
+    write_recording(
+        directory / "run.rrd",
+        site,
+        best,
+        truth=log.truth,
+        errors=errors,
+        trust=trust,
+        states=states,
+    )
+    write_report(directory, figures | compared)
+    return figures | compared
+
+
+def run_published_fix(job: Job, settings: FixSettings) -> Figures:
+    """Fix every epoch on its own by an algorithm of paper 004.
+
+    The poses have no covariance, because the algorithms give none.
+
+    Raises
+    ------
+    InputError
+        Where the survey names a beacon that the site does not know, it and the site
+        share fewer than three rotating beacons, or as many are detected in no epoch.
+    EstimationError
+    """
+    from magfusion.estimation.demodulation import phasors
+    from magfusion.estimation.integrity.recording import BRIDGED, recorded
+    from magfusion.files.survey import read_survey
+    from magfusion.files.trajectory_table import write_trajectory
+    from magfusion.files.tum import write_tum
+    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.model.trajectory import Trajectory
+    from magfusion.model.trust import Finding, Trust, alike
+    from magfusion.papers.p004_fingerprints.algorithms import fix_as_published
+    from magfusion.papers.p004_fingerprints.fingerprint import fingerprint_database
+    from magfusion.papers.p004_fingerprints.rotating import rotating_beacons, rotating_fields
+    from magfusion.results.recording import write_recording
+    from magfusion.results.report import compared_with_truth, dropped_figures, write_report
+    from magfusion.results.verdict import trust_figures
+
+    method, survey_path, lockin = settings.method, settings.survey, settings.lockin(job)
+    assert method != "likelihood"
+    assert survey_path is not None
+    claimed = claim(job.output, "smooth", "fix")
+    log, site = read_job(job)
+    table = survey_path / "survey.parquet" if survey_path.is_dir() else survey_path
+    with named(table):
+        database, axis_world = rotating_beacons(
+            fingerprint_database(read_survey(table), site), site
+        )
+    began = time.perf_counter()
+    with named(job.log_path):
+        samples, windows_dropped = phasors(log, site, lockin)
+    fields = rotating_fields(samples, site, database.beacons, axis_world)
+    fixes = fix_as_published(database, fields, method, settings.block)
+    if len(fixes.epoch) == 0:
+        reasons = ", ".join(f"{count} {reason}" for reason, count in fixes.dropped.items())
+        raise InputError(
+            f"{job.log_path}: none of its {len(samples)} epochs can be located with {table}"
+            f" ({reasons}); make the survey where the log was recorded"
+        )
+    lever_world = fixes.world_from_body @ site.platform.magnetometer.position_body
+    found = Trajectory(
+        samples.time[fixes.epoch], fixes.world_from_body, fixes.position_world - lever_world
+    )
+    errors, compared = compared_with_truth(found, log)
+    text = f"--method {settings.method} tells no covariance: how far a pose errs is not known."
+    trust = Trust((Finding("no_covariance", text), *recorded(log, site, BRIDGED)))
+    figures = (
+        heading("fix", log.name)
+        | trust_figures(trust)
+        | Figures(
+            Figure("method", settings.method),
+            Figure("epochs", len(found)),
+            Figure("fingerprints", len(database)),
+        )
+    )
+    figures |= dropped_figures(fixes.dropped, "epochs")
+    figures |= dropped_figures(windows_dropped) | compared
+    figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
+    with claimed as whole:
+        directory = found_in(whole, trust)
+        write_tum(found, directory / "trajectory.tum", log.epoch_ns)
+        rows = alike(len(found), trust.verdict)
+        write_trajectory(found, directory / "trajectory.parquet", log.epoch_ns, rows)
+        recording = directory / "run.rrd"
+        write_recording(recording, site, found, truth=log.truth, errors=errors, trust=trust)
+        write_report(whole, figures)
+    refuse_failed(job.log_path, job.output, trust)
+    return figures
+
+
+COMMAND = Command(
+    FixSettings,
+    run,
+)

@@ -1,0 +1,256 @@
+"""What a job reads, and where it may write."""
+
+import json
+import re
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.integrity.mending import mended
+from magfusion.files.atomic import refuse_in_the_way, whole_directory
+from magfusion.files.bag import Topics
+from magfusion.files.fields import order_channels
+from magfusion.files.open import open_log
+from magfusion.files.site import load_site
+from magfusion.files.trajectory_table import read_trajectory
+from magfusion.files.tum import read_tum
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Trust, Verdict
+from magfusion.receiver.receiver import Receiver
+
+
+@dataclass(frozen=True)
+class Job:
+    """What every job on a log needs.
+
+    Parameters
+    ----------
+    site_path : Path, optional
+        None takes ``site.yaml`` in the log's directory.
+    output : Path
+        Directory of the results; an earlier result there is replaced.
+    start, end : float, optional
+        Part of the log to use, seconds since its epoch.
+    topics : Topics, optional
+        Of a bag that has several of one type.
+    """
+
+    log_path: Path
+    site_path: Path | None
+    output: Path
+    start: float | None = None
+    end: float | None = None
+    topics: Topics | None = None
+
+    @property
+    def declared_path(self) -> Path:
+        """File of the site."""
+        return self.log_path / "site.yaml" if self.site_path is None else self.site_path
+
+
+_SITE = {"site.yaml", "site_field_map.parquet", "site_correlation.parquet"}
+FAILED = "failed"  # directory of what was found where the verdict is that
+_RESULT = {"trajectory.tum", "trajectory.parquet", *_SITE, "run.rrd", "report.json", FAILED}
+_TABLES = {"imu.parquet", "magnetometer.parquet", "fields.parquet", "truth.parquet"}
+_TRUE_SITE = {f"true_{name}" for name in _SITE}
+_LOG = {"log.yaml", *_SITE, *_TRUE_SITE, "report.json", *_TABLES}
+UNFINISHED_DRIFT = "unfinished"
+CHECKPOINT, ROWS = "checkpoint.bin", "checkpoint.rows"
+# What is in the directory while these jobs run.
+_UNFINISHED = {"navigate": {CHECKPOINT, ROWS}, "drift": {UNFINISHED_DRIFT}}
+_WRITTEN = {
+    "smooth": _RESULT | {"fixes.parquet"},
+    "fix": _RESULT | {"fixes.parquet"},
+    "navigate": _RESULT | {"lagged.parquet"} | _UNFINISHED["navigate"],
+    "drift": {"drift.png", "stability.png", "run.rrd", "report.json"} | _UNFINISHED["drift"],
+    "simulate": _LOG,
+    "demodulate": _LOG,
+    "survey": {"survey.parquet", "survey.png", "report.json"},
+    "calibrate log": _SITE | {"calibration.png", "report.json"},
+    "calibrate beacon": _SITE | {"beacon.png", "report.json"},
+    "calibrate antenna": _SITE | {"antenna.png", "report.json"},
+    "calibrate fieldmap": _SITE | {"field_map.png", "report.json"},
+    "calibrate magnetometer": _SITE | {"magnetometer.png", "report.json"},
+    "calibrate attitude-database": {"attitudes.parquet", "attitudes.png", "report.json"},
+    "check": {"check.png", "report.json", FAILED},
+    "match": {"attitude.parquet", "attitude.png", "report.json"},
+    "coverage": {"coverage.parquet", "coverage.png", "run.rrd", "report.json"},
+}
+
+
+def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
+    """Return whether a directory holds nothing but an earlier result of these jobs."""
+    found = {entry.name for entry in path.iterdir()}
+    # A checkpoint that was being written when its run was killed.
+    found = {name for name in found if not re.fullmatch(r"\.checkpoint\.(bin|rows)\.\d+", name)}
+    if any(found <= _UNFINISHED.get(kind, set()) for kind in kinds):
+        return True
+    try:
+        report = json.loads((path / "report.json").read_text(encoding="utf-8"))
+        job = report["job"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return job in kinds and found <= _WRITTEN[job] | {FAILED}
+
+
+def claim(output: Path, *kinds: str) -> AbstractContextManager[Path]:
+    """Return a context whose directory becomes ``output`` only if nothing fails.
+
+    What is in the way is refused at once, before the work is done.
+
+    Raises
+    ------
+    InputError
+        Where ``output`` holds anything but an earlier result of these jobs.
+    """
+
+    def replaces(path: Path) -> bool:
+        return _may_be_replaced(path, kinds)
+
+    refuse_in_the_way(output.resolve(), replaces)
+    return whole_directory(output, replaces)
+
+
+def found_in(directory: Path, trust: Trust) -> Path:
+    """Return where results go: of a verdict that is failed, under a name that says so."""
+    if trust.verdict is not Verdict.FAILED:
+        return directory
+    (directory / FAILED).mkdir()
+    return directory / FAILED
+
+
+def refuse_failed(place: Path, output: Path, trust: Trust) -> None:
+    """End a job whose verdict is failed, once its report is written.
+
+    Raises
+    ------
+    EstimationError
+        With the first reason.
+    """
+    if trust.verdict is Verdict.FAILED:
+        raise EstimationError(
+            f"{place}: failed: {trust.ordered[0].text} The reasons are in"
+            f" {output / 'report.json'}, what was found in {output / FAILED}"
+        )
+
+
+@contextmanager
+def named(place: Path | str) -> Iterator[None]:
+    """Name the file in the refusals of what knows only its content."""
+    try:
+        yield
+    except InputError as error:
+        if re.search(rf"(?<!\w){re.escape(str(place))}(?!\w)", str(error)):
+            raise
+        raise InputError(f"{place}: {error}") from error
+
+
+def topics_option(text: str | None) -> Topics | None:
+    """Read ``role=name,...``.
+
+    Raises
+    ------
+    InputError
+    """
+    if text is None:
+        return None
+    roles = [part.strip().partition("=") for part in text.split(",")]
+    known = [field.name for field in fields(Topics)]
+    if any(role not in known or not name for role, _, name in roles):
+        raise InputError(
+            f"--topics {text!r}: write role=name, separated by commas, with a role of"
+            f" {', '.join(known)}"
+        )
+    return Topics(**{role: name for role, _, name in roles})
+
+
+def read_site(job: Job, *, unknown: bool = False) -> Site:
+    """Read the site of a job.
+
+    Parameters
+    ----------
+    unknown : bool
+        Whether the job can do with beacons that were never surveyed.
+
+    Raises
+    ------
+    InputError
+    """
+    if job.site_path is None and not job.declared_path.is_file():
+        # A log that is not there is the nearer cause.
+        _open(job)
+        raise InputError(
+            f"{job.log_path}: holds no site.yaml; name the site's file with --site SITE.yaml"
+        )
+    return load_site(job.declared_path, unknown=unknown)
+
+
+def read_job(job: Job, *, unknown: bool = False) -> tuple[Log, Site]:
+    """Read the log and the site of a job, and see that they belong together.
+
+    Parameters
+    ----------
+    unknown : bool
+        Whether the job can do with beacons that were never surveyed.
+
+    Raises
+    ------
+    InputError
+        For anything in either file that a user must correct.
+    """
+    site = read_site(job, unknown=unknown)
+    log = _open(job)
+    if log.waveform is not None:
+        with named(job.declared_path):
+            Receiver.of(site).check()
+        log = mended(log, site)
+    if log.fields is not None:
+        with named(job.log_path):
+            log = replace(log, fields=order_channels(log.fields, site))
+    return log, site
+
+
+def read_recording(job: Job) -> tuple[Log, Site | None]:
+    """Read a log, and its site where there is one: a log alone can be judged too.
+
+    Raises
+    ------
+    InputError
+    """
+    if job.site_path is not None or job.declared_path.is_file():
+        site = load_site(job.declared_path, unknown=True, without=True)
+        if site.beacons:
+            return read_job(job, unknown=True)
+        return _open(job), site
+    return open_log(job.log_path, job.start, job.end, job.topics), None
+
+
+def _open(job: Job) -> Log:
+    log = open_log(job.log_path, job.start, job.end, job.topics)
+    if log.waveform is None and log.fields is None:
+        raise InputError(
+            f"{job.log_path}: holds no magnetometer samples in the part to use; record the"
+            " magnetometer beside the inertial sensor"
+        )
+    return log
+
+
+def read_estimate(path: Path, epoch_ns: int = 0) -> Trajectory:
+    """Read a trajectory from a result's directory, a TUM file, or a table (Parquet, CSV).
+
+    Raises
+    ------
+    InputError
+        Where there is none.
+    """
+    if path.is_dir():
+        if not (path / "trajectory.parquet").is_file():
+            raise InputError(f"{path}: holds no trajectory.parquet; give the result of a job")
+        return read_trajectory(path / "trajectory.parquet", epoch_ns)
+    if path.suffix in (".parquet", ".csv"):
+        return read_trajectory(path, epoch_ns)
+    return read_tum(path, epoch_ns)

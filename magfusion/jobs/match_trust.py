@@ -1,0 +1,123 @@
+"""Whether attitudes from the steady field are to be believed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magfusion.model.trust import Finding, Trust, Unverified, Verdict
+from magfusion.units import DEGREE, NANOTESLA, Array
+
+if TYPE_CHECKING:
+    from magfusion.jobs.attitude_database import Steady
+    from magfusion.model.samples import Log
+    from magfusion.model.site import Site
+    from magfusion.papers.p001_magnetometer.matching import Matches
+
+FEW = 0.05  # share of epochs that may be undetermined
+OTHER_SIZE = 0.3  # of the Earth's field, by which it contradicts the site
+EXPLAINED = 1.5  # residual by what is declared, as of whitened residuals
+# Numbers of a field vector that are left when so many angles have been found by it.
+_LEFT = {"roll": 2, "roll-pitch": 1, "roll-pitch-yaw": 2}
+_NAMES = ("roll", "pitch", "yaw")
+
+
+def judged(
+    matches: Matches,
+    angles: tuple[int, ...],
+    field_world: Array | None,
+    taken: Steady,
+    site: Site,
+    log: Log,
+) -> tuple[Matches, Trust]:
+    """Return matches with sigmas that their residuals allow, and what is to be said of them.
+
+    Parameters
+    ----------
+    angles : tuple of int
+        That were found, of roll, pitch and yaw.
+    field_world : ndarray, shape (3,), optional
+        The field that was taken as exact (T); none with a database, which refuses what it does not
+        know by itself.
+    """
+    from magfusion.estimation.integrity.recording import BRIDGED, recorded
+
+    findings = [*_undetermined(matches), *recorded(log, site, BRIDGED)]
+    unverified = []
+    if field_world is not None:
+        size, strength = float(np.linalg.norm(field_world)), site.earth.strength_sigma
+        findings += _other_size(taken, size)
+        rms = _residual(matches, angles)
+        ratio = rms / taken.sigma
+        if ratio > EXPLAINED:
+            matches = replace(matches, sigma=ratio * matches.sigma)
+        declared = float(np.linalg.norm([taken.sigma, _sensor_sigma(site, size), strength * size]))
+        if rms > EXPLAINED * declared:
+            findings.append(
+                Finding(
+                    "earth_field",
+                    f"The matched field misses the measured one by {rms / NANOTESLA:.3g} nT (rms),"
+                    f" and noise, calibration and the building's iron are declared as"
+                    f" {declared / NANOTESLA:.3g} nT: calibrate the magnetometer, or check the"
+                    " Earth field and the angles that were given. The sigmas have been enlarged.",
+                    weight=rms / declared,
+                )
+            )
+        turned = float(np.hypot(site.earth.declination_sigma, strength)) / DEGREE
+        declination = site.earth.declination_sigma / DEGREE
+        said = f"{100.0 * strength:.2g} %, {declination:.2g} deg"
+        unverified.append(Unverified("earth.field", said, 0.0, turned))
+    given = [name for k, name in enumerate(_NAMES) if k not in angles]
+    unverified += [Unverified(f"given.{name}", "0 deg", 0.0, 0.0) for name in given]
+    return matches, Trust(tuple(findings), tuple(unverified))
+
+
+def _residual(matches: Matches, angles: tuple[int, ...]) -> float:
+    """Return the root mean square of what is left of a component (T)."""
+    left = _LEFT["-".join(_NAMES[k] for k in angles)]
+    own = matches.residual[:, 0][matches.determined[:, 0]]
+    return float(np.sqrt(np.mean(own**2) / left)) if len(own) else 0.0
+
+
+def _sensor_sigma(site: Site, size: float) -> float:
+    """Return what is declared of the magnetometer's calibration, of a component (T)."""
+    sigma = site.platform.magnetometer.sigma
+    matrix = float(np.sqrt(np.mean(np.sum(sigma.matrix**2, axis=1)))) * size
+    return float(np.hypot(matrix, np.sqrt(np.mean(sigma.offset**2))))
+
+
+def _undetermined(matches: Matches) -> Iterator[Finding]:
+    count, missing = len(matches.determined), int(np.sum(~matches.determined[:, 0]))
+    if missing > FEW * count:
+        yield Finding(
+            "geometry",
+            f"{missing} of {count} epochs have no attitude: the field lies near the axes that are"
+            " asked for, is none that the database holds, or the platform moves. They are marked"
+            " in attitude.parquet (determined); add gravity at rest (--gravity), or beacons.",
+            weight=missing / count / FEW,
+        )
+    both = int(np.sum(matches.ambiguous))
+    if both:
+        yield Finding(
+            "ambiguous",
+            f"In {both} of {count} epochs the field has two attitudes: first stands that on the"
+            " side of a level body, the other beside it.",
+            Verdict.TRUSTWORTHY,
+        )
+
+
+def _other_size(taken: Steady, size: float) -> Iterator[Finding]:
+    measured = float(np.median(np.linalg.norm(taken.field_body, axis=1)))
+    off = max(measured / size, size / measured) - 1.0
+    if off > OTHER_SIZE:
+        yield Finding(
+            "earth_field",
+            f"The steady field is {1e6 * measured:.3g} uT and the Earth's, of the site, is"
+            f" {1e6 * size:.3g} uT: check the unit of magnetometer.parquet, the sensor's"
+            " calibration, and the Earth field in the site.",
+            Verdict.FAILED,
+            off / OTHER_SIZE,
+        )

@@ -1,0 +1,269 @@
+"""What a navigation along a log comes to: trajectories with their verdicts, figures and files."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from magfusion.estimation.initialization.online import NoStart
+from magfusion.estimation.integrity.diagnosis import with_cause
+from magfusion.estimation.integrity.judgement import JudgedState
+from magfusion.estimation.integrity.recording import BRIDGED, recorded
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.state import MOTION
+from magfusion.files.site import save_site
+from magfusion.files.trajectory_table import write_trajectory
+from magfusion.files.tum import write_tum
+from magfusion.model.parameters import dimension, initial_calibration
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding, StateTrust, Trust, Verdict
+from magfusion.results.errors import TrajectoryErrors
+from magfusion.results.figures import (
+    Column,
+    Estimate,
+    Figure,
+    Figures,
+    Section,
+    determined_figures,
+    heading,
+)
+from magfusion.results.recording import write_recording
+from magfusion.results.refinement import parameter_estimates, refined_site
+from magfusion.results.report import (
+    compared_with_truth,
+    rival_figures,
+    sigma_figures,
+    where_found,
+)
+from magfusion.results.verdict import level_figures, trust_figures
+from magfusion.units import Array, BoolArray
+
+# Of each state: when it was made of all that had come, or when it left the smoother's window.
+_STATE = {
+    "time": 1,
+    "world_from_body": 9,
+    "position_world": 3,
+    "velocity_world": 3,
+    "accel_bias_body": 3,
+    "gyro_bias_body": 3,
+}
+_VERDICTS = tuple(Verdict)
+
+
+def row_columns(site: Site) -> dict[str, int]:
+    """Return what is kept of each state as it is made, with the number of values."""
+    beacons = len(site.beacons)
+    told = {"lagged": 1, "latency": 1, "verdict": 1, "levels": 2, "pose_cov": 36}
+    return told | _STATE | {"distortion": beacons, "excluded": beacons}
+
+
+def state_row(
+    navigator: Navigator, state: JudgedState, latency: float, *, lagged: bool
+) -> dict[str, Array | float]:
+    """Return a state as a row of `row_columns`; the latency (s) is NaN where it is none."""
+    level, names = navigator.distortion, [b.name for b in navigator.site.beacons]
+    return {name: getattr(state, name) for name in _STATE} | {
+        "lagged": float(lagged),
+        "latency": latency,
+        "verdict": float(state.verdict.rank),
+        "levels": np.array([np.nan if x is None else x for x in _levels(state)]),
+        "pose_cov": state.cov[:6, :6],
+        "distortion": np.array([level.get(name, np.nan) for name in names]),
+        "excluded": np.array([float(name in state.judgement.excluded) for name in names]),
+    }
+
+
+def _levels(state: JudgedState) -> tuple[float | None, float | None]:
+    return state.judgement.protection_level_m, state.judgement.protection_level_deg
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """States of one kind, with what is said of each."""
+
+    states: Trajectory
+    trust: StateTrust
+
+
+@dataclass(frozen=True, eq=False)
+class NavigateResults:
+    """What is written of a run.
+
+    Parameters
+    ----------
+    current, lagged : Part
+        States as they were made, and as they left the smoother's window, where there is one.
+        Those that were lost have no pose and are not among them, unless all have failed.
+    """
+
+    trust: Trust
+    current: Part
+    lagged: Part | None
+    errors: TrajectoryErrors | None
+    innovations: dict[str, tuple[Array, Array]]
+    refined: Site
+
+
+def no_start(seconds: float, why: NoStart) -> Trust:
+    """Return what is to be said where a log led to no state."""
+    text = f"{seconds:.3g} s of data lead to no state: {why.reason}"
+    weight = 0.0 if why.trust.findings else 1.0
+    return why.trust | Trust((Finding("no_start", text, Verdict.FAILED, weight),))
+
+
+def _chosen(rows: dict[str, Array], trust: Trust, *, lagged: bool) -> BoolArray:
+    own: BoolArray = rows["lagged"][:, 0] == lagged
+    if trust.verdict is Verdict.FAILED:
+        return own
+    return own & (rows["verdict"][:, 0] < Verdict.FAILED.rank)
+
+
+def _part(rows: dict[str, Array], own: BoolArray, site: Site) -> Part | None:
+    if not np.any(own):
+        return None
+    states = Trajectory(
+        time=rows["time"][own, 0],
+        world_from_body=rows["world_from_body"][own].reshape(-1, 3, 3),
+        pose_cov=rows["pose_cov"][own].reshape(-1, 6, 6),
+        **{name: rows[name][own] for name in tuple(_STATE)[2:]},
+    )
+    excluded = tuple(
+        tuple(b.name for b, out in zip(site.beacons, row, strict=True) if out)
+        for row in rows["excluded"][own]
+    )
+    verdict = tuple(_VERDICTS[int(rank)] for rank in rows["verdict"][own, 0])
+    level_m, level_deg = rows["levels"][own].T
+    return Part(states, StateTrust(verdict, level_m, level_deg, excluded))
+
+
+def navigated(
+    log: Log, navigator: Navigator, rows: dict[str, Array], elapsed: float
+) -> tuple[Figures, NavigateResults]:
+    """Return figures and results of a navigation.
+
+    Parameters
+    ----------
+    rows : mapping
+        Of `row_columns`, all that were made.
+    elapsed : float
+        (s)
+    """
+    site, settings = navigator.site, navigator.settings
+    trust = navigator.summary.trust | Trust(recorded(log, site, BRIDGED, beacons=True))
+    trust = with_cause(trust, log, site, settings.lockin)
+    own = _chosen(rows, trust, lagged=False)
+    current, lagged = _part(rows, own, site), None
+    assert current is not None
+    states = current.states
+    estimates, refined = _calibration(navigator, log.name)
+    errors, compared = compared_with_truth(states, log)
+    figures = heading("navigate", log.name) | trust_figures(trust)
+    figures |= _settings_figures(navigator.settings) | _run_figures(navigator, states) | compared
+    figures |= level_figures(current.trust)
+    lagged = _part(rows, _chosen(rows, trust, lagged=True), site)
+    if lagged is not None:
+        figures |= Figures(Figure("lagged_epochs", len(lagged.states), section=Section.REPORT))
+        figures |= compared_with_truth(lagged.states, log, Column.LAGGED, "lagged_")[1]
+    latency = rows["latency"][rows["lagged"][:, 0] == 0.0, 0]
+    figures |= _update_figures(latency, elapsed)
+    figures |= Figures(*estimates) | determined_figures(estimates)
+    innovations = {
+        beacon.name: (states.time, np.sqrt(rows["distortion"][own, i]))
+        for i, beacon in enumerate(site.beacons)
+    }
+    return figures, NavigateResults(trust, current, lagged, errors, innovations, refined)
+
+
+def _calibration(navigator: Navigator, name: str) -> tuple[list[Estimate], Site]:
+    """Return the estimates of the calibration, and the refined site."""
+    state = navigator.state(-np.inf)
+    blocks, _ = navigator.settings.blocks(navigator.site)
+    # What is only considered follows what is estimated.
+    own = slice(MOTION, MOTION + dimension(blocks))
+    cov = state.cov[own, own]
+    declared = initial_calibration(navigator.site, state.calibration.reference_time)
+    estimates = parameter_estimates(declared, state.calibration, blocks, cov)
+    return estimates, refined_site(state.calibration, blocks, cov, estimates, name)
+
+
+def _settings_figures(settings: NavigatorSettings) -> Figures:
+
+    figures = [Figure("estimator", settings.estimator), Figure("delay_s", settings.delay, "s")]
+    lag = [Figure("lag_s", settings.lag, "s")] if settings.estimator == "smoother" else []
+    return Figures(*figures, *lag)
+
+
+def _run_figures(navigator: Navigator, current: Trajectory) -> Figures:
+
+    lost = navigator.summary
+    assert current.pose_cov is not None
+    return (
+        Figures(
+            Figure("epochs", len(current)),
+            Figure("duration_s", float(current.time[-1] - current.time[0]), "s"),
+            Figure("first_state_s", float(current.time[0]), "s"),
+            where_found("lost_epochs", lost.lost_states > 0, lost.lost_states),
+            where_found("lost_s", lost.lost_states > 0, lost.lost_time),
+            where_found("longest_loss_s", lost.lost_states > 0, lost.longest_loss),
+        )
+        | rival_figures(navigator.rival_chi_square)
+        | Figures(
+            *(
+                Figure("counted_" + reason.replace(":", "").replace(" ", "_"), count, label=reason)
+                for reason, count in navigator.losses.items()
+            ),
+            *(
+                Figure("distortion_{beacon}", level, "", beacon, label="distortion (1 expected)")
+                for beacon, level in navigator.distortion.items()
+            ),
+        )
+        | sigma_figures(current.pose_cov)
+    )
+
+
+def _update_figures(latency: Array, elapsed: float) -> Figures:
+    """Return how long an update took; the first state, which a smoother finds, is no update."""
+    spent = [Figure("elapsed_s", elapsed, "s"), Figure("memory_mb", _memory_mb(), "MB")]
+    known = 1e3 * latency[np.isfinite(latency)]
+    if len(known):
+        spent += [
+            Figure("update_p50_ms", float(np.median(known)), "ms"),
+            Figure("update_p99_ms", float(np.percentile(known, 99)), "ms"),
+            Figure("update_max_ms", float(np.max(known)), "ms"),
+        ]
+    return Figures(*spent)
+
+
+def _memory_mb() -> float | None:
+    """Return the most memory that the process has had; None where the system does not report it."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    unit = 1 << 20 if sys.platform == "darwin" else 1 << 10  # macOS reports bytes
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+
+def write_navigated(directory: Path, log: Log, results: NavigateResults) -> None:
+    """Write all but the report."""
+    current, lagged = results.current, results.lagged
+    write_tum(current.states, directory / "trajectory.tum", log.epoch_ns)
+    path = directory / "trajectory.parquet"
+    write_trajectory(current.states, path, log.epoch_ns, current.trust)
+    if lagged is not None:
+        path = directory / "lagged.parquet"
+        write_trajectory(lagged.states, path, log.epoch_ns, lagged.trust)
+    save_site(results.refined, directory / "site.yaml")
+    write_recording(
+        directory / "run.rrd",
+        results.refined,
+        current.states,
+        truth=log.truth,
+        errors=results.errors,
+        innovations=results.innovations,
+        trust=results.trust,
+        states=current.trust,
+    )

@@ -1,0 +1,124 @@
+"""The job that simulates a log, with truth, in the files a user has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from magfusion.errors import InputError
+from magfusion.jobs.settings import Command, RandomSettings, option
+from magfusion.results.figures import Figure, Figures, Section, heading
+
+if TYPE_CHECKING:
+    from magfusion.model.site import Site
+    from magfusion.simulation.log import SimulationConfig
+    from magfusion.units import Array
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulateSettings(RandomSettings):
+    """What is simulated."""
+
+    site: Path | None = option(None, "Site file", note="default: the demo's four beacons")
+    motion: Literal["walk", "turn", "static"] = option("walk", "How the platform moves")
+    duration: float = option(120.0, "Length", unit="s", least=1.0, most=1e6)
+    box: str | None = option(None, "Room to move in, m: xmin,xmax,ymin,ymax,zmin,zmax")
+    perturb: bool = option(True, "Draw the true calibration from the site's sigmas")
+    iron: int = option(0, "Steel spheres about the room, 0.5 m from it or more", least=0, most=200)
+
+
+def box_option(text: str | None) -> Array | None:
+    """Read ``xmin,xmax,ymin,ymax,zmin,zmax`` (m) as lower and upper corner, shape (2, 3).
+
+    Raises
+    ------
+    InputError
+    """
+    import numpy as np
+
+    if text is None:
+        return None
+    try:
+        box = np.array([float(part) for part in text.split(",")]).reshape(3, 2).T
+    except ValueError:
+        raise InputError(
+            f"--box {text!r}: six numbers in metres are needed, x, y, z limits"
+        ) from None
+    if not np.all(np.isfinite(box)) or np.any(box[0] >= box[1]):
+        raise InputError(f"--box {text!r}: each lower limit must be below its upper limit")
+    return box
+
+
+def run(settings: SimulateSettings, output: Path) -> Figures:
+    """Simulate a log as the settings ask; see `run_simulate`."""
+    from magfusion.files.site import load_site
+    from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+    from magfusion.simulation.log import SimulationConfig
+
+    site = demo_site() if settings.site is None else load_site(settings.site)
+    box = box_option(settings.box)
+    config = SimulationConfig(
+        box_world=DEMO_BOX_WORLD if box is None else box,
+        duration=settings.duration,
+        motion=settings.motion,
+        perturb=settings.perturb,
+        iron=settings.iron,
+    )
+    return run_simulate(site, config, output, settings.seed)
+
+
+def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) -> Figures:
+    """Simulate a log, with truth.
+
+    Parameters
+    ----------
+    site : Site
+        What the user would declare; written beside the log as ``site.yaml``.
+
+    Raises
+    ------
+    InputError
+        Where ``output`` is in the way, or the configuration does not fit the site.
+    """
+    import numpy as np
+
+    from magfusion.files.log import write_log
+    from magfusion.files.site import save_site
+    from magfusion.jobs.inputs import claim
+    from magfusion.model.trust import Trust
+    from magfusion.results.report import write_report
+    from magfusion.results.verdict import trust_figures
+    from magfusion.simulation.log import simulate_log
+
+    claimed = claim(output, "simulate")
+    rng = np.random.default_rng(seed)
+    imu = site.platform.imu
+    if config.time_offset is None and config.perturb:
+        drawn = imu.time_offset + imu.time_offset_sigma * float(rng.standard_normal())
+        config = replace(config, time_offset=drawn)
+    simulated = simulate_log(site, config, rng)
+    figures = (
+        heading("simulate", simulated.log.name)
+        | trust_figures(Trust())
+        | Figures(
+            Figure("seed", seed),
+            Figure("duration_s", config.duration, "s"),
+            Figure("imu_samples", len(simulated.log.imu), label="IMU samples"),
+            Figure("time_offset_s", simulated.time_offset, "s", section=Section.REPORT),
+            Figure("iron_spheres", config.iron),
+        )
+    )
+    with claimed as directory:
+        write_log(simulated.log, directory)
+        save_site(site, directory / "site.yaml")
+        save_site(simulated.true_site, directory / "true_site.yaml")
+        write_report(directory, figures)
+    return figures
+
+
+COMMAND = Command(
+    SimulateSettings,
+    run,
+    output_required=True,
+)

@@ -1,0 +1,1 @@
+"""The model: the site, its parameters, and what a magnetometer measures there."""

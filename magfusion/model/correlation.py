@@ -1,0 +1,75 @@
+"""How the errors of calibrated parameters go together.
+
+A log tells where beacons stand to each other far better than where all of them stand: each sigma is
+then of centimetres and their differences are known to a millimetre.  Sigmas alone would forget it.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.units import Array
+
+
+class Component(NamedTuple):
+    """One number of a calibration, e.g. the first of beacon A's position."""
+
+    group: str
+    owner: str
+    kind: str
+    component: int
+
+
+@dataclass(frozen=True, eq=False)
+class Correlation:
+    """Correlation coefficients of the errors that a site's sigmas stand for.
+
+    Parameters
+    ----------
+    parameters : tuple of Component
+        All others are independent.
+    coefficients : ndarray, shape (n, n)
+        With ones on the diagonal.
+    """
+
+    parameters: tuple[Component, ...]
+    coefficients: Array
+
+    def kept(self, wanted: Callable[[Component], bool]) -> "Correlation | None":
+        """Return the part between some parameters; None where none is left."""
+        rows = [i for i, parameter in enumerate(self.parameters) if wanted(parameter)]
+        if not rows:
+            return None
+        names = tuple(self.parameters[i] for i in rows)
+        return Correlation(names, self.coefficients[np.ix_(rows, rows)])
+
+    def without(self, groups: tuple[str, ...], owners: Iterable[str]) -> "Correlation | None":
+        """Return the part without some groups of some owners, which were found anew, apart."""
+        gone = set(owners)
+        return self.kept(lambda p: p.group not in groups or p.owner not in gone)
+
+    def among(self, parameters: list[Component]) -> Array:
+        """Return the coefficients between given parameters, those of strangers zero, (k, k)."""
+        index = {parameter: i for i, parameter in enumerate(self.parameters)}
+        mine = [j for j, parameter in enumerate(parameters) if parameter in index]
+        theirs = [index[parameters[j]] for j in mine]
+        out = np.eye(len(parameters))
+        out[np.ix_(mine, mine)] = self.coefficients[np.ix_(theirs, theirs)]
+        return out
+
+
+def joined(parts: list[Correlation | None]) -> Correlation | None:
+    """Return several correlations as one; between them there is none."""
+    some = [part for part in parts if part is not None]
+    if not some:
+        return None
+    parameters = [parameter for part in some for parameter in part.parameters]
+    out = np.eye(len(parameters))
+    start = 0
+    for part in some:
+        rows = slice(start, start + len(part.parameters))
+        out[rows, rows] = part.coefficients
+        start = rows.stop
+    return Correlation(tuple(parameters), out)

@@ -1,0 +1,400 @@
+"""The one measurement model: what a magnetometer sees of a beacon, and how that changes.
+
+Every solver predicts through `observe`; the simulator does not.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple, overload
+
+import numpy as np
+
+from magfusion.model.physics.dipole import dipole_field, dipole_gradient
+from magfusion.model.site import Beacon, Magnetometer
+from magfusion.units import Array, ComplexArray
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """Predicted phasors of one beacon with their Jacobian blocks.
+
+    Every block has the shape of ``phasor_sensor`` with one axis more, of the length given.
+
+    Parameters
+    ----------
+    phasor_sensor : complex ndarray, shape (..., tones, 3)
+        (T), measured axes.
+    platform_pose : complex ndarray, 6
+        Right perturbation of world_from_body: rotation, translation, body axes (T/rad, T/m).
+    beacon_pose : complex ndarray, 6
+        Right perturbation of world_from_beacon: rotation, translation, beacon axes.
+    log_moments : complex ndarray, coils
+        Logarithm of each coil's moment (T).
+    phase : complex ndarray
+        Drive phase of the phasor's own tone; no further axis (T/rad).
+    matrix : complex ndarray, 9
+        Magnetometer matrix, row by row (T).
+    body_from_sensor : complex ndarray, 6
+        Right perturbation of the sensor's pose in the body: rotation, translation, sensor axes.
+    time_offset : complex ndarray, optional
+        IMU time offset; no further axis (T/s).  None where no twist was given.
+    """
+
+    phasor_sensor: ComplexArray
+    platform_pose: ComplexArray
+    beacon_pose: ComplexArray
+    log_moments: ComplexArray
+    phase: ComplexArray
+    matrix: ComplexArray
+    body_from_sensor: ComplexArray
+    time_offset: ComplexArray | None
+
+
+@overload
+def skew(vector: Array) -> Array: ...
+@overload
+def skew(vector: ComplexArray) -> ComplexArray: ...
+def skew(vector: Array | ComplexArray) -> Array | ComplexArray:
+    """Return the matrix of the cross product, shape (..., 3, 3), of vectors (..., 3)."""
+    matrix = np.zeros((*vector.shape, 3), dtype=vector.dtype)
+    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
+    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -z, y, -x
+    matrix[..., 1, 0], matrix[..., 2, 0], matrix[..., 2, 1] = z, -y, x
+    return matrix
+
+
+@overload
+def by_matrix(field_sensor: Array) -> Array: ...
+@overload
+def by_matrix(field_sensor: ComplexArray) -> ComplexArray: ...
+def by_matrix(field_sensor: Array | ComplexArray) -> Array | ComplexArray:
+    """Return the derivative of ``matrix @ field_sensor`` by the matrix, shape (..., 3, 9)."""
+    columns = np.zeros((*field_sensor.shape, 3, 3), dtype=field_sensor.dtype)
+    for row in range(3):
+        columns[..., row, row, :] = field_sensor
+    return columns.reshape(*field_sensor.shape, 9)
+
+
+def _offset_beacon(
+    beacon: Beacon, magnetometer: Magnetometer, world_from_body: Array, position_world: Array
+) -> Array:
+    sensor_world = position_world + world_from_body @ magnetometer.position_body
+    return (sensor_world - beacon.position_world) @ beacon.world_from_beacon
+
+
+def _turned(excitation: ComplexArray, phase: Array | None) -> ComplexArray:
+    """Excitation with the drive phase applied, shape (..., coils, tones)."""
+    return excitation if phase is None else excitation * np.exp(1j * phase)[..., None, :]
+
+
+def _coil_fields(beacon: Beacon, offset_beacon: Array) -> tuple[Array, Array]:
+    """Offset from, and field of, each coil; shape (..., coils, 3), beacon axes."""
+    offset = offset_beacon[..., None, :] - beacon.centres_beacon
+    return offset, dipole_field(offset, beacon.moments_beacon)
+
+
+class _Mapped(NamedTuple):
+    """What a field map makes of the model, beacon axes."""
+
+    model_beacon: Array  # (..., coils, 3), field of each coil without the map
+    correction: Array  # (..., 1, 3, 3), multiplies it
+    slope: Array  # (..., coils, 3, 3), what the map's change along each axis adds to the gradient
+
+
+def _mapped(beacon: Beacon, offset_beacon: Array, model_beacon: Array) -> _Mapped | None:
+    """Evaluate the beacon's map at the sensor; None where it has none."""
+    if beacon.field_map is None:
+        return None
+    world_from_beacon = beacon.world_from_beacon
+    sensor_world = beacon.position_world + offset_beacon @ world_from_beacon.T
+    value, gradient = beacon.field_map.mean(sensor_world)
+    gradient = gradient @ world_from_beacon
+    turn_beacon = value[..., 1:] @ world_from_beacon
+    by_axis = (world_from_beacon.T @ gradient[..., 1:, :])[..., None, :, :]
+    correction = np.exp(value[..., :1, None]) * (np.eye(3) + skew(turn_beacon))
+    correction = correction[..., None, :, :]
+    mapped = (correction @ model_beacon[..., None])[..., 0]
+    gain = np.exp(value[..., 0])[..., None, None, None]
+    slope = mapped[..., None] * gradient[..., None, :1, :] - gain * skew(model_beacon) @ by_axis
+    return _Mapped(model_beacon, correction, slope)
+
+
+def predict(
+    beacon: Beacon,
+    magnetometer: Magnetometer,
+    world_from_body: Array,
+    position_world: Array,
+    phase: Array | None = None,
+) -> ComplexArray:
+    """Return the phasors that `observe` returns, shape (..., tones, 3) (T), without Jacobian."""
+    if magnetometer.coil_centres_sensor is not None:
+        apart = [
+            predict(beacon, axis, world_from_body, position_world, phase)[..., i]
+            for i, axis in enumerate(_axes_apart(magnetometer))
+        ]
+        return np.stack(apart, axis=-1)
+    offset = _offset_beacon(beacon, magnetometer, world_from_body, position_world)
+    _, coils = _coil_fields(beacon, offset)
+    mapped = _mapped(beacon, offset, coils)
+    if mapped is not None:
+        coils = (mapped.correction @ coils[..., None])[..., 0]
+    in_beacon = np.swapaxes(_turned(beacon.excitation, phase), -1, -2) @ coils
+    beacon_from_body = beacon.world_from_beacon.T @ world_from_body
+    in_body = in_beacon @ beacon_from_body
+    return in_body @ (magnetometer.body_from_sensor @ magnetometer.matrix.T)
+
+
+def observe(
+    beacon: Beacon,
+    magnetometer: Magnetometer,
+    world_from_body: Array,
+    position_world: Array,
+    phase: Array | None = None,
+    twist_body: Array | None = None,
+) -> Observation:
+    """Predict the phasors of one beacon, with the Jacobian in the same call.
+
+    ::
+
+        Y = S sensor_from_body body_from_world C world_from_beacon [G(r_j) m_j]_j X
+            diag(exp(i phase))
+
+    C is the beacon's field map at the sensor, the identity where it has none.
+
+    Parameters
+    ----------
+    beacon : Beacon
+        Coils with their moments, centres, and complex drive in each tone.
+    magnetometer : Magnetometer
+        Matrix, mounting and lever arm.
+    world_from_body : ndarray, shape (..., 3, 3)
+    position_world : ndarray, shape (..., 3)
+        Origin of the body (m).
+    phase : ndarray, shape (..., tones), optional
+        Drive phase relative to the log clock beyond what the coils declare (rad).
+    twist_body : ndarray, shape (..., 6), optional
+        Angular rate (rad/s) and velocity (m/s) of the body, body axes, for the time offset.
+
+    Returns
+    -------
+    Observation
+        Leading axes as those of the poses.
+    """
+    if magnetometer.coil_centres_sensor is not None:
+        apart = [
+            observe(beacon, axis, world_from_body, position_world, phase, twist_body)
+            for axis in _axes_apart(magnetometer)
+        ]
+        return _joined(apart, magnetometer.coil_centres_sensor)
+    mounting, matrix = magnetometer.body_from_sensor, magnetometer.matrix
+    seen = _seen(beacon, magnetometer, world_from_body, position_world, phase)
+    phasor, platform_pose = seen.phasor_sensor, seen.platform_pose
+    field_beacon = seen.tones_from_coils @ seen.coils_beacon
+    sensor_from_body = matrix @ mounting.T
+    measured_from_beacon = (sensor_from_body @ seen.body_from_beacon)[..., None, :, :]
+    in_sensor = field_beacon @ (np.swapaxes(seen.body_from_beacon, -1, -2) @ mounting)
+
+    by_body = platform_pose[..., 3:]
+    by_beacon_offset = by_body @ seen.body_from_beacon[..., None, :, :]
+    turned = measured_from_beacon @ skew(field_beacon)
+    if seen.mapped is not None:  # the map stays where it is when the beacon moves
+        flat = seen.mapped.slope.reshape(*seen.mapped.slope.shape[:-2], 9)
+        slope = (seen.tones_from_coils @ flat).reshape(*field_beacon.shape, 3)
+        by_beacon_offset = by_beacon_offset - measured_from_beacon @ slope
+        model_beacon = seen.tones_from_coils @ seen.mapped.model_beacon
+        turned = measured_from_beacon @ seen.mapped.correction @ skew(model_beacon)
+    beacon_rotation = by_beacon_offset @ skew(seen.offset_beacon)[..., None, :, :] - turned
+    # (..., tones, coils, 3)
+    by_coil = seen.coils_beacon[..., None, :, :] * seen.tones_from_coils[..., None]
+    by_time_offset: ComplexArray | None = None
+    if twist_body is not None:
+        twist = twist_body.astype(np.complex128)[..., None, :, None]
+        by_time_offset = -(platform_pose @ twist)[..., 0]
+    return Observation(
+        phasor_sensor=phasor,
+        platform_pose=platform_pose,
+        beacon_pose=np.concatenate([beacon_rotation, -by_beacon_offset], axis=-1),
+        log_moments=measured_from_beacon @ np.swapaxes(by_coil, -1, -2),
+        phase=1j * phasor,
+        matrix=by_matrix(in_sensor),
+        body_from_sensor=np.concatenate([matrix @ skew(in_sensor), by_body @ mounting], axis=-1),
+        time_offset=by_time_offset,
+    )
+
+
+def observe_from(
+    beacon: Beacon,
+    magnetometer: Magnetometer,
+    world_from_body: Array,
+    position_world: Array,
+    phase: Array | None = None,
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return phasor_sensor and platform_pose of `observe` alone, at a fraction of the cost."""
+    if magnetometer.coil_centres_sensor is not None:
+        whole = observe(beacon, magnetometer, world_from_body, position_world, phase)
+        return whole.phasor_sensor, whole.platform_pose
+    seen = _seen(beacon, magnetometer, world_from_body, position_world, phase)
+    return seen.phasor_sensor, seen.platform_pose
+
+
+def _axes_apart(magnetometer: Magnetometer) -> list[Magnetometer]:
+    """Return a magnetometer for each axis, at its own coil: only that axis of it is true."""
+    assert magnetometer.coil_centres_sensor is not None
+    return [
+        replace(
+            magnetometer,
+            position_body=magnetometer.position_body + magnetometer.body_from_sensor @ centre,
+            coil_centres_sensor=None,
+        )
+        for centre in magnetometer.coil_centres_sensor
+    ]
+
+
+def _joined(apart: list[Observation], centres_sensor: Array) -> Observation:
+    """Return the observation whose axis i is that of the i-th."""
+    fields = {
+        name: np.stack([getattr(o, name)[..., i, :] for i, o in enumerate(apart)], axis=-2)
+        for name in ("platform_pose", "beacon_pose", "log_moments", "matrix", "body_from_sensor")
+    }
+    for i, centre in enumerate(centres_sensor):  # the mounting turns the coils' centres too
+        turning = fields["body_from_sensor"][..., i, :]
+        turning[..., :3] -= turning[..., 3:] @ skew(centre)
+    for name in ("phasor_sensor", "phase"):
+        fields[name] = np.stack([getattr(o, name)[..., i] for i, o in enumerate(apart)], axis=-1)
+    offsets = [o.time_offset[..., i] for i, o in enumerate(apart) if o.time_offset is not None]
+    return Observation(**fields, time_offset=np.stack(offsets, axis=-1) if offsets else None)
+
+
+class _Seen(NamedTuple):
+    """What the blocks of an observation have in common."""
+
+    phasor_sensor: ComplexArray
+    platform_pose: ComplexArray
+    offset_beacon: Array
+    coils_beacon: Array  # (..., coils, 3), field of each coil
+    tones_from_coils: ComplexArray  # (..., tones, coils)
+    body_from_beacon: Array
+    mapped: _Mapped | None
+
+
+def _times(left: Array, right: Array) -> Array:
+    """Return ``left @ right`` of many and one: a single product is faster than as many small."""
+    return (left.reshape(-1, 3) @ right).reshape(left.shape)
+
+
+def _seen(
+    beacon: Beacon,
+    magnetometer: Magnetometer,
+    world_from_body: Array,
+    position_world: Array,
+    phase: Array | None,
+) -> _Seen:
+    offset_beacon = _offset_beacon(beacon, magnetometer, world_from_body, position_world)
+    offset, coils = _coil_fields(beacon, offset_beacon)
+    tones_from_coils = np.swapaxes(_turned(beacon.excitation, phase), -1, -2)
+    body_from_beacon = _times(np.swapaxes(world_from_body, -1, -2), beacon.world_from_beacon)
+    beacon_from_body = np.swapaxes(body_from_beacon, -1, -2)
+    body_from_sensor = magnetometer.body_from_sensor @ magnetometer.matrix.T  # not a rotation
+    measured_from_beacon = np.swapaxes(_times(beacon_from_body, body_from_sensor), -1, -2)
+    # Coil by coil all is real; only their sum in a tone is complex.
+    gradients = dipole_gradient(offset, beacon.moments_beacon)
+    mapped = _mapped(beacon, offset_beacon, coils)
+    if mapped is not None:
+        coils = (mapped.correction @ coils[..., None])[..., 0]
+        gradients = mapped.correction @ gradients + mapped.slope
+    in_body = coils @ beacon_from_body
+    by_body = measured_from_beacon[..., None, :, :] @ gradients
+    by_body = by_body @ beacon_from_body[..., None, :, :]
+    turning = -np.swapaxes(_times(skew(in_body), body_from_sensor), -1, -2)
+    by_rotation = turning - _times(by_body, skew(magnetometer.position_body))
+    parts = (_times(in_body, body_from_sensor), by_rotation, by_body)
+    by_coil = np.concatenate([p.reshape(*coils.shape[:-1], -1) for p in parts], axis=-1)
+    in_tones = tones_from_coils @ by_coil
+    jacobian = in_tones[..., 3:].reshape(*in_tones.shape[:-1], 2, 3, 3)
+    return _Seen(
+        phasor_sensor=in_tones[..., :3],
+        platform_pose=np.concatenate([jacobian[..., 0, :, :], jacobian[..., 1, :, :]], axis=-1),
+        offset_beacon=offset_beacon,
+        coils_beacon=coils,
+        tones_from_coils=tones_from_coils,
+        body_from_beacon=body_from_beacon,
+        mapped=mapped,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class EarthObservation:
+    """Predicted steady field with its Jacobian blocks, by what is on the other side of each.
+
+    Parameters
+    ----------
+    measured_sensor : ndarray, shape (..., 3)
+        (T), measured axes.
+    platform_rotation : ndarray, shape (..., 3, 3)
+        Right perturbation of world_from_body (T/rad).
+    matrix : ndarray, shape (..., 3, 9)
+        Magnetometer matrix, row by row (T).
+    sensor_rotation : ndarray, shape (..., 3, 3)
+        Right perturbation of body_from_sensor (T/rad).
+    offset : ndarray, shape (..., 3, 3)
+        Of the magnetometer.
+    earth_world : ndarray, shape (..., 3, 3)
+        The field itself, world axes.
+    """
+
+    measured_sensor: Array
+    platform_rotation: Array
+    matrix: Array
+    sensor_rotation: Array
+    offset: Array
+    earth_world: Array
+
+
+def observe_earth(
+    magnetometer: Magnetometer, world_from_body: Array, earth_field_world: Array
+) -> EarthObservation:
+    """Predict the steady part of what a magnetometer reads, with the Jacobian in the same call.
+
+    ::
+
+        m = S sensor_from_body body_from_world e + offset
+
+    Parameters
+    ----------
+    world_from_body : ndarray, shape (..., 3, 3)
+    earth_field_world : ndarray, shape (3,)
+        (T)
+    """
+    mounting, matrix = magnetometer.body_from_sensor, magnetometer.matrix
+    measured_from_body = matrix @ mounting.T
+    in_body = earth_field_world @ world_from_body
+    in_sensor = in_body @ mounting
+    return EarthObservation(
+        measured_sensor=in_sensor @ matrix.T + magnetometer.offset,
+        platform_rotation=measured_from_body @ skew(in_body),
+        matrix=by_matrix(in_sensor),
+        sensor_rotation=matrix @ skew(in_sensor),
+        offset=np.broadcast_to(np.eye(3), (*in_sensor.shape, 3)),
+        earth_world=measured_from_body @ np.swapaxes(world_from_body, -1, -2),
+    )
+
+
+def model_error_cov(phasor_sensor: ComplexArray, model_error: float | Array) -> Array:
+    """Return the variance that an inexact field model adds to each component of a phasor.
+
+    ``eps^2 |b|^2 / 3``, with ``|b|^2`` the mean square of the two quadratures: plain white-noise
+    weights let the nearest beacon's model error swamp everything else (paper 004 re-examined).
+
+    Parameters
+    ----------
+    phasor_sensor : complex ndarray, shape (..., 3)
+        (T)
+    model_error : float or ndarray, shape (...)
+        Relative error of the field model, one sigma.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        (T^2)
+    """
+    power = 0.5 * np.sum(np.abs(phasor_sensor) ** 2, axis=-1)
+    return (model_error**2 * power)[..., None, None] / 3.0 * np.eye(3)

@@ -1,0 +1,145 @@
+"""What the field of one beacon is, relative to its model, over the places where it was surveyed.
+
+``field = exp(g) (model + w x model)``: a Gaussian process of the logarithm g of the gain and of a
+small rotation w, functions of the sensor's position.  `magfusion.calibration.fieldmap` learns it;
+`magfusion.model.field.observe` applies it.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from magfusion.units import Array
+
+COMPONENTS = 4  # log-gain, then the rotation about x, y, z
+_ROWS = 8192  # positions evaluated at once
+
+
+@dataclass(frozen=True, eq=False)
+class FieldMap:
+    """A Gaussian process with a squared-exponential kernel, conditioned on a survey.
+
+    Parameters
+    ----------
+    points_world : ndarray, shape (m, 3)
+        Of the sensor (m).
+    weights : ndarray, shape (m, 4)
+        The mean at x is ``sigma^2 sum_j rho(x, x_j) weights_j``.
+    information : ndarray, shape (m, 4, 4)
+        What the survey knew at each point of gain and rotation.
+    length_scale : float
+        (m)
+    gain_sigma, rotation_sigma : float
+        Of the process, where nothing was surveyed; the latter in rad.
+    residual : float
+        Relative error of the field that no smooth map explains, one sigma; it takes the place of
+        the site's ``model_error``.
+    """
+
+    points_world: Array
+    weights: Array
+    information: Array
+    length_scale: float
+    gain_sigma: float
+    rotation_sigma: float
+    residual: float
+
+    @cached_property
+    def component_sigma(self) -> Array:
+        """Standard deviation of the process in each component, shape (4,)."""
+        return np.array([self.gain_sigma, *[self.rotation_sigma] * 3])
+
+    @cached_property
+    def _reduction(self) -> Array:
+        """``(1 + information K)^-1 information``, shape (4 m, 4 m)."""
+        kernel = process_covariance(self.points_world, self.length_scale, self.component_sigma)
+        information = block_diagonal(self.information)
+        system = np.eye(len(kernel)) + information @ kernel
+        return np.asarray(np.linalg.solve(system, information))
+
+    @cached_property
+    def typical_variance(self) -> Array:
+        """Median over the survey's points of `variance`, shape (2,)."""
+        return np.median(self.variance(self.points_world), axis=0)
+
+    def mean(self, position_world: Array) -> tuple[Array, Array]:
+        """Return the map with its gradient.
+
+        Parameters
+        ----------
+        position_world : ndarray, shape (..., 3)
+            Of the sensor (m).
+
+        Returns
+        -------
+        value : ndarray, shape (..., 4)
+            Log-gain and rotation (rad, world axes).
+        gradient : ndarray, shape (..., 4, 3)
+            By the position, world axes (1/m).
+        """
+        flat = position_world.reshape(-1, 3)
+        value, gradient = np.empty((len(flat), 4)), np.empty((len(flat), 4, 3))
+        scaled = self.weights * self.component_sigma**2
+        moment = scaled[:, :, None] * self.points_world[:, None, :]
+        for start in range(0, len(flat), _ROWS):
+            rows = slice(start, start + _ROWS)
+            near = correlation(flat[rows], self.points_world, self.length_scale)
+            value[rows] = near @ scaled
+            pulled = (near @ moment.reshape(len(moment), -1)).reshape(-1, 4, 3)
+            gradient[rows] = pulled - value[rows, :, None] * flat[rows, None, :]
+        gradient /= self.length_scale**2
+        shape = position_world.shape[:-1]
+        return value.reshape(*shape, 4), gradient.reshape(*shape, 4, 3)
+
+    def variance(self, position_world: Array) -> Array:
+        """Return the variance of log-gain and, mean of three axes, of rotation; shape (n, 2)."""
+        out = np.empty((len(position_world), 2))
+        rows = max(1, _ROWS // max(1, len(self.points_world)))
+        prior = self.component_sigma**2
+        for start in range(0, len(position_world), rows):
+            part = slice(start, start + rows)
+            near = correlation(position_world[part], self.points_world, self.length_scale)
+            spread = near[:, None, :, None] * (np.eye(4) * prior)[None, :, None, :]
+            reach = spread.reshape(len(near), 4, -1)
+            known = np.einsum("nai,nai->na", reach @ self._reduction, reach)
+            left = np.maximum(prior - known, 0.0)
+            out[part] = np.stack([left[:, 0], np.mean(left[:, 1:], axis=1)], axis=1)
+        return out
+
+    def relative_variance(self, position_world: Array | None = None) -> Array:
+        """Return the mean square of the field's error relative to its strength.
+
+        Parameters
+        ----------
+        position_world : ndarray, shape (n, 3), optional
+            Of the sensor (m); where it is not known yet, a typical place of the survey is meant.
+
+        Returns
+        -------
+        ndarray, shape (n,) or ()
+        """
+        known = self.typical_variance if position_world is None else self.variance(position_world)
+        # A rotation moves the field by the two of its components that are across.
+        return self.residual**2 + known[..., 0] + 2.0 * known[..., 1]
+
+
+def correlation(first_world: Array, second_world: Array, length_scale: float) -> Array:
+    """Return the correlation of the process between positions, shape (n, m)."""
+    square = np.sum((first_world[:, None] - second_world) ** 2, axis=-1)
+    return np.exp(-0.5 * square / length_scale**2)
+
+
+def process_covariance(points_world: Array, length_scale: float, sigma: Array) -> Array:
+    """Return the prior covariance at the points, point by point, shape (4 m, 4 m)."""
+    near = correlation(points_world, points_world, length_scale)
+    return np.asarray(np.kron(near, np.diag(sigma**2)))
+
+
+def block_diagonal(blocks: Array) -> Array:
+    """Return matrices of shape (..., k, m, m) as one, shape (..., k m, k m)."""
+    count, size = blocks.shape[-3:-1]
+    out = np.zeros((*blocks.shape[:-3], count, size, count, size))
+    for i in range(count):
+        out[..., i, :, i, :] = blocks[..., i, :, :]
+    return out.reshape(*blocks.shape[:-3], count * size, count * size)

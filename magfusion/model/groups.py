@@ -1,0 +1,3 @@
+"""Names of the calibration groups of `magfusion.model.parameters`, for who only names them."""
+
+GROUPS = ("beacons", "moments", "phase", "magnetometer", "extrinsics", "time-offset", "earth")

@@ -1,0 +1,173 @@
+"""Parameters of a beacon: where it is, how strong, and how its drive runs."""
+
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from magfusion.model.parameters.parameter import (
+    AXES,
+    CENTIMETRE,
+    DEGREES,
+    METRE,
+    PERCENT,
+    PPM,
+    Calibration,
+    Parameter,
+    PhasorView,
+    SiteParameter,
+)
+from magfusion.model.site import Beacon, Site
+from magfusion.units import Array, BoolArray, ComplexArray
+
+PHASE_SIGMA = 1e2  # rad; wide enough to be no information
+
+
+class BeaconParameter(Parameter):
+    """A parameter that every beacon has; its owners are the beacons' names."""
+
+    def part(self, site: Site, owner: str) -> Beacon:
+        """Return the beacon."""
+        return next(b for b in site.beacons if b.name == owner)
+
+    def with_part(self, site: Site, part: Beacon) -> Site:
+        """Return the site with the beacon of that name replaced."""
+        return replace(
+            site, beacons=tuple(part if b.name == part.name else b for b in site.beacons)
+        )
+
+    def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
+        """Return the columns of the owner's phasors; it has no bearing on the others'."""
+        return self.own_jacobian(view) if view.beacon.name == owner else None
+
+    def own_jacobian(self, view: PhasorView) -> ComplexArray:
+        """Return the columns of the owner's phasors."""
+        raise NotImplementedError
+
+
+class _Rotation(BeaconParameter, SiteParameter):
+    group, kind, components = "beacons", "rotation", AXES
+    attribute, sigma_attribute, is_rotation = "world_from_beacon", "rotation_beacon", True
+    unit = spoken = DEGREES
+    words = "the turn of beacon {owner} about its {axis}"
+    negligible = 1.75e-3
+    field_error = 2.0
+
+    def own_jacobian(self, view: PhasorView) -> ComplexArray:
+        return view.whole.beacon_pose[..., :3]
+
+
+class _Position(BeaconParameter, SiteParameter):
+    group, kind, components = "beacons", "position", AXES
+    attribute = sigma_attribute = "position_world"
+    unit, spoken = METRE, CENTIMETRE
+    words = ("x of beacon {owner}", "y of beacon {owner}", "the height of beacon {owner}")
+    negligible = 2e-3
+    field_error, falls = 9.0, 2  # the field falls with the cube of the distance
+
+    def own_jacobian(self, view: PhasorView) -> ComplexArray:
+        return view.whole.beacon_pose[..., 3:] @ view.beacon.world_from_beacon.T
+
+
+class _LogMoment(BeaconParameter, SiteParameter):
+    group, kind, sigma_attribute = "moments", "log_moment", "log_moment"
+    spoken = PERCENT
+    negligible = 2e-3
+    field_error = 1.0
+    walk = "clock.log_moment_walk"
+
+    def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
+        beacon = self.part(calibration.site, owner)
+        coils = tuple(
+            replace(coil, moment_beacon=coil.moment_beacon * np.exp(change))
+            for coil, change in zip(beacon.coils, step, strict=True)
+        )
+        site = self.with_part(calibration.site, replace(beacon, coils=coils))
+        return replace(calibration, site=site)
+
+    def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
+        beacons = (self.part(c.site, owner) for c in (old, new))
+        before, after = (np.linalg.norm(beacon.moments_beacon, axis=1) for beacon in beacons)
+        return np.log(after / before)
+
+    def own_jacobian(self, view: PhasorView) -> ComplexArray:
+        return view.whole.log_moments
+
+    def called(self, site: Site, owner: str, i: int) -> str:
+        coil = f"coil {i} of " if len(self.part(site, owner).coils) > 1 else ""
+        return f"the moment of {coil}beacon {owner}"
+
+
+class _OfDrive(BeaconParameter):
+    """A parameter of the log's own: some entries of an array that the calibration holds."""
+
+    of_log = factor_of_phasor = True
+    attribute: ClassVar[str]
+
+    def mine(self, site: Site, owner: str) -> BoolArray:
+        """Return which entries are the owner's; here one a channel."""
+        return np.array([name == owner for name, _ in site.channels], dtype=bool)
+
+    def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
+        value = getattr(calibration, self.attribute).copy()
+        value[self.mine(calibration.site, owner)] += step
+        return replace(calibration, **{self.attribute: value})
+
+    def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
+        change = getattr(new, self.attribute) - getattr(old, self.attribute)
+        return change[self.mine(old.site, owner)]
+
+
+class _Phase(_OfDrive):
+    group = kind = attribute = "phase"
+    unit = spoken = DEGREES
+    words = "the drive phase of beacon {owner}"
+    walk = "clock.phase_walk"
+
+    def sigma(self, site: Site, owner: str) -> Array:
+        beacon = self.part(site, owner)
+        return np.full(len(beacon.tones), 0.0 if beacon.synchronised else PHASE_SIGMA)
+
+    def own_jacobian(self, view: PhasorView) -> ComplexArray:
+        return 1j * view.phasor[..., None] * np.eye(len(view.beacon.tones))[:, None, :]
+
+
+class _Drift(_OfDrive):
+    group, kind, attribute = "phase", "drift", "drift"
+    unit = spoken = PPM
+    words = "the clock of beacon {owner}"
+    walk = "clock.drift_walk"
+
+    def sigma(self, site: Site, owner: str) -> Array:
+        return np.array([0.0 if self.part(site, owner).synchronised else site.clock.drift_sigma])
+
+    def mine(self, site: Site, owner: str) -> BoolArray:
+        return np.array([beacon.name == owner for beacon in site.beacons], dtype=bool)
+
+    def own_jacobian(self, view: PhasorView) -> ComplexArray:
+        turns = 2.0 * np.pi * view.beacon.tone_frequencies_hz[:, None]
+        return (1j * view.phasor * (turns * view.elapsed[:, None, None]))[..., None]
+
+    def drags(
+        self, calibration: Calibration, owner: str, time: float
+    ) -> tuple[Parameter, Array] | None:
+        # A frequency that changes now has not turned the phase of all the time before: the phase
+        # at the reference time goes back by what the new frequency would have made.
+        tones = self.part(calibration.site, owner).tone_frequencies_hz
+        return PHASE, -2.0 * np.pi * tones[:, None] * (time - calibration.reference_time)
+
+
+class _Gain(_OfDrive):
+    """What every phasor of a beacon is larger by; found beside a pose, never part of a site."""
+
+    group, kind, attribute = "gain", "gain", "log_gain"
+
+    def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
+        return super().difference(old, new, owner)[:1]
+
+    def own_jacobian(self, view: PhasorView) -> ComplexArray:
+        return view.phasor[..., None]
+
+
+BEACON_ROTATION, BEACON_POSITION, LOG_MOMENT = _Rotation(), _Position(), _LogMoment()
+PHASE, DRIFT, GAIN = _Phase(), _Drift(), _Gain()

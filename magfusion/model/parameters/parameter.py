@@ -1,0 +1,253 @@
+"""What a calibration parameter is: all that is particular to one kind of it, in one object."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from operator import attrgetter
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.model.field import EarthObservation, Observation
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import Beacon, Site
+from magfusion.units import DEGREE, Array, ComplexArray
+
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Current values of everything that can be estimated besides the trajectory.
+
+    Parameters
+    ----------
+    phase : ndarray, shape (channels,)
+        Drive phase of each channel at ``reference_time`` beyond the coils' own (rad).
+    drift : ndarray, shape (beacons,)
+        Relative error of each beacon's clock.
+    time_offset : float
+        The IMU's sample stamped t was taken at t + time_offset (s).
+    reference_time : float
+        Where ``phase`` holds (s).
+    log_gain : ndarray, shape (channels,)
+        Logarithm of what each channel's phasor is larger by than the site says.
+    others : mapping
+        Values of parameters that have no field here, by ``owner.kind``; absent means zero.
+
+    ``phase`` and ``log_gain`` may have one row for each pose.
+    """
+
+    site: Site
+    phase: Array
+    drift: Array
+    time_offset: float
+    reference_time: float
+    log_gain: Array
+    others: Mapping[str, Array] = field(default_factory=dict)
+
+    def drive_phase(self, time: Array) -> Array:
+        """Return the phase of every channel at the given times, shape (..., channels) (rad)."""
+        owner = [i for i, b in enumerate(self.site.beacons) for _ in b.tones]
+        frequencies = np.concatenate([b.tone_frequencies_hz for b in self.site.beacons])
+        rate = 2.0 * np.pi * frequencies * self.drift[owner]
+        return self.phase + (time[..., None] - self.reference_time) * rate
+
+
+class Unit(NamedTuple):
+    """A unit's name, and its size in that of the tangent vector."""
+
+    text: str
+    size: float
+
+
+NO_UNIT, METRE, SECOND = Unit("", 1.0), Unit("m", 1.0), Unit("s", 1.0)
+DEGREES, PPM, PERCENT = Unit("deg", DEGREE), Unit("ppm", 1e-6), Unit("%", 1e-2)
+CENTIMETRE, MILLISECOND = Unit("cm", 1e-2), Unit("ms", 1e-3)
+
+
+class PhasorView(NamedTuple):
+    """What the Jacobian of one beacon's phasors is made of."""
+
+    calibration: Calibration
+    beacon: Beacon
+    elapsed: Array  # (n,) since the reference time (s)
+    phasor: ComplexArray  # (n, tones, 3)
+    observation: Observation | None  # None where all that is asked for is a factor of the phasor
+
+    @property
+    def whole(self) -> Observation:
+        """The observation of a parameter that is no factor of the phasor."""
+        assert self.observation is not None
+        return self.observation
+
+
+class SteadyView(NamedTuple):
+    """What the Jacobian of the steady field is made of."""
+
+    calibration: Calibration
+    observation: EarthObservation
+    rate_body: Array  # (n, 3) (rad/s)
+
+
+class Parameter:
+    """One kind of calibration parameter.
+
+    A new one is a subclass, added to the kinds in use: estimators, reports and files know of it
+    what it says here.  What is not overridden makes it a value in `Calibration.others` that starts
+    at zero, adds up, and has no bearing on any measurement.  The tangent vector's unit is ``si``.
+    """
+
+    group: ClassVar[str]  # under which it is chosen, with others
+    owner: ClassVar[str]  # what it belongs to, and what it is of that: its name
+    kind: ClassVar[str]
+    components: ClassVar[Sequence[str]] = ()  # names of its numbers; otherwise they are counted
+    unit: ClassVar[Unit] = NO_UNIT  # of figures under its name
+    spoken: ClassVar[Unit] = NO_UNIT  # of sentences
+    words: ClassVar[str | Sequence[str]] = "{owner}.{kind} {i}"  # of sentences: for all or for each
+    si: ClassVar[float] = 1.0  # numbers of all sizes in one covariance cost its digits
+    # A survey this good is kept at its declared values; what it may still be wrong by is considered
+    # in the covariance of the result.
+    negligible: ClassVar[float] = 0.0
+    declared: ClassVar[bool] = False  # whether the site's file has its value and its sigma
+    of_log: ClassVar[bool] = False  # whether it is the log's own, only recorded with the site
+    steady_only: ClassVar[bool] = False  # whether only the steady field determines it
+    factor_of_phasor: ClassVar[bool] = False  # its Jacobian is the phasor but for a factor
+    inertial: ClassVar[bool] = False  # whether it corrects the inertial stream
+    # Its mean variance, times this and by this power of the distance, is relative variance of a
+    # beacon's field.
+    field_error: ClassVar[float] = 0.0
+    falls: ClassVar[int] = 0
+    by_turning: ClassVar[str] = ""  # what it is called where turning would determine it
+    walk: ClassVar[str] = ""  # where the site says what standard deviation it gains in an hour (SI)
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other)
+
+    def __hash__(self) -> int:
+        return hash(type(self))
+
+    def __repr__(self) -> str:
+        # Of the same settings the same in every process: checkpoints are recognised by it.
+        return f"{type(self).__qualname__}()"
+
+    def sigma(self, site: Site, owner: str) -> Array:
+        """Return the prior standard deviations, flat; all zero where it is known."""
+        raise NotImplementedError
+
+    def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
+        """Return the calibration moved by a step."""
+        name = f"{owner}.{self.kind}"
+        value = calibration.others.get(name, 0.0) + step
+        return replace(calibration, others={**calibration.others, name: value})
+
+    def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
+        """Return the step that takes one calibration to another: the inverse of `moved`."""
+        name, zero = f"{owner}.{self.kind}", np.zeros(1)
+        return new.others.get(name, zero) - old.others.get(name, zero)
+
+    def refined(self, site: Site, calibration: Calibration, owner: str, sigma: Array) -> Site:
+        """Return the site of a fitted calibration with its value and posterior sigma."""
+        return site
+
+    def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
+        """Return its columns, shape (n, tones, 3, columns); None where it has no bearing."""
+        return None
+
+    def steady_jacobian(self, view: SteadyView) -> Array | None:
+        """Return its columns, shape (n, 3, columns); None where it has no bearing."""
+        return None
+
+    def corrected_imu(self, calibration: Calibration, owner: str, imu: ImuSamples) -> ImuSamples:
+        """Return the inertial samples without what this parameter does to them."""
+        return imu
+
+    def walk_per_sqrt_hour(self, site: Site) -> float:
+        """Return the standard deviation that it gains in an hour."""
+        return attrgetter(self.walk)(site) / self.si if self.walk else 0.0
+
+    def drags(
+        self, calibration: Calibration, owner: str, time: float
+    ) -> "tuple[Parameter, Array] | None":
+        """Return what else a step of it moves that happens at a time, shape (columns, own)."""
+        return None
+
+    def called(self, site: Site, owner: str, i: int) -> str:
+        """Return what one of its numbers is called in a sentence."""
+        words = self.words if isinstance(self.words, str) else self.words[i]
+        return words.format(owner=owner, kind=self.kind, i=i, axis=AXES[i % 3])
+
+
+class SiteParameter(Parameter):
+    """A parameter that is an attribute of some part of the site, with a sigma there."""
+
+    declared = True
+    attribute: ClassVar[str]
+    sigma_attribute: ClassVar[str]
+    is_rotation: ClassVar[bool] = False  # perturbed on its right
+
+    def part(self, site: Site, owner: str) -> Any:
+        """Return the part of the site."""
+        raise NotImplementedError
+
+    def with_part(self, site: Site, part: Any) -> Site:
+        """Return the site with that part replaced."""
+        raise NotImplementedError
+
+    def sigma(self, site: Site, owner: str) -> Array:
+        """Return what the survey declares."""
+        return getattr(self.part(site, owner).sigma, self.sigma_attribute).ravel() / self.si
+
+    def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
+        """Return the calibration with the part moved."""
+        part = self.part(calibration.site, owner)
+        value = getattr(part, self.attribute)
+        if self.is_rotation:
+            value = value @ Rotation.from_rotvec(step).as_matrix()
+        else:
+            value = value + self.si * step.reshape(value.shape)
+        part = replace(part, **{self.attribute: value})
+        return replace(calibration, site=self.with_part(calibration.site, part))
+
+    def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
+        """Return the step between two states of the part."""
+        a, b = (getattr(self.part(c.site, owner), self.attribute) for c in (old, new))
+        if self.is_rotation:
+            return Rotation.from_matrix(a.T @ b).as_rotvec()
+        return ((b - a) / self.si).ravel()
+
+    def refined(self, site: Site, calibration: Calibration, owner: str, sigma: Array) -> Site:
+        """Return the site with the posterior sigma; the value is in it."""
+        part = self.part(site, owner)
+        shape = getattr(part.sigma, self.sigma_attribute).shape
+        changed = {self.sigma_attribute: self.si * sigma.reshape(shape)}
+        return self.with_part(site, replace(part, sigma=replace(part.sigma, **changed)))
+
+
+class Block(NamedTuple):
+    """One named part of the tangent vector, e.g. the position of beacon A."""
+
+    parameter: Parameter
+    owner: str
+    columns: slice
+    sigma: Array
+
+    @property
+    def group(self) -> str:
+        """Name under which it is chosen."""
+        return self.parameter.group
+
+    @property
+    def kind(self) -> str:
+        """What it is of its owner."""
+        return self.parameter.kind
+
+    @property
+    def name(self) -> str:
+        """E.g. ``A.position`` or ``magnetometer.matrix``."""
+        return f"{self.owner}.{self.kind}"
+
+    @property
+    def key(self) -> tuple[Parameter, str]:
+        """What distinguishes it from all others; a beacon may be called sensor, so not its name."""
+        return self.parameter, self.owner

@@ -1,0 +1,47 @@
+"""The field of a magnetic dipole and its gradient."""
+
+import numpy as np
+
+from magfusion.units import MU0_OVER_4PI, Array
+
+
+def dipole_field(offset: Array, moment: Array) -> Array:
+    """Return the flux density of a dipole, in the axes of its arguments.
+
+    Parameters
+    ----------
+    offset : ndarray, shape (..., 3)
+        From the dipole to the point of interest (m). Must not be zero.
+    moment : ndarray, shape (..., 3)
+        Dipole moment (A m^2).
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Flux density (T): ``(mu0/4pi) (3 n (n . m) - m) / r^3``, n the direction of offset (paper
+        004, Eq 1).
+    """
+    square = np.einsum("...i,...i", offset, offset)[..., None]
+    along = np.einsum("...i,...i", offset, moment)[..., None]
+    return MU0_OVER_4PI * (3.0 * offset * along / square - moment) / square**1.5
+
+
+def dipole_gradient(offset: Array, moment: Array) -> Array:
+    """Return the gradient of the dipole field: ``[i, j] = d field_i / d offset_j``.
+
+    Parameters
+    ----------
+    offset, moment : ndarray, shape (..., 3)
+        As in `dipole_field` (m, A m^2).
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        (T/m); symmetric and without trace, as the field has neither curl nor divergence.
+    """
+    square = np.einsum("...i,...i", offset, offset)[..., None, None]
+    along = np.einsum("...i,...i", offset, moment)[..., None, None]
+    outer = offset[..., :, None] * moment[..., None, :]
+    radial = offset[..., :, None] * offset[..., None, :]
+    bracket = outer + np.swapaxes(outer, -1, -2) + along * (np.eye(3) - 5.0 * radial / square)
+    return 3.0 * MU0_OVER_4PI * bracket / square**2.5

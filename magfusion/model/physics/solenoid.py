@@ -1,0 +1,88 @@
+"""The field of coils of true size: loops, current sheets and arrays of dipoles."""
+
+import numpy as np
+
+from magfusion.model.physics.dipole import dipole_field
+from magfusion.units import MU0_OVER_4PI, Array
+
+_AZIMUTHS = 32
+_SLICES = 5
+
+
+def solenoid_field(
+    offset: Array, moment: Array, radius: float | None = None, length: float | None = None
+) -> Array:
+    """Return the flux density of a coil, in the axes of its arguments.
+
+    A coil with a radius is a thin loop, one with a length as well a uniform current sheet, one
+    with a length alone a line of dipoles (paper 002, Eq 2-3), one with neither a dipole.  Loops
+    are integrated by Biot and Savart's law at 32 azimuths and sheets at 5 Gauss-Legendre slices:
+    the relative error is below 1e-5 (a lone loop's below 1e-7) farther than two radii and two
+    lengths away.
+
+    Parameters
+    ----------
+    offset : ndarray, shape (n, 3)
+        From the coil's centre (m).
+    moment : ndarray, shape (3,)
+        Of the whole coil, along its axis (A m^2).
+    radius, length : float, optional
+        (m)
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        (T)
+    """
+    size = float(np.linalg.norm(moment))
+    if size == 0.0:
+        return np.zeros_like(offset)
+    axis = moment / size
+    nodes, weights = _slices(length)
+    field = np.zeros_like(offset)
+    for node, weight in zip(nodes, weights, strict=True):
+        from_slice = offset - node * axis
+        if radius:
+            field += loop_field(from_slice, weight * moment, radius)
+        else:
+            field += dipole_field(from_slice, weight * moment)
+    return field
+
+
+def loop_field(offset: Array, moment: Array, radius: float) -> Array:
+    """Return the flux density of a thin circular current loop, in the axes of its arguments.
+
+    Parameters
+    ----------
+    offset : ndarray, shape (n, 3)
+        From the loop's centre (m).
+    moment : ndarray, shape (3,)
+        Along the loop's axis (A m^2). Must not be zero.
+    radius : float
+        (m)
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        (T)
+    """
+    size = float(np.linalg.norm(moment))
+    current = size / (np.pi * radius**2)
+    axis = moment / size
+    across = np.linalg.svd(axis[None])[2][1]
+    along = np.cross(axis, across)
+    field = np.zeros_like(offset)
+    for angle in np.arange(_AZIMUTHS) * 2.0 * np.pi / _AZIMUTHS:
+        outward = np.cos(angle) * across + np.sin(angle) * along
+        separation = offset - radius * outward
+        cubed = np.einsum("ni,ni->n", separation, separation)[:, None] ** 1.5
+        field += np.cross(np.cross(axis, outward), separation) / cubed
+    return MU0_OVER_4PI * current * radius * (2.0 * np.pi / _AZIMUTHS) * field
+
+
+def _slices(length: float | None) -> tuple[Array, Array]:
+    """Return positions along the axis (m) and weights that sum to one."""
+    if not length:
+        return np.zeros(1), np.ones(1)
+    nodes, weights = np.polynomial.legendre.leggauss(_SLICES)
+    return 0.5 * length * nodes, 0.5 * weights

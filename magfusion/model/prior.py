@@ -1,0 +1,46 @@
+"""What is known of a calibration beforehand: the site's sigmas, and how they go together."""
+
+import numpy as np
+
+from magfusion.model.correlation import Component
+from magfusion.model.parameters import Block, prior_sigma
+from magfusion.model.site import Site
+from magfusion.units import Array
+
+
+def parameters_of(blocks: tuple[Block, ...]) -> list[Component]:
+    """Return the parameter that each column of a tangent vector is."""
+    return [
+        Component(block.group, block.owner, block.kind, i)
+        for block in blocks
+        for i in range(len(block.sigma))
+    ]
+
+
+def prior_sqrt_covariance(site: Site, blocks: tuple[Block, ...]) -> Array:
+    """Return the triangular matrix that makes a draw of the prior out of unit noise.
+
+    Parameters
+    ----------
+    site : Site
+        The declared one: its correlation counts.
+    blocks : tuple of Block
+        Parameters not among them are marginalised.
+
+    Returns
+    -------
+    ndarray, shape (dimension, dimension)
+        ``spread @ spread.T`` is the prior's covariance.
+    """
+    sigma = prior_sigma(blocks)
+    if site.correlation is None:
+        return np.diag(sigma)
+    correlation = site.correlation.among(parameters_of(blocks))
+    return np.asarray(sigma[:, None] * np.linalg.cholesky(correlation))
+
+
+def prior_sqrt_information(site: Site, blocks: tuple[Block, ...]) -> Array:
+    """Return the matrix that whitens a step away from the prior's mean: its spread inverted."""
+    if site.correlation is None:
+        return np.diag(1.0 / prior_sigma(blocks))
+    return np.asarray(np.linalg.inv(prior_sqrt_covariance(site, blocks)))

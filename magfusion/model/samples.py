@@ -1,0 +1,196 @@
+"""The streams of a log as arrays, time first."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding
+from magfusion.units import Array, BoolArray, ComplexArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSamples:
+    """Inertial stream.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Seconds since the log's epoch, strictly increasing; the IMU's own stamps.
+    gyro_body : ndarray, shape (n, 3)
+        Angular rate (rad/s).
+    accel_body : ndarray, shape (n, 3)
+        Specific force (m/s^2): +g on z at rest, level.
+    """
+
+    time: Array
+    gyro_body: Array
+    accel_body: Array
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, eq=False)
+class Waveform:
+    """Raw magnetometer stream, as the instrument gave it.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Seconds since the log's epoch, strictly increasing.
+    measured_sensor : ndarray, shape (n, 3)
+        Uncalibrated flux density (T).
+    """
+
+    time: Array
+    measured_sensor: Array
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+@dataclass(frozen=True, eq=False)
+class FieldSamples:
+    """Demodulated phasors, one row per window; a channel is one tone of one beacon.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Centre of the window, seconds since the log's epoch.
+    window : ndarray, shape (n,)
+        Length of the window (s).
+    channels : tuple of (str, int)
+        Beacon name and tone of each channel, in the site's order.
+    phasor_sensor : complex ndarray, shape (n, channels, 3)
+        (T), measured axes; NaN where the channel is missing.
+    phasor_cov : ndarray, shape (n, channels, 3, 3)
+        Covariance of the real part, and of the imaginary part alike (T^2).
+    """
+
+    time: Array
+    window: Array
+    channels: tuple[tuple[str, int], ...]
+    phasor_sensor: ComplexArray
+    phasor_cov: Array
+
+    def __post_init__(self) -> None:
+        n, c = len(self.time), len(self.channels)
+        for name, shape in (
+            ("window", (n,)),
+            ("phasor_sensor", (n, c, 3)),
+            ("phasor_cov", (n, c, 3, 3)),
+        ):
+            if getattr(self, name).shape != shape:
+                found = getattr(self, name).shape
+                raise ValueError(f"{name} must have shape {shape}; got {found}")
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @staticmethod
+    def empty(channels: tuple[tuple[str, int], ...]) -> "FieldSamples":
+        """Return no epoch of these channels."""
+        shape = (0, len(channels), 3)
+        none, phasor = np.zeros(0), np.zeros(shape, dtype=np.complex128)
+        return FieldSamples(none, none, channels, phasor, np.zeros((*shape, 3)))
+
+    @staticmethod
+    def joined(parts: list["FieldSamples"]) -> "FieldSamples":
+        """Return the epochs of several, one after the other."""
+        return FieldSamples(
+            time=np.concatenate([p.time for p in parts]),
+            window=np.concatenate([p.window for p in parts]),
+            channels=parts[0].channels,
+            phasor_sensor=np.concatenate([p.phasor_sensor for p in parts]),
+            phasor_cov=np.concatenate([p.phasor_cov for p in parts]),
+        )
+
+    def epochs(self) -> list["FieldSamples"]:
+        """Return each epoch alone."""
+        return [self.rows(slice(i, i + 1)) for i in range(len(self))]
+
+    def rows(self, kept: IntArray | BoolArray | slice) -> "FieldSamples":
+        """Return some epochs."""
+        return FieldSamples(
+            self.time[kept],
+            self.window[kept],
+            self.channels,
+            self.phasor_sensor[kept],
+            self.phasor_cov[kept],
+        )
+
+    @property
+    def valid(self) -> BoolArray:
+        """Which channels each row holds, shape (n, channels)."""
+        return np.all(np.isfinite(self.phasor_sensor), axis=2)
+
+
+@dataclass(frozen=True, eq=False)
+class SteadyFields:
+    """Steady part of the waveform, one row for each window: the Earth field and the offset.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Centre of the window, seconds since the log's epoch.
+    measured_sensor : ndarray, shape (n, 3)
+        (T), measured axes at the centre.
+    cov : ndarray, shape (n, 3, 3)
+        Of the instrument's noise alone (T^2).
+    """
+
+    time: Array
+    measured_sensor: Array
+    cov: Array
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def rows(self, kept: BoolArray | slice) -> "SteadyFields":
+        """Return some epochs."""
+        return SteadyFields(self.time[kept], self.measured_sensor[kept], self.cov[kept])
+
+
+@dataclass(frozen=True)
+class StreamClock:
+    """How the stamps of a stream lie about the even clock that it was sampled by.
+
+    Parameters
+    ----------
+    step : float
+        Between two samples (s).
+    scatter : float
+        Root mean square of the stamps about the clock (s).
+    lost : int
+        Samples that are missing, gaps aside.
+    replaced : bool
+        Whether the clock has taken the stamps' place; otherwise the samples were taken at them.
+    """
+
+    step: float
+    scatter: float
+    lost: int
+    replaced: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """One recording; streams that it does not hold are None.
+
+    ``epoch_ns`` is the log clock's zero, to which drive phases and every ``time`` refer.
+    ``steady`` goes with ``fields``, at the same times; no file holds it.  ``clocks`` says of which
+    streams the stamps scatter, ``noticed`` what else was mended in it.
+    """
+
+    name: str
+    epoch_ns: int
+    source: str
+    imu: ImuSamples
+    waveform: Waveform | None = None
+    fields: FieldSamples | None = None
+    truth: Trajectory | None = None
+    steady: SteadyFields | None = None
+    clocks: Mapping[str, StreamClock] = field(default_factory=dict)
+    noticed: tuple[Finding, ...] = ()

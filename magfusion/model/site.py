@@ -1,0 +1,369 @@
+"""The installation: beacons, the platform that moves among them, and how well each is known."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from magfusion.model.correlation import Correlation
+from magfusion.model.field_map import FieldMap
+from magfusion.units import Array, ComplexArray, IntArray
+
+Unknown = Literal["pose", "position", "attitude"]
+
+
+@dataclass(frozen=True, eq=False)
+class Coil:
+    """One coil of a beacon, driven by ``cos(2 pi f t + phase)``.
+
+    Parameters
+    ----------
+    moment_beacon : ndarray, shape (3,)
+        Peak moment (A m^2).
+    phase : float
+        Drive phase relative to the log clock (rad).
+    centre_beacon : ndarray, shape (3,)
+        Magnetic centre relative to the beacon's origin (m).
+    radius, length : float, optional
+        Finite size (m); the simulator uses it, the dipole model does not.
+    frequency_hz : float, optional
+        Drive frequency where it differs from the beacon's (frequency division).
+    slot : int, optional
+        Time slot, counted from 0, where coils are driven in turn (time division).
+    """
+
+    moment_beacon: Array
+    phase: float = 0.0
+    centre_beacon: Array = field(default_factory=lambda: np.zeros(3))
+    radius: float | None = None
+    length: float | None = None
+    frequency_hz: float | None = None
+    slot: int | None = None
+
+
+@dataclass(frozen=True)
+class Slots:
+    """Time division: the coils of a beacon are driven in turn, slot after slot, cycle after cycle.
+
+    Parameters
+    ----------
+    duration : float
+        Of one slot (s).
+    count : int
+        Slots in a cycle; those that no coil names are silent.
+    start : float
+        When slot 0 of a cycle begins on the log's clock (s).
+    """
+
+    duration: float
+    count: int
+    start: float = 0.0
+
+    @property
+    def cycle(self) -> float:
+        """Duration of a cycle (s)."""
+        return self.duration * self.count
+
+    def running(self, time: Array) -> IntArray:
+        """Return the number of the slot at each time, counted on since ``start``.
+
+        Modulo ``count`` it is the slot in its cycle; a time that rounding takes from the beginning
+        of a slot belongs to that slot.
+        """
+        return np.floor((time - self.start) / self.duration + 1e-6).astype(np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class BeaconSigma:
+    """Prior standard deviations of a beacon's calibration; zero means known.
+
+    Parameters
+    ----------
+    position_world : ndarray, shape (3,)
+        Of the centre, world axes (m).
+    rotation_beacon : ndarray, shape (3,)
+        Of the attitude, beacon axes (rad).
+    log_moment : ndarray, shape (coils,)
+        Of the natural logarithm of each coil's moment.
+    """
+
+    position_world: Array
+    rotation_beacon: Array
+    log_moment: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Beacon:
+    """A magnetic source: one or more coils on a common rigid frame.
+
+    Parameters
+    ----------
+    position_world : ndarray, shape (3,)
+        Surveyed centre (m).
+    world_from_beacon : ndarray, shape (3, 3)
+        Rotation of the coil axes.
+    synchronised : bool
+        False where the drive phase relative to the log clock is unknown and drifts.
+    field_map : FieldMap, optional
+        How its field differs from the model where it was surveyed.
+    slots : Slots, optional
+        When its coils are driven, where they are driven in turn and that is known; a frequency of
+        zero then means pulses of direct current.
+    unknown : {"pose", "position", "attitude"}, optional
+        What was never surveyed, so that a log must place it; the values in its stead are NaN.
+    model_error : float, optional
+        Of its own field; the site's where it is None.
+    noise_factor : float
+        Noise of its phasors in units of what the receiver measures beside its tones.
+    """
+
+    name: str
+    position_world: Array
+    world_from_beacon: Array
+    frequency_hz: float
+    coils: tuple[Coil, ...]
+    synchronised: bool
+    sigma: BeaconSigma
+    field_map: FieldMap | None = None
+    slots: Slots | None = None
+    unknown: Unknown | None = None
+    model_error: float | None = None
+    noise_factor: float = 1.0
+
+    @cached_property
+    def tones(self) -> tuple[tuple[float, int | None], ...]:
+        """Distinct (frequency in Hz, slot) pairs in the order in which the coils name them."""
+        return tuple(
+            dict.fromkeys((c.frequency_hz or self.frequency_hz, c.slot) for c in self.coils)
+        )
+
+    @cached_property
+    def tone_frequencies_hz(self) -> Array:
+        """Frequency of each tone (Hz), shape (tones,)."""
+        return np.array([frequency for frequency, _ in self.tones])
+
+    @cached_property
+    def excitation(self) -> ComplexArray:
+        """Complex drive of each coil in each tone, shape (coils, tones)."""
+        drive = np.zeros((len(self.coils), len(self.tones)), dtype=np.complex128)
+        for j, coil in enumerate(self.coils):
+            k = self.tones.index((coil.frequency_hz or self.frequency_hz, coil.slot))
+            drive[j, k] = np.exp(1j * coil.phase)
+        return drive
+
+    @cached_property
+    def moments_beacon(self) -> Array:
+        """Peak moments (A m^2), shape (coils, 3)."""
+        return np.array([c.moment_beacon for c in self.coils])
+
+    @cached_property
+    def centres_beacon(self) -> Array:
+        """Magnetic centres of the coils (m), shape (coils, 3)."""
+        return np.array([c.centre_beacon for c in self.coils])
+
+
+@dataclass(frozen=True)
+class ClockModel:
+    """How the drive of a beacon without synchronisation runs, and how steady all drives are.
+
+    Parameters
+    ----------
+    drift_sigma, drift_largest : float
+        Of a clock's relative error before any log, as of an ordinary crystal; and the largest
+        error that is searched.
+    phase_walk, drift_walk, log_moment_walk : float
+        Standard deviation that drive phase (rad), relative error of the clock, and logarithm of a
+        moment gain in an hour, by temperature and ageing.
+    """
+
+    drift_sigma: float = 2e-5
+    drift_largest: float = 1e-4
+    phase_walk: float = 0.02
+    drift_walk: float = 1e-8
+    log_moment_walk: float = 1e-3
+
+
+@dataclass(frozen=True)
+class EarthModel:
+    """How far a building's iron changes the declared Earth field, outside of steel halls.
+
+    Parameters
+    ----------
+    declination_sigma : float
+        Of its azimuth (rad).
+    strength_sigma : float
+        Of its horizontal and of its vertical part, relative to its size.
+    declination_walk, strength_walk : float
+        Standard deviation that azimuth (rad) and parts (T) gain in an hour: where the platform goes
+        in that time, the field is another.
+    """
+
+    declination_sigma: float = float(np.deg2rad(3.0))
+    strength_sigma: float = 0.02
+    declination_walk: float = 0.05
+    strength_walk: float = 1e-6
+
+
+@dataclass(frozen=True)
+class MotionModel:
+    """How the platform moves, and what counts as rest; by default that of a hand.
+
+    Parameters
+    ----------
+    rest_gyro, rest_accel : float
+        It rests where rate (rad/s) and specific force (m/s^2) deviate less from their means.
+    rest_span : float
+        Duration of that (s).
+    rest_speed_sigma : float
+        Of the zero velocity (m/s).
+    rest_known_speed : float
+        A velocity with a larger sigma is not taken for zero (m/s).
+    speed_sigma : float
+        Usual speed (m/s).
+    accel_sigma : float
+        Of the mean specific force against gravity, in motion (m/s^2).
+    accel_span : float
+        Over which it is averaged (s).
+    start_speed_sigma : float
+        Prior of the first velocity (m/s).
+    """
+
+    rest_gyro: float = 0.03
+    rest_accel: float = 0.25
+    rest_span: float = 1.0
+    rest_speed_sigma: float = 0.01
+    rest_known_speed: float = 0.1
+    speed_sigma: float = 1.0
+    accel_sigma: float = 1.5
+    accel_span: float = 2.0
+    start_speed_sigma: float = 10.0
+
+
+@dataclass(frozen=True)
+class ImuModel:
+    """Inertial noise: densities per square root of hertz, walks per square root of second.
+
+    ``time_offset`` says that the sample stamped t was taken at t + offset on the log's clock (s).
+    """
+
+    gyro_noise: float
+    accel_noise: float
+    gyro_bias_walk: float
+    accel_bias_walk: float
+    gyro_bias_sigma: float
+    accel_bias_sigma: float
+    time_offset: float = 0.0
+    time_offset_sigma: float = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class MagnetometerSigma:
+    """Prior standard deviations of the magnetometer's calibration; zero means known.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (3, 3)
+    offset : ndarray, shape (3,)
+        (T)
+    rotation_sensor : ndarray, shape (3,)
+        Of the mounting, sensor axes (rad).
+    position_body : ndarray, shape (3,)
+        Of the lever arm, body axes (m).
+    """
+
+    matrix: Array
+    offset: Array
+    rotation_sensor: Array
+    position_body: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Magnetometer:
+    """``measured = matrix @ field_sensor + offset`` at ``position_body`` on the platform.
+
+    Parameters
+    ----------
+    position_body : ndarray, shape (3,)
+        Lever arm (m).
+    body_from_sensor : ndarray, shape (3, 3)
+        Mounting rotation.
+    noise_density : float
+        One-sided white noise (T/sqrt(Hz)).
+    matrix : ndarray, shape (3, 3)
+    offset : ndarray, shape (3,)
+        (T)
+    coil_centres_sensor : ndarray, shape (3, 3), optional
+        Magnetic centre of each axis's own coil (m), row by row; None where all three are at
+        ``position_body``.
+    offset_walk : float
+        Standard deviation that the offset gains in an hour (T).
+    """
+
+    position_body: Array
+    body_from_sensor: Array
+    noise_density: float
+    matrix: Array
+    offset: Array
+    sigma: MagnetometerSigma
+    coil_centres_sensor: Array | None = None
+    offset_walk: float = 2e-8
+
+
+@dataclass(frozen=True)
+class Platform:
+    """What moves: an IMU and a magnetometer rigidly mounted beside it."""
+
+    imu: ImuModel
+    magnetometer: Magnetometer
+    motion: MotionModel = MotionModel()
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where and when, for the geomagnetic reference field; ``date`` is ISO 8601 (YYYY-MM-DD)."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    date: str
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """Everything that is known before a log is read.
+
+    Parameters
+    ----------
+    gravity : float
+        (m/s^2)
+    model_error : float
+        Relative error of the field model, one sigma per phasor.
+    model_error_length : float
+        Distance over which that error stays much the same (m): it is that of iron, which is
+        constant in place, and does not average over epochs that lie closer.
+    earth_field_world : ndarray, shape (3,), optional
+        (T); from ``location`` by the IGRF where that is given instead.
+    calibration : mapping, optional
+        Where refined values came from: log, parameters that it determined and that it did not.
+    correlation : Correlation, optional
+        Of the errors that the sigmas stand for; None where all are independent.
+    """
+
+    gravity: float
+    model_error: float
+    beacons: tuple[Beacon, ...]
+    platform: Platform
+    earth_field_world: Array | None = None
+    location: Location | None = None
+    calibration: Mapping[str, object] | None = None
+    correlation: Correlation | None = None
+    clock: ClockModel = ClockModel()
+    earth: EarthModel = EarthModel()
+    model_error_length: float = 0.5
+
+    @cached_property
+    def channels(self) -> tuple[tuple[str, int], ...]:
+        """(beacon, tone) of each phasor, in site order: the channel axis of `FieldSamples`."""
+        return tuple((b.name, k) for b in self.beacons for k in range(len(b.tones)))

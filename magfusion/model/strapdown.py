@@ -1,0 +1,244 @@
+"""Attitude and motion between samples from the inertial stream, without a loop over samples."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.model.site import MotionModel
+from magfusion.units import Array, BoolArray, IntArray
+
+CHUNK = 65_536  # samples at a time: what is computed of them stays in the cache
+
+
+def rotation_increments(time: Array, gyro_body: Array) -> Rotation:
+    """Return the rotation from each sample to the next, the rate taken as linear between them.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    gyro_body : ndarray, shape (n, 3)
+        (rad/s)
+
+    Returns
+    -------
+    Rotation
+        n - 1 rotations ``body(k)_from_body(k+1)``; second-order coning included.
+    """
+    before, after = gyro_body[:-1], gyro_body[1:]
+    dt = np.diff(time)[:, None]
+    coning = np.cross(before, after) * dt**2 / 12.0
+    return Rotation.from_rotvec(0.5 * (before + after) * dt + coning)
+
+
+def _prefix_products(rotations: Rotation) -> Rotation:
+    """Products of the first 1, 2, ... rotations: those of neighbouring pairs, then the odd ones."""
+    n = len(rotations)
+    if n == 1:
+        return rotations
+    quaternion = rotations.as_quat()
+    pairs = _prefix_products(rotations[: n - 1 : 2] * rotations[1::2])
+    quaternion[1::2] = pairs.as_quat()
+    if n > 2:
+        quaternion[2::2] = (pairs[: (n - 1) // 2] * rotations[2::2]).as_quat()
+    return Rotation.from_quat(quaternion)
+
+
+def attitude_from_gyro(time: Array, gyro_body: Array) -> Rotation:
+    """Return ``body(0)_from_body(k)`` for every sample.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    gyro_body : ndarray, shape (n, 3)
+        (rad/s), bias removed.
+
+    Returns
+    -------
+    Rotation
+        n rotations, the first the identity.
+    """
+    steps = rotation_increments(time, gyro_body)
+    first = Rotation.identity(1)
+    return _prefix_products(Rotation.concatenate([first, steps]))
+
+
+def attitude_at(attitude: Rotation, time: Array, gyro_body: Array, wanted: Array) -> Rotation:
+    """Return the attitude at other times, from the nearest earlier sample and its rate.
+
+    Parameters
+    ----------
+    attitude : Rotation
+        One for each sample, as from `attitude_from_gyro`.
+    time : ndarray, shape (n,)
+    gyro_body : ndarray, shape (n, 3)
+        (rad/s)
+    wanted : ndarray, shape (m,)
+        Times (s); outside the stream the end rate is extended.
+
+    Returns
+    -------
+    Rotation
+        m rotations.
+    """
+    index = _sample_before(time, wanted)
+    return attitude[index] * _turn_since(index, time, gyro_body, wanted)
+
+
+def attitude_from_gyro_at(time: Array, gyro_body: Array, wanted: Array) -> Rotation:
+    """Return the attitude at some times only: of a long stream it takes less than at every sample.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    gyro_body : ndarray, shape (n, 3)
+        (rad/s), bias removed.
+    wanted : ndarray, shape (m,)
+        Times (s); outside the stream the end rate is extended.
+
+    Returns
+    -------
+    Rotation
+        m rotations, as of `attitude_at` on the chain of `attitude_from_gyro`.
+    """
+    index = _sample_before(time, wanted)
+    quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (len(wanted), 1))
+    carried = Rotation.identity()
+    for lo in range(0, len(time) - 1, CHUNK):
+        piece = slice(lo, lo + CHUNK + 1)
+        steps = rotation_increments(time[piece], gyro_body[piece])
+        here = np.flatnonzero((index > lo) & (index <= lo + len(steps)))
+        turned = carried * _products_of_first(steps, np.append(index[here] - lo, len(steps)))
+        quaternion[here] = turned[:-1].as_quat()
+        carried = turned[-1]
+    return Rotation.from_quat(quaternion) * _turn_since(index, time, gyro_body, wanted)
+
+
+def _products_of_first(rotations: Rotation, count: IntArray) -> Rotation:
+    """Products of the first rotations, as many as each count tells, by products of pairs."""
+    n = len(rotations)
+    if n == 1:
+        return Rotation.from_rotvec(count[:, None] * rotations.as_rotvec())
+    pairs = rotations[: n - 1 : 2] * rotations[1::2]
+    quaternion = _products_of_first(pairs, count // 2).as_quat()
+    odd = np.flatnonzero(count % 2)
+    if len(odd):
+        before = Rotation.from_quat(quaternion[odd])
+        quaternion[odd] = (before * rotations[count[odd] - 1]).as_quat()
+    return Rotation.from_quat(quaternion)
+
+
+def _sample_before(time: Array, wanted: Array) -> IntArray:
+    before = np.searchsorted(time, wanted, side="right") - 1
+    return np.clip(before, 0, len(time) - 1)
+
+
+def _turn_since(index: IntArray, time: Array, gyro_body: Array, wanted: Array) -> Rotation:
+    """Return the turn from samples to the times that follow them."""
+    after = np.minimum(index + 1, len(time) - 1)
+    span = np.where(after > index, time[after] - time[index], 1.0)
+    ahead = wanted - time[index]
+    share = np.clip(0.5 * ahead / span, 0.0, 0.5)[:, None]
+    rate = (1.0 - share) * gyro_body[index] + share * gyro_body[after]
+    return Rotation.from_rotvec(rate * ahead[:, None])
+
+
+def mean_about(time: Array, vector: Array, wanted: Array, span: float) -> Array:
+    """Return the means of sampled vectors over a span about some times, shape (m, 3).
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    vector : ndarray, shape (n, 3)
+    wanted : ndarray, shape (m,)
+        (s)
+    span : float
+        Where it holds no sample, the nearest one counts (s).
+    """
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(vector, axis=0)])
+    lo = np.searchsorted(time, wanted - span / 2)
+    hi = np.maximum(np.searchsorted(time, wanted + span / 2), lo + 1)
+    hi = np.minimum(hi, len(time))
+    lo = np.minimum(lo, hi - 1)
+    return (total[hi] - total[lo]) / (hi - lo)[:, None]
+
+
+def triad(field_world: Array, up_body: Array, field_body: Array) -> Array:
+    """Return attitudes with the vertical exact and the heading by the field (TRIAD).
+
+    Parameters
+    ----------
+    field_world : ndarray, shape (3,)
+        Of any size, as all vectors here; not vertical.
+    up_body, field_body : ndarray, shape (..., 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        world_from_body.
+    """
+
+    def axes(up: Array, field: Array) -> Array:
+        z = up / np.linalg.norm(up, axis=-1, keepdims=True)
+        east = np.cross(field, z)
+        x = east / np.linalg.norm(east, axis=-1, keepdims=True)
+        return np.stack([x, np.cross(z, x), z], axis=-1)
+
+    world = axes(np.array([0.0, 0.0, 1.0]), field_world)
+    return world @ np.swapaxes(axes(up_body, field_body), -1, -2)
+
+
+def resting(
+    time: Array,
+    gyro_body: Array,
+    accel_body: Array,
+    span: float | None = None,
+    *,
+    motion: MotionModel,
+) -> BoolArray:
+    """Return at which samples the platform is at rest.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    gyro_body, accel_body : ndarray, shape (n, 3)
+        (rad/s, m/s^2)
+    span : float, optional
+        Length of the stretch around each sample that must be quiet (s), other than the model's.
+    motion : MotionModel
+        What is called rest.
+
+    Returns
+    -------
+    bool ndarray, shape (n,)
+        Where rate and specific force scatter less about their means over the stretch than they may.
+    """
+    span = motion.rest_span if span is None else span
+    centres = np.mean(gyro_body, axis=0), np.mean(accel_body, axis=0)
+    quiet = np.empty(len(time), dtype=bool)
+    for begin in range(0, len(time), CHUNK):
+        here = time[begin : begin + CHUNK]
+        first = np.searchsorted(time, here[0] - span / 2)
+        last = np.searchsorted(time, here[-1] + span / 2, side="right")
+        lo = np.searchsorted(time[first:last], here - span / 2)
+        hi = np.searchsorted(time[first:last], here + span / 2, side="right")
+        quiet[begin : begin + CHUNK] = (
+            _variance(gyro_body[first:last] - centres[0], lo, hi) < motion.rest_gyro**2
+        ) & (_variance(accel_body[first:last] - centres[1], lo, hi) < motion.rest_accel**2)
+    inside = (time - span / 2 >= time[0]) & (time + span / 2 <= time[-1])
+    return quiet & inside
+
+
+def _variance(centred: Array, lo: IntArray, hi: IntArray) -> Array:
+    """Return the sum of the axes' variances over rows from ``lo`` to before ``hi``."""
+    out = np.zeros(len(lo))
+    for axis in centred.T:
+        mean, square = (
+            (total[hi] - total[lo]) / (hi - lo)
+            for total in (np.concatenate([[0.0], np.cumsum(a)]) for a in (axis, axis**2))
+        )
+        out += square - mean**2
+    return out

@@ -1,0 +1,102 @@
+"""A trajectory: poses over time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from magfusion.units import Array, BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses of the body over time; optional parts are None where they are not known.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Seconds since the log's epoch, strictly increasing.
+    world_from_body : ndarray, shape (n, 3, 3)
+        Rotation matrices.
+    position_world : ndarray, shape (n, 3)
+        (m)
+    velocity_world : ndarray, shape (n, 3), optional
+        (m/s)
+    gyro_bias_body : ndarray, shape (n, 3), optional
+        (rad/s)
+    accel_bias_body : ndarray, shape (n, 3), optional
+        (m/s^2)
+    pose_cov : ndarray, shape (n, 6, 6), optional
+        Rotation, then position; body axes, right perturbation (rad, m).
+    """
+
+    time: Array
+    world_from_body: Array
+    position_world: Array
+    velocity_world: Array | None = None
+    gyro_bias_body: Array | None = None
+    accel_bias_body: Array | None = None
+    pose_cov: Array | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.time)
+        shapes = {"time": (n,), "world_from_body": (n, 3, 3), "position_world": (n, 3)}
+        shapes |= {k: (n, 3) for k in ("velocity_world", "gyro_bias_body", "accel_bias_body")}
+        shapes["pose_cov"] = (n, 6, 6)
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise ValueError(f"{name} must have shape {shape}; got {value.shape}")
+        if n > 1 and np.any(np.diff(self.time) <= 0):
+            raise ValueError("time must be strictly increasing")
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+def interpolate(
+    trajectory: Trajectory, time: Array, max_gap: float
+) -> tuple[Trajectory, BoolArray]:
+    """Return the poses at those of ``time`` that lie on a sample or in a short enough step.
+
+    Positions are joined by straight lines, attitudes by the shortest turn (slerp); the parts of
+    the trajectory beside its poses are left out.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Strictly increasing (s).
+    max_gap : float
+        Longest step of the trajectory to interpolate across (s).
+
+    Returns
+    -------
+    poses : Trajectory
+        At the m times that exist.
+    exists : ndarray of bool, shape (n,)
+        Which of ``time`` they are.
+    """
+    known = trajectory.time
+    if len(known) == 0:
+        exists = np.zeros(len(time), dtype=bool)
+        return Trajectory(time[exists], np.empty((0, 3, 3)), np.empty((0, 3))), exists
+    after = np.clip(np.searchsorted(known, time), 0, len(known) - 1)
+    before = np.where(known[after] == time, after, np.maximum(after - 1, 0))
+    step = known[after] - known[before]
+    exists = (known[before] <= time) & (time <= known[after]) & (step <= max_gap)
+    wanted, left, right = time[exists], before[exists], after[exists]
+    # On a sample both neighbours are that sample, and the step is zero.
+    share = (wanted - known[left]) / np.where(left == right, 1.0, step[exists])
+    position = trajectory.position_world
+    turn = _slerp(known, trajectory.world_from_body, wanted)
+    moved = position[left] + share[:, None] * (position[right] - position[left])
+    return Trajectory(wanted, turn, moved), exists
+
+
+def _slerp(known: Array, world_from_body: Array, wanted: Array) -> Array:
+    if len(wanted) == 0:
+        return np.empty((0, 3, 3))
+    if len(known) == 1:
+        return world_from_body.copy()
+    turns = Slerp(known, Rotation.from_matrix(world_from_body))(wanted)
+    return turns.as_matrix()

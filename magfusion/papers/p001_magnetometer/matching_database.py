@@ -1,0 +1,287 @@
+"""Attitude from a database of field vectors: paper 001, section 2, with and without interpolation.
+
+The matched entry is that of Eq 17 and 18, `magfusion.papers.p001_magnetometer.equations`.  Where
+the field is known, `magfusion.papers.p001_magnetometer.matching` does as well or better without a
+database: it pays where the platform distorts the field in a way that no model tells.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from magfusion.errors import InputError
+from magfusion.files.attitude_table import LEAST_ENTRIES, Angles, AttitudeDatabase
+from magfusion.papers.p001_magnetometer.matching import (
+    LEAST_SHARE,
+    THREE_ANGLES,
+    Matches,
+    check_roll_axis,
+    fold_side,
+    predict_field,
+    roll_sigma,
+    with_other_pitch,
+    wrap,
+)
+from magfusion.units import DEGREE, Array, IntArray
+
+FIXED = 2.0 * DEGREE  # rad; a yaw that is free by this much costs up to 4 of the paper's 5 degrees
+NEIGHBOURS = {"roll": 3, "roll-pitch": 9}
+# Of the neighbours' extent: directions in which they extend less have no slope.
+_FLAT = 0.05
+_CHUNK = 50_000  # fields at once
+_OUTSIDE = 3.0  # spacings of the database
+
+
+@dataclass(frozen=True, eq=False)
+class Index:
+    """A database ready to be asked.
+
+    Parameters
+    ----------
+    tree : KDTree
+        Over the components that are compared (T).
+    field_world : ndarray, shape (3,)
+        The uniform field that explains the entries best (T).
+    sigma : float
+        What it leaves unexplained, of each component (T).
+    spacing : float
+        Distance of an entry's nearest neighbour (T), that 95 % do not exceed.
+    side : int
+        Of the fold on which all entries lie.
+    """
+
+    database: AttitudeDatabase
+    tree: KDTree
+    field_world: Array
+    sigma: float
+    spacing: float
+    side: int
+
+
+@dataclass(frozen=True, eq=False)
+class Built:
+    """A database, and how many measurements did not enter it.
+
+    Parameters
+    ----------
+    beyond_fold : int
+        Measurements on the rarer side of the fold, where the same fields have other attitudes.
+    """
+
+    database: AttitudeDatabase
+    beyond_fold: int
+
+
+def build_database(
+    field_body: Array,
+    world_from_body: Array,
+    source: str,
+    angles: str | None = None,
+    step: float = 1.0 * DEGREE,
+) -> Built:
+    """Return the database of measurements whose attitude is known.
+
+    Parameters
+    ----------
+    field_body : ndarray, shape (n, 3)
+        (T), calibrated.
+    world_from_body : ndarray, shape (n, 3, 3)
+        Of the reference.
+    source : str
+        Log that they come from.
+    angles : {"roll", "roll-pitch"}, optional
+        What the database shall tell; default: what varies.
+    step : float
+        Measurements within one cell of this size in each angle are averaged (rad).
+
+    Raises
+    ------
+    InputError
+        Where an angle that must be fixed varies, the field does not determine one that is asked, or
+        too few attitudes remain.
+    """
+    chosen, rpy = _angles_of(world_from_body, angles)
+    beyond = np.zeros(len(rpy), dtype=bool)
+    field_world = np.mean(np.einsum("nij,nj->ni", world_from_body, field_body), axis=0)
+    if chosen == "roll":
+        check_roll_axis(float(rpy[0, 1]), float(rpy[0, 2]), field_world)
+    else:
+        side = fold_side(rpy[:, 1], rpy[:, 2], field_world)
+        usual = 1.0 if np.sum(np.sign(side)) >= 0.0 else -1.0
+        beyond = usual * side < LEAST_SHARE
+    thinned = _thin(field_body[~beyond], rpy[~beyond], step)
+    if len(thinned[0]) < LEAST_ENTRIES:
+        raise InputError(
+            f"holds {len(thinned[0])} attitudes that differ by {step / DEGREE:g} degrees and do not"
+            f" lie beyond the fold, of which a database needs {LEAST_ENTRIES}; turn the platform"
+            " through all that it shall know"
+        )
+    return Built(AttitudeDatabase(*thinned, chosen, source), int(np.sum(beyond)))
+
+
+def prepare(database: AttitudeDatabase) -> Index:
+    """Return a database ready to be asked.
+
+    Raises
+    ------
+    InputError
+        Where what it holds at one value varies, or its entries lie on both sides of the fold.
+    """
+    fixed = (1, 2) if database.angles == "roll" else (2,)
+    for axis in fixed:
+        name = ("roll", "pitch", "yaw")[axis]
+        if np.ptp(wrap(database.rpy[:, axis] - database.rpy[0, axis])) > 1e-6:
+            raise InputError(f"its {name} varies, which must be fixed; {THREE_ANGLES}")
+    turned = np.stack([predict_field(database.rpy, axis) for axis in np.eye(3)], axis=-1)
+    field_world = np.einsum("nij,ni->j", turned, database.field_body) / len(database)
+    left = database.field_body - predict_field(database.rpy, field_world)
+    side = fold_side(database.rpy[:, 1], database.rpy[:, 2], field_world)
+    if database.angles == "roll-pitch" and np.min(side) * np.max(side) <= 0.0:
+        raise InputError(
+            "its entries lie on both sides of the fold of pitch, where one field has two attitudes;"
+            " keep those of one side"
+        )
+    tree = KDTree(_compared(database.angles, database.field_body))
+    gap, _ = tree.query(tree.data, k=2)
+    return Index(
+        database=database,
+        tree=tree,
+        field_world=field_world,
+        sigma=float(np.sqrt(np.mean(left**2))),
+        spacing=float(np.quantile(gap[:, 1], 0.95)),
+        side=1 if float(np.mean(side)) >= 0.0 else -1,
+    )
+
+
+def nearest_entries(index: Index, field_body: Array, count: int = 1) -> tuple[Array, IntArray]:
+    """Return distance (T) and row of the entries nearest to each field, each (n, count)."""
+    asked = _compared(index.database.angles, field_body)
+    distance, row = index.tree.query(asked, k=np.arange(1, count + 1))
+    return distance, row
+
+
+def match_nearest(index: Index, field_body: Array, sigma: float) -> Matches:
+    """Return the attitude of the entry nearest to each field (n, 3) (T), as the paper does."""
+    distance, row = nearest_entries(index, field_body)
+    return _matches(index, field_body, index.database.rpy[row[:, 0]], distance[:, 0], sigma)
+
+
+def match_interpolated(index: Index, field_body: Array, sigma: float) -> Matches:
+    """Return the attitude from an affine map fitted to the entries nearest to each field (n, 3)."""
+    rows = [slice(k, k + _CHUNK) for k in range(0, len(field_body), _CHUNK)]
+    parts = [_interpolated(index, field_body[part]) for part in rows]
+    rpy, distance, left = (np.concatenate(part) for part in zip(*parts, strict=True))
+    found = _matches(index, field_body, rpy, distance, sigma, interpolated=True)
+    found.sigma[:, 0] = np.hypot(found.sigma[:, 0], left)
+    return found
+
+
+def _interpolated(index: Index, field_body: Array) -> tuple[Array, Array, Array]:
+    """Return angles, distance of the nearest entry (T), and what the map leaves of the angles."""
+    kind = index.database.angles
+    distance, row = nearest_entries(index, field_body, NEIGHBOURS[kind])
+    near = _unit(_compared(kind, index.database.field_body[row]))
+    asked = _unit(_compared(kind, field_body))
+    centre = np.mean(near, axis=1)
+    # Only directions count; the length is noise.  So the fit lives in the plane across the centre.
+    across = np.eye(near.shape[-1]) - _unit(centre)[:, :, None] * _unit(centre)[:, None, :]
+    spread = (near - centre[:, None]) @ across
+    known = index.database.rpy[row]
+    turned = wrap(known - known[:, :1])
+    mean = np.mean(turned, axis=1)
+    slope = np.linalg.pinv(spread, rcond=_FLAT) @ (turned - mean[:, None])
+    rpy = known[:, 0] + mean + ((asked - centre)[:, None] @ across @ slope)[:, 0]
+    rpy[:, 0] = wrap(rpy[:, 0])
+    # What an affine map leaves of the neighbours, it leaves of the angles between them too.
+    left = turned - mean[:, None] - spread @ slope
+    free = left.shape[1] - (2 if kind == "roll" else 3)
+    return rpy, distance[:, 0], np.sqrt(np.sum(left**2, axis=1) / free)
+
+
+def _matches(
+    index: Index,
+    field_body: Array,
+    rpy: Array,
+    distance: Array,
+    sigma: float,
+    *,
+    interpolated: bool = False,
+) -> Matches:
+    within = distance <= _OUTSIDE * index.spacing + 5.0 * np.hypot(sigma, index.sigma)
+    # The nearest entry is off by up to half a spacing, evenly.
+    step = 0.0 if interpolated else index.spacing / np.sqrt(12.0)
+    total = float(np.sqrt(sigma**2 + index.sigma**2 + step**2))
+    if index.database.angles == "roll-pitch":
+        found = with_other_pitch(rpy, field_body, index.field_world, total, within)
+        found.residual[:, 0] = distance
+        return found
+    spread = roll_sigma(rpy, index.field_world, total)
+    return Matches(rpy[:, None], spread[:, None], distance[:, None], within[:, None])
+
+
+def _compared(angles: Angles, field_body: Array) -> Array:
+    """Return the components that determine the attitude: a turn about x leaves its own as it is."""
+    return field_body[..., 1:] if angles == "roll" else field_body
+
+
+def _unit(vector: Array) -> Array:
+    return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
+
+
+def _angles_of(world_from_body: Array, angles: str | None) -> tuple[Angles, Array]:
+    """Return what varies, and the angles with the others fixed at their mean."""
+    axis = world_from_body[:, :, 0]
+    mean = _unit(np.mean(axis, axis=0))
+    turning = np.arccos(np.clip(axis @ mean, -1.0, 1.0))
+    if angles == "roll" or (angles is None and np.max(turning) <= FIXED):
+        if np.max(turning) > FIXED:
+            raise InputError(
+                f"the axis of roll turns by {np.max(turning) / DEGREE:.3g} degrees from its mean,"
+                f" and may by {FIXED / DEGREE:g}; hold pitch and yaw, or ask for roll and pitch"
+            )
+        level = float(np.hypot(mean[0], mean[1]))
+        # On a vertical axis yaw and roll are one: roll then counts from world x.
+        yaw = float(np.arctan2(mean[1], mean[0])) if level > np.sin(FIXED) else 0.0
+        return "roll", angles_about(world_from_body, yaw, -float(np.arctan2(mean[2], level)))
+    heading = np.arctan2(axis[:, 1], axis[:, 0])
+    yaw = float(np.angle(np.mean(np.exp(1j * heading))))
+    turning = np.abs(wrap(heading - yaw))
+    if angles not in (None, "roll-pitch") or np.max(turning) > FIXED:
+        raise InputError(
+            f"the yaw turns by {np.max(turning) / DEGREE:.3g} degrees from its mean, and may by"
+            f" {FIXED / DEGREE:g}; {THREE_ANGLES}"
+        )
+    return "roll-pitch", angles_about(world_from_body, yaw)
+
+
+def angles_about(world_from_body: Array, yaw: Array | float, pitch: float | None = None) -> Array:
+    """Return roll, pitch, yaw (n, 3) (rad) of attitudes (n, 3, 3), fixed at the values given (rad).
+
+    Defined at a vertical x axis too, where roll and yaw are one.
+    """
+    n = len(world_from_body)
+    if pitch is None:
+        tilt = -np.arcsin(np.clip(world_from_body[:, 2, 0], -1.0, 1.0))
+    else:
+        tilt = np.full(n, pitch)
+    # The image of body y in the axes of the pitched frame is (0, cos roll, sin roll).
+    y_axis = world_from_body[:, :, 1]
+    level_x = np.cos(yaw) * y_axis[:, 0] + np.sin(yaw) * y_axis[:, 1]
+    level_y = np.cos(yaw) * y_axis[:, 1] - np.sin(yaw) * y_axis[:, 0]
+    up = np.sin(tilt) * level_x + np.cos(tilt) * y_axis[:, 2]
+    return np.stack([np.arctan2(up, level_y), tilt, np.broadcast_to(yaw, n)], axis=1)
+
+
+def _thin(field_body: Array, rpy: Array, step: float) -> tuple[Array, Array]:
+    """Average what lies in one cell of roll and pitch."""
+    cells = np.floor(rpy[:, :2] / step).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    cell = cell.ravel()
+    count = np.bincount(cell).astype(np.float64)[:, None]
+
+    def mean(values: Array) -> Array:
+        columns = [np.bincount(cell, weights=column) for column in values.T]
+        return np.stack(columns, axis=1) / count
+
+    return mean(field_body), mean(rpy)

@@ -1,0 +1,157 @@
+"""Calibration of a rotating beacon as paper 002 prints it, to compare with.
+
+The paper turns the normals of the field's plane into directions (Eq 4), finds the distances from
+the angles between them (Eq 9-11), the centre from the distances (Eq 12), and the attitude from
+directions seen and directions known (Eq 18-21).  That is right only where the normals are given in
+the axes of the beacon, which is what the calibration is to find, and each direction in its
+hemisphere; the paper's argument that the centre does not depend on the attitude (Eq 13-17) is
+false.  Given normals in the magnetometers' axes, one degree of tilt moves the centre by 0.2 m.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from magfusion.estimation.snapshot.candidates import wahba
+from magfusion.estimation.solve.batched import minimise, normal_equations
+from magfusion.papers.p002_beacon.equations import (
+    eq_04_direction,
+    eq_09_cosines,
+    eq_10_lengths,
+    eq_11_misfit,
+    eq_18_direction,
+    eq_19_attitude_as_printed,
+    eq_21_angles,
+    pairs,
+)
+from magfusion.papers.p004_fingerprints.rssi import trilaterate
+from magfusion.receiver.ellipse import plane_normal, semi_axes
+from magfusion.units import MU0_OVER_4PI, Array, ComplexArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class PrintedCalibration:
+    """What the paper's equations give, run by run.
+
+    Parameters
+    ----------
+    centre_world : ndarray, shape (runs, 3)
+        (m)
+    world_from_beacon : ndarray, shape (runs, 3, 3)
+        Transpose of the least-squares matrix of Eq 19, in general no rotation.
+    angles : ndarray, shape (runs, 3)
+        psi, gamma, lambda of Eq 21 (rad).
+    distance : ndarray, shape (runs, magnetometers)
+        From the centre (m); one below zero shows that the directions fit no beacon.
+    alarm : ndarray, shape (runs,)
+        What the law of cosines leaves (m^2), root of the mean square; zero for three magnetometers.
+    """
+
+    centre_world: Array
+    world_from_beacon: Array
+    angles: Array
+    distance: Array
+    alarm: Array
+
+
+def distances_from_angles(
+    direction: Array, position_world: Array, start: Array
+) -> tuple[Array, Array]:
+    """Return distances (runs, m) (m) and what Eq 11 leaves (runs, pairs) (m^2), by least squares.
+
+    Directions (runs, m, 3) from the beacon in any axes, magnetometers (m, 3) (m); the start
+    (runs, m) chooses among up to four solutions that fit three magnetometers.
+    """
+    first, second = pairs(len(position_world))
+    cosine, length = eq_09_cosines(direction), eq_10_lengths(position_world)
+    pair = np.arange(len(first))
+
+    def rows_at(rows: IntArray, distance: Array) -> tuple[Array, Array]:
+        a, b, c = distance[:, first], distance[:, second], cosine[rows]
+        slope = np.zeros((len(rows), len(pair), len(position_world)))
+        slope[:, pair, first] = 2.0 * (a - b * c)
+        slope[:, pair, second] = 2.0 * (b - a * c)
+        return eq_11_misfit(distance, c, length), slope
+
+    distance = minimise(lambda *at: normal_equations(*rows_at(*at)), start).state
+    return distance, eq_11_misfit(distance, cosine, length)
+
+
+def centre_by_rays(direction: Array, distance: Array, position_world: Array) -> Array:
+    """Return the centres (runs, 3) (m) of rays that are moved rigidly onto their known ends.
+
+    Unlike the distances (runs, m) alone, the directions (runs, m, 3), beacon axes, tell on which
+    side of the magnetometers' plane (m, 3) the beacon is.
+    """
+    rays = distance[..., None] * direction
+    mean_ray, mean_place = rays.mean(axis=1), position_world.mean(axis=0)
+    world_from_beacon = wahba(
+        np.einsum("mi,rmj->rij", position_world - mean_place, rays - mean_ray[:, None])
+    )
+    return mean_place - (world_from_beacon @ mean_ray[..., None])[..., 0]
+
+
+def calibrate_as_printed(
+    phasor: ComplexArray,
+    position_world: Array,
+    moment: float,
+    hemisphere: Array | None = None,
+) -> PrintedCalibration:
+    """Calibrate a beacon by the equations of paper 002.
+
+    Parameters
+    ----------
+    phasor : complex ndarray, shape (runs, magnetometers, 3)
+        (T).  In beacon axes the equations are right; in world axes, which is what magnetometers
+        that are aligned with the world measure, they are the paper's.
+    position_world : ndarray, shape (magnetometers, 3)
+        Three at least, not on a line (m).
+    moment : float
+        Of both coils (A m^2); only the start of the distances depends on it.
+    hemisphere : ndarray, shape (magnetometers,), optional
+        The sign of each direction's third component, which the normal does not tell; positive, as
+        the paper has it, where it is not given.
+    """
+    direction = eq_04_direction(plane_normal(phasor))
+    if hemisphere is not None:
+        direction = direction * hemisphere[:, None]
+    start = np.cbrt(MU0_OVER_4PI * moment / semi_axes(phasor)[..., 0])
+    distance, residual = distances_from_angles(direction, position_world, start)
+    by_rays = centre_by_rays(direction, distance, position_world)
+    centre = trilaterate(distance, position_world, by_rays)  # the minimum of Eq 12
+    known = eq_18_direction(centre, position_world)
+    world_from_beacon = np.swapaxes(eq_19_attitude_as_printed(direction, known), -1, -2)
+    return PrintedCalibration(
+        centre_world=centre,
+        world_from_beacon=world_from_beacon,
+        angles=eq_21_angles(world_from_beacon),
+        distance=distance,
+        alarm=np.sqrt(np.mean(residual**2, axis=-1)),
+    )
+
+
+def consistent_centres(
+    direction: Array, position_world: Array, tolerance: float
+) -> list[tuple[tuple[int, ...], Array]]:
+    """Return every centre that fits directions (m, 3) of unknown hemisphere, with its signs.
+
+    The normals leave each direction's sign open (one of them is the choice of the beacon's own
+    z axis), and the law of cosines, which may leave the tolerance (m^2), has up to four roots for
+    three magnetometers.
+    """
+    count = len(position_world)
+    size = float(np.max(np.linalg.norm(position_world[:, None] - position_world, axis=-1)))
+    starts = size * np.array(list(product((0.2, 0.6, 1.2), repeat=count)))
+    found: list[tuple[tuple[int, ...], Array]] = []
+    for signs in product((1, -1), repeat=count - 1):
+        turned = np.broadcast_to(
+            direction * np.array([1, *signs])[:, None], (len(starts), count, 3)
+        )
+        distance, residual = distances_from_angles(turned, position_world, starts)
+        fits = (np.max(np.abs(residual), axis=-1) < tolerance) & np.all(distance > 0.0, axis=-1)
+        for centre in centre_by_rays(turned[fits], distance[fits], position_world):
+            known = [c for s, c in found if s == (1, *signs)]
+            if not any(np.linalg.norm(centre - other) < 1e-3 * size for other in known):
+                found.append(((1, *signs), centre))
+    return found

@@ -1,0 +1,136 @@
+"""Paper 002, equation by equation: centre and attitude of a rotating beacon by magnetometers.
+
+In the source every equation is a picture: what is here follows from the text beside it, from its
+references by number, and from paper 004 of the same authors.  Directions (..., magnetometers, 3)
+point from the beacon to the magnetometers, angles (..., 3) are psi, gamma, lambda (rad).
+"""
+
+from itertools import combinations
+
+import numpy as np
+
+from magfusion.model.physics.dipole import dipole_field
+from magfusion.model.physics.solenoid import solenoid_field
+from magfusion.papers.p004_fingerprints import equations as p004
+from magfusion.units import Array, IntArray
+
+NOT_FUNCTIONS = {
+    5: "defines the offset of the centre from where the beacon's shape has it; Right",
+    6: "defines the attitude: axes of the field = C_0^m axes of the shape; Right",
+    14: "says that C_0^m is orthogonal; Right, of the C of Eq 7 and not of that of Eq 19",
+    15: "step to Eq 17: the products of pseudo-directions by Eq 13",
+    16: "step to Eq 17: the angles between them are those of the directions; False as Eq 13",
+    17: "concludes that the centre does not depend on the attitude; False: 0.2 m for each degree",
+    20: "names the matrices of Eq 19, whose columns are the directions of Eq 13 and 18",
+    22: "assumes pseudo-directions with errors of mean zero; Right to first order in the noise",
+    23: "step to Eq 26: the error of the matrix of Eq 19, of that of the directions",
+    24: "step to Eq 26: its mean",
+    25: "step to Eq 26; False: T is made of the estimated centre, hence not free of the errors",
+    26: "concludes that Eq 19 has no bias; Right to first order: 7 mm of the centre at 5 % noise",
+    27: "step to Eq 30: the sine of a small error is the error; Right",
+    28: "step to Eq 30: element (3, 1) of the matrix as a function of psi and its error",
+    29: "step to Eq 30: names the variance of element (3, 1)",
+}
+
+eq_01_field = dipole_field
+"""Right."""
+
+eq_02_field = solenoid_field
+"""Unclear: a sum over dipoles along the axis and over radii; here the coil that they stand for."""
+
+
+def eq_03_moment(current: float, turns: float, radius: Array) -> Array:
+    """Return the moment ``I N pi R^2`` (A m^2) of turns of a radius (m).
+
+    Unclear: how the paper parts it among the rows and columns of Eq 2.
+    """
+    return current * turns * np.pi * radius**2
+
+
+eq_04_direction = p004.eq_07_direction
+"""Corrected as Eq 6-7 of paper 004; right of normals in the beacon's axes, z > 0, alone."""
+
+eq_07_attitude = p004.eq_20_attitude
+"""Right: ``Rz(gamma) Ry(psi) Rx(lambda)``."""
+
+eq_08_direction = p004.eq_02_direction
+"""Right."""
+
+
+def pairs(count: int) -> tuple[IntArray, IntArray]:
+    """Return first and second of all pairs of magnetometers, each (pairs,)."""
+    first, second = np.array(list(combinations(range(count), 2))).T
+    return first, second
+
+
+def eq_09_cosines(direction: Array) -> Array:
+    """Return the cosines of the angles between directions, shape (..., pairs).  Right."""
+    first, second = pairs(direction.shape[-2])
+    return np.einsum("...pi,...pi->...p", direction[..., first, :], direction[..., second, :])
+
+
+def eq_10_lengths(position_world: Array) -> Array:
+    """Return the distances between magnetometers (m), shape (pairs,).  Right."""
+    first, second = pairs(len(position_world))
+    return np.linalg.norm(position_world[first] - position_world[second], axis=-1)
+
+
+def eq_11_misfit(distance: Array, cosine: Array, length: Array) -> Array:
+    """Return what the law of cosines leaves (m^2), shape (..., pairs).
+
+    Right; up to four sets of distances (..., magnetometers) (m) fit three magnetometers.
+    """
+    first, second = pairs(distance.shape[-1])
+    a, b = distance[..., first], distance[..., second]
+    return a**2 + b**2 - 2.0 * a * b * cosine - length**2
+
+
+eq_12_misfit = p004.eq_17_misfit
+"""Right, of centre, magnetometers and distances; in one plane they leave two mirror centres."""
+
+eq_13_pseudo_direction_as_printed = p004.eq_18_pseudo_direction_as_printed
+"""False as Eq 18 of paper 004."""
+
+
+def eq_18_direction(centre_world: Array, position_world: Array) -> Array:
+    """Return the directions from a centre (..., 3) to the magnetometers.  Right."""
+    return -p004.eq_19_direction(centre_world, position_world)
+
+
+eq_19_attitude_as_printed = p004.eq_21_attitude_as_printed
+"""False as Eq 21 of paper 004: in general no rotation, and blind to a turn about the axis."""
+
+eq_21_angles = p004.eq_23_angles
+"""Corrected: Eq 30-32 imply arcsine and arccosines, which lose the signs."""
+
+
+def eq_30_variance_of_psi(world_from_beacon: Array, variance: Array) -> Array:
+    """Return the variance (rad^2) of psi by the arcsine.  Right; variance (3, 3): the elements'."""
+    return variance[..., 2, 0] / _upright(world_from_beacon)
+
+
+def eq_31_variance_of_lambda(world_from_beacon: Array, variance: Array) -> Array:
+    """Return the variance (rad^2) of lambda by the arccosine.
+
+    Right of the arccosine, hence without bound at ``cos lambda = 1``, which atan2 is not.
+    """
+    lamda = eq_21_angles(world_from_beacon)[..., 2]
+    return variance[..., 2, 2] / (_upright(world_from_beacon) * np.sin(lamda) ** 2)
+
+
+def eq_32_variance_of_gamma(world_from_beacon: Array, variance: Array) -> Array:
+    """Return the variance (rad^2) of gamma by the arccosine.  Right as Eq 31."""
+    gamma = eq_21_angles(world_from_beacon)[..., 1]
+    return variance[..., 0, 0] / (_upright(world_from_beacon) * np.sin(gamma) ** 2)
+
+
+def _upright(world_from_beacon: Array) -> Array:
+    return np.cos(eq_21_angles(world_from_beacon)[..., 0]) ** 2
+
+
+def eq_33_geometric_centre(corner_world: Array) -> Array:
+    """Return the mean of the corners (8, 3) of the beacon's box (m).
+
+    Right of the shape; the field's centre and axes are what it leaves open.
+    """
+    return corner_world.mean(axis=0)

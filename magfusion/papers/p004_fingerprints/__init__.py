@@ -1,0 +1,1 @@
+"""Paper 004: position and attitude among two-axis rotating beacons by fingerprints."""

@@ -1,0 +1,228 @@
+"""Which windows of a waveform are demodulated: one set of rules, for whole logs and for pieces.
+
+A window is judged when it is complete, by what was measured until then: what comes later changes
+nothing, so that a log drops the same windows whether it is read at once or as it arrives.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.model.samples import Waveform
+from magfusion.units import Array, BoolArray, IntArray
+
+MAGNETOMETER_GAP = "gap in the magnetometer stream"
+TOO_FEW = "too few samples"
+SATURATED = "magnetometer saturated"
+NO_INERTIAL = "no inertial data"
+INERTIAL_GAP = "gap in the inertial stream"
+REASONS = (MAGNETOMETER_GAP, TOO_FEW, SATURATED, NO_INERTIAL, INERTIAL_GAP)
+
+MOST_GROWTH = 4.0  # of the variance of a phasor, by missing samples
+LONGEST_GAP = 0.02  # s; of inertial samples: the motion between is a straight line
+SATURATED_RUN = 3  # consecutive samples at the extreme of all until then
+ROUNDING = 1e-6  # of a step; what arithmetic may take from a window
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Windows of a waveform that can be demodulated.
+
+    Parameters
+    ----------
+    number : int ndarray, shape (n,)
+        Counted on along the grid.
+    centre : ndarray, shape (n,)
+        (s)
+    first, count : int ndarray, shape (n,)
+        Samples of each window.
+    """
+
+    number: IntArray
+    centre: Array
+    first: IntArray
+    count: IntArray
+
+    def __len__(self) -> int:
+        return len(self.number)
+
+    def rows(self, kept: BoolArray | slice) -> "Windows":
+        """Return some windows."""
+        return Windows(self.number[kept], self.centre[kept], self.first[kept], self.count[kept])
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Windows of one length that follow each other by a fixed step.
+
+    Parameters
+    ----------
+    centre : float
+        Of window 0 (s).
+    step, length : float
+        (s)
+    early : float
+        How long before a window the interval of its first sample begins (s).
+    rounding : float
+        What a stamp may be early and still belong to a window (s).
+    wait : float
+        After a window's end, until its last sample has come for sure (s).
+    together : int
+        Windows that are judged at once, when the last of them is complete.
+    """
+
+    centre: float
+    step: float
+    length: float
+    early: float = 0.0
+    rounding: float = 0.0
+    wait: float = 0.0
+    together: int = 1
+
+    def last(self, until: float) -> int:
+        """Return the number of the last window that can be judged at a time (s)."""
+        complete = self.centre + self.length / 2.0 + self.wait
+        number = int(np.floor((until - complete) / self.step + ROUNDING))
+        return (number + 1) // self.together * self.together - 1
+
+    def last_of_log(self, time: Array, sample_step: float) -> int:
+        """Return the number of the last window that the samples of a whole log fill."""
+        # The last sample covers the interval up to the next one, as every sample does.
+        end = time[-1] + 0.5 * sample_step + self.early - self.length / 2.0
+        return int(np.floor((end - self.centre) / self.step + ROUNDING))
+
+    def windows(self, number: IntArray, time: Array) -> Windows:
+        """Return the samples at these times that some windows hold."""
+        centre = np.asarray(self.centre + self.step * number, dtype=np.float64)
+        half = self.length / 2.0
+        first = np.searchsorted(time, centre - half - self.rounding)
+        last = np.searchsorted(time, centre + half - self.rounding)
+        return Windows(number, centre, first, last - first)
+
+
+def usual_step(time: Array, stream: str) -> float:
+    """Return the usual time between two samples (s).
+
+    Raises
+    ------
+    InputError
+        Where there are less than two samples.
+    """
+    if len(time) < 2:
+        raise InputError(f"{stream}: found {len(time)} samples; record at least one window")
+    return float(np.median(np.diff(time)))
+
+
+def sample_rate_hz(waveform: Waveform) -> float:
+    """Return the usual sampling rate (Hz).
+
+    Raises
+    ------
+    InputError
+        Where there are less than two samples.
+    """
+    return 1.0 / usual_step(waveform.time, "magnetometer")
+
+
+Growth = Callable[[Windows, Array], Array]
+
+
+@dataclass(eq=False)
+class Admission:
+    """The rules by which windows are judged, in the order of their numbers.
+
+    Parameters
+    ----------
+    magnetometer_step, imu_step : float
+        Usual time between two samples (s).
+    imu_begin : float
+        First inertial sample (s).
+    imu_margin : float
+        How far a window may reach beyond the inertial samples (s).
+    clips : bool
+        Whether a constant extreme is saturation.
+    least_share : float
+        Of the samples that a window should hold.
+    extremes : ndarray, shape (2, 3)
+        Least and largest value so far (T).
+    """
+
+    magnetometer_step: float
+    imu_step: float
+    imu_begin: float
+    imu_margin: float
+    clips: bool
+    least_share: float
+    extremes: Array = field(default_factory=lambda: np.array([[np.inf] * 3, [-np.inf] * 3]))
+
+    def verdicts(
+        self, grid: Grid, windows: Windows, waveform: Waveform, imu_time: Array, growth: Growth
+    ) -> IntArray:
+        """Return the reason to drop each window, an index into `REASONS`; -1 for none.
+
+        Parameters
+        ----------
+        windows : Windows
+            Those after the ones that were judged last.
+        waveform : Waveform
+            With all samples of these windows and since those before.
+        imu_time : ndarray
+            On the clock of the waveform (s), likewise.
+        growth : callable
+            Takes windows that lack samples and the times of all; returns how many times as large as
+            that of a whole window the variance of their phasors is.
+        """
+        half = grid.length / 2.0 + grid.early
+        begin, end = windows.centre - half, windows.centre + grid.length / 2.0 - grid.early
+        found = np.full(len(windows), -1)
+
+        def drop(reason: str, spoilt: BoolArray) -> None:
+            found[(found < 0) & spoilt] = REASONS.index(reason)
+
+        time, step = waveform.time, self.magnetometer_step
+        gap = np.flatnonzero(np.diff(time) > 1.5 * step)
+        # From just before the first missing sample to just after the last.
+        lacking = _meets(time[gap] + 0.75 * step, time[gap + 1] - 0.75 * step, begin, end)
+        few = windows.count * step < self.least_share * grid.length
+        asked = lacking & ~few
+        if np.any(asked):
+            lacking[asked] = growth(windows.rows(asked), time) > MOST_GROWTH
+        drop(MAGNETOMETER_GAP, lacking)
+        drop(TOO_FEW, few)
+        if self.clips:
+            drop(SATURATED, self._saturated(waveform.measured_sensor, windows))
+        drop(NO_INERTIAL, begin < self.imu_begin - self.imu_margin)
+        gap = np.flatnonzero(np.diff(imu_time) > max(3.0 * self.imu_step, LONGEST_GAP))
+        silent = np.append(imu_time[gap], imu_time[-1:] + self.imu_margin)
+        spoken = np.append(imu_time[gap + 1], np.inf)
+        drop(INERTIAL_GAP, _meets(silent, spoken, begin, end - 0.6 * step))
+        return found
+
+    def _saturated(self, measured: Array, windows: Windows) -> BoolArray:
+        """Return in which windows an axis stays at the extreme of all its values until then."""
+        first, last = windows.first, windows.first + windows.count
+        spoilt = np.zeros(len(windows), dtype=bool)
+        long = np.flatnonzero(windows.count >= SATURATED_RUN)
+        if len(long) == 0:
+            return spoilt
+        for row, sign in enumerate((-1.0, 1.0)):
+            for axis in range(3):
+                value = sign * measured[: np.max(last), axis]
+                extreme = np.maximum.accumulate(value)
+                level = np.maximum(extreme[last[long] - 1], sign * self.extremes[row, axis])
+                same = value[1:] == value[:-1]
+                run = np.flatnonzero(same[1:] & same[:-1] & (value[2:] == extreme[2:]))
+                # The extreme only grows: of the runs in a window the last is the farthest out.
+                latest = np.searchsorted(run, last[long] - SATURATED_RUN, side="right") - 1
+                at = run[np.maximum(latest, 0)] if len(run) else np.zeros(len(long), dtype=int)
+                inside = (latest >= 0) & (at >= first[long])
+                spoilt[long] |= inside & (value[at] == level)
+                self.extremes[row, axis] = sign * max(extreme[-1], sign * self.extremes[row, axis])
+        return spoilt
+
+
+def _meets(begin: Array, end: Array, window_begin: Array, window_end: Array) -> BoolArray:
+    """Return which windows meet at least one of the stretches, which are sorted and apart."""
+    return np.searchsorted(begin, window_end) > np.searchsorted(end, window_begin)

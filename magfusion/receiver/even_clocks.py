@@ -1,0 +1,53 @@
+"""A log whose streams are on even clocks, where stamps scatter about one that is."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.model.samples import Log, StreamClock
+from magfusion.model.site import Site
+from magfusion.receiver.lockin import unexplained
+from magfusion.receiver.sampling_clock import SamplingClock, sampling_clock
+from magfusion.receiver.slots import has_schedule
+from magfusion.receiver.windows import default_settings
+
+
+def on_even_clocks(log: Log, site: Site) -> Log:
+    """Return a log with stamps that scatter about an even clock replaced by it.
+
+    Whether the samples were taken at the ticks or at the stamps the magnetometer decides: at the
+    right times tones and turn leave less of it.  An IMU tells no such thing, and follows.
+    """
+    found = {"imu": sampling_clock(log.imu.time)}
+    if log.waveform is not None:
+        found["magnetometer"] = sampling_clock(log.waveform.time)
+    clocks = {name: clock for name, clock in found.items() if clock is not None}
+    if not clocks:
+        return log
+    even = _at(log, clocks)
+    replaced = "magnetometer" not in clocks or _evener(log, even, site)
+    notes = {
+        name: StreamClock(clock.step, clock.scatter, clock.lost, replaced)
+        for name, clock in clocks.items()
+    }
+    return replace(even if replaced else log, clocks=notes)
+
+
+def _at(log: Log, clocks: Mapping[str, SamplingClock]) -> Log:
+    """Return a log with the stamps of some streams replaced by their clocks."""
+    if "imu" in clocks:
+        log = replace(log, imu=replace(log.imu, time=clocks["imu"].time))
+    if "magnetometer" in clocks:
+        assert log.waveform is not None
+        log = replace(log, waveform=replace(log.waveform, time=clocks["magnetometer"].time))
+    return log
+
+
+def _evener(log: Log, even: Log, site: Site) -> bool:
+    """Return whether tones and turn leave less of the samples at the ticks than at the stamps."""
+    if has_schedule(site) or not site.beacons:
+        return True
+    settings = default_settings(site)
+    ticks, stamps = (unexplained(one, site, settings) for one in (even, log))
+    return bool(np.median(ticks) < np.median(stamps))

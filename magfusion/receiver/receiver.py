@@ -1,0 +1,417 @@
+"""The receiver: a magnetometer's samples, pushed as they come or all at once, to phasors.
+
+Of tones that are sent at once, `LockinReceiver`; of time slots, `SlotReceiver`.  Which windows are
+used `magfusion.receiver.admission` says, for both and whatever the size of the pieces.
+"""
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from functools import cached_property
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
+from magfusion.model.site import Site
+from magfusion.receiver.admission import (
+    REASONS,
+    ROUNDING,
+    Admission,
+    Grid,
+    Windows,
+    sample_rate_hz,
+    usual_step,
+)
+from magfusion.receiver.lockin import variance_growth, window_operator
+from magfusion.receiver.slots import (
+    SlotSettings,
+    check_carriers,
+    demodulate_slots,
+    driven_slots,
+    has_schedule,
+    history_of,
+    is_pulsed,
+    schedule,
+    slot_lockin,
+    slot_settings_of,
+)
+from magfusion.receiver.turn import on_clock
+from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz, default_settings
+from magfusion.units import Array, BoolArray, IntArray
+
+NO_SILENT_SLOT = "no silent slot beside it"
+# Of the samples of a window: its design tells whether they suffice; of a slot: it has few columns.
+LEAST_SHARE, LEAST_SHARE_OF_SLOT = 0.5, 0.9
+
+
+class Receiver(ABC):
+    """Windows of a waveform, each admitted or dropped once, and their phasors.
+
+    Attributes
+    ----------
+    grid : Grid, optional
+        Where the windows lie, once it has begun.
+    next_number : int
+        Of the window that is judged next.
+    recent : int ndarray
+        Numbers of windows that were admitted and that the phasors of later ones need.
+    dropped : Counter
+        Reason to number of windows.
+    """
+
+    grid: Grid | None
+    admission: Admission | None
+    next_number: int
+    recent: IntArray
+    dropped: Counter[str]
+
+    def __init__(self, site: Site) -> None:
+        self.site = site
+        self.grid = self.admission = None
+        self.next_number = 0
+        self.recent = np.zeros(0, dtype=np.int64)
+        self.dropped = Counter()
+
+    @staticmethod
+    def of(site: Site, settings: LockinSettings | SlotSettings | None = None) -> "Receiver":
+        """Return the receiver for the drives of a site.
+
+        Parameters
+        ----------
+        settings : LockinSettings or SlotSettings, optional
+            None chooses them by the tones or the time slots.
+        """
+        if isinstance(settings, SlotSettings) or has_schedule(site):
+            return SlotReceiver(site, settings)
+        return LockinReceiver(site, settings)
+
+    @property
+    @abstractmethod
+    def remembered(self) -> int:
+        """For how many windows one that was admitted is needed."""
+
+    @property
+    def history(self) -> float:
+        """How much older than a window's centre the samples are that its phasors need (s)."""
+        if self.grid is None:
+            return 0.0
+        return self.grid.length + (self.remembered + self.grid.together) * self.grid.step
+
+    @abstractmethod
+    def check(self) -> None:
+        """Refuse drives that cannot be separated, and settings that do not suit them.
+
+        Raises
+        ------
+        InputError
+        """
+
+    def lockin(self) -> "LockinReceiver":
+        """Return this receiver where its windows leave a steady field, the Earth's.
+
+        Raises
+        ------
+        InputError
+            Where it is of time slots.
+        """
+        if isinstance(self, LockinReceiver):
+            return self
+        raise InputError(
+            "of coils in time slots the Earth field is taken off with the silent slots; leave"
+            " --earth out"
+        )
+
+    @abstractmethod
+    def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
+        """Lay the grid by the first samples.
+
+        Raises
+        ------
+        InputError
+            Where the sampling rate does not suit the drives, or a stream has less than two samples.
+        """
+
+    @abstractmethod
+    def phasors(
+        self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
+    ) -> tuple[FieldSamples, IntArray]:
+        """Return the phasors of windows at what is known, and the number of each row's window.
+
+        Parameters
+        ----------
+        imu : ImuSamples
+            As from `magfusion.receiver.turn.on_clock`.
+        site : Site
+            With the calibration of the magnetometer.
+        """
+
+    @abstractmethod
+    def _driven(self, number: IntArray) -> BoolArray:
+        """Tell which windows lead to a row of phasors."""
+
+    @abstractmethod
+    def _growth(self, windows: Windows, time: Array) -> Array:
+        """Return what missing samples do to the variance of phasors, as of `Growth`."""
+
+    def push(
+        self,
+        waveform: Waveform,
+        imu: ImuSamples,
+        until: float,
+        gyro_bias_body: Array | None = None,
+        time_offset: float | None = None,
+    ) -> FieldSamples:
+        """Return the phasors of the windows that have become complete.
+
+        Parameters
+        ----------
+        waveform : Waveform
+            With all samples of these windows, and since so long before as `history` says.
+        imu : ImuSamples
+            Likewise.
+        until : float
+            When what has come ends (s).
+        gyro_bias_body, time_offset
+            As of `magfusion.receiver.turn.on_clock`; the offset is the site's where none is given.
+        """
+        assert self.grid is not None
+        new = self.admit(waveform, imu, until).number
+        expected = int(np.sum(self._driven(new)))
+        known = np.concatenate([self.recent, new])
+        self.recent = known[known >= self.next_number - self.remembered]
+        if expected == 0:
+            return FieldSamples.empty(self.site.channels)
+        windows = self.grid.windows(known, waveform.time)
+        offset = self.site.platform.imu.time_offset if time_offset is None else time_offset
+        known_imu = on_clock(imu, offset, gyro_bias_body)
+        found, number = self.phasors(waveform, known_imu, windows, self.site)
+        found = found.rows(number >= new[0])
+        self._count(NO_SILENT_SLOT, expected - len(found))
+        return found
+
+    def whole(self, waveform: Waveform, imu: ImuSamples) -> tuple[Windows, FieldSamples]:
+        """Return the usable windows of a whole log, and their phasors.
+
+        Raises
+        ------
+        InputError
+            Where no window is usable.
+        """
+        self.begin(waveform, imu)
+        windows = self.admit(waveform, imu)
+        expected = int(np.sum(self._driven(windows.number)))
+        if expected == 0:
+            raise self._none_usable()
+        known = on_clock(imu, self.site.platform.imu.time_offset)
+        found, _ = self.phasors(waveform, known, windows, self.site)
+        self._count(NO_SILENT_SLOT, expected - len(found))
+        if len(found) == 0:
+            raise self._none_usable()
+        return windows, found
+
+    def centre_of(self, number: int) -> float:
+        """Return the centre of a window (s)."""
+        assert self.grid is not None
+        return self.grid.centre + self.grid.step * number
+
+    def complete(self, until: float) -> bool:
+        """Return whether there is a window to judge at a time (s)."""
+        return self.grid is not None and self.grid.last(until) >= self.next_number
+
+    def admit(self, waveform: Waveform, imu: ImuSamples, until: float | None = None) -> Windows:
+        """Return the windows that have become complete and can be demodulated.
+
+        Parameters
+        ----------
+        waveform, imu, until
+            As of `push`; no time means the end of the log.
+        """
+        assert self.grid is not None
+        assert self.admission is not None
+        if until is None:
+            last = self.grid.last_of_log(waveform.time, self.admission.magnetometer_step)
+        else:
+            last = self.grid.last(until)
+        number = np.arange(self.next_number, max(last + 1, self.next_number))
+        self.next_number += len(number)
+        windows = self.grid.windows(number, waveform.time)
+        # By the clock as declared: what is learnt of it later changes no verdict.
+        stamps = imu.time + self.site.platform.imu.time_offset
+        verdict = self.admission.verdicts(self.grid, windows, waveform, stamps, self._growth)
+        for k, reason in enumerate(REASONS):
+            self._count(reason, int(np.sum(verdict == k)))
+        return windows.rows(verdict < 0)
+
+    def _count(self, reason: str, dropped: int) -> None:
+        if dropped:
+            self.dropped[reason] += dropped
+
+    def _begin(
+        self, waveform: Waveform, imu: ImuSamples, grid: Grid, share: float, *, clips: bool
+    ) -> None:
+        model = self.site.platform.imu
+        stamps = imu.time + model.time_offset
+        step = usual_step(stamps, "imu")
+        self.grid = grid
+        self.admission = Admission(
+            magnetometer_step=usual_step(waveform.time, "magnetometer"),
+            imu_step=step,
+            imu_begin=float(stamps[0]),
+            imu_margin=2.0 * step + 3.0 * model.time_offset_sigma,
+            clips=clips,
+            least_share=share,
+        )
+
+    def _none_usable(self) -> InputError:
+        assert self.grid is not None
+        slots = has_schedule(self.site)
+        one, remedy = ("slot", "") if slots else ("window", ", or choose a shorter window")
+        reasons = "; ".join(f"{k}: {v}" for k, v in self.dropped.items())
+        return InputError(
+            f"magnetometer: no {one} of {self.grid.length:g} s is usable"
+            f" ({reasons or 'the log is too short'}); record longer{remedy}"
+        )
+
+
+class LockinReceiver(Receiver):
+    """Of tones that are sent at once: windows that overlap, long against the motion."""
+
+    remembered = 0
+
+    def __init__(self, site: Site, settings: LockinSettings | None = None) -> None:
+        super().__init__(site)
+        self._given = settings
+
+    @cached_property
+    def settings(self) -> LockinSettings:
+        """Window and step, chosen by the tones where they were not given."""
+        return default_settings(self.site) if self._given is None else self._given
+
+    def check(self) -> None:
+        """Refuse tones that cannot be separated, as `Receiver.check`."""
+        channel_frequencies_hz(self.site)
+
+    def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
+        """Lay windows from the first sample on, as `Receiver.begin`."""
+        rate_hz = sample_rate_hz(waveform)
+        highest = float(np.max(channel_frequencies_hz(self.site)))
+        if highest > 0.45 * rate_hz:
+            raise InputError(
+                f"magnetometer: sampled at {rate_hz:.4g} Hz, too slow for the tone at {highest:g}"
+                f" Hz; at least {highest / 0.45:.4g} Hz are needed"
+            )
+        window = self.settings.window
+        grid = Grid(
+            centre=float(waveform.time[0]) - 0.5 / rate_hz + window / 2.0,
+            step=self.settings.step,
+            length=window,
+            wait=-0.6 / rate_hz,  # the last sample is half a step earlier
+        )
+        self._begin(waveform, imu, grid, LEAST_SHARE, clips=True)
+
+    def phasors(
+        self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
+    ) -> tuple[FieldSamples, IntArray]:
+        """Return the phasors of windows without what is known of the motion but the turns."""
+        operator = window_operator(waveform, imu, site, self.settings, windows)
+        return operator.demodulate(waveform.measured_sensor)[0], windows.number
+
+    def _driven(self, number: IntArray) -> BoolArray:
+        return np.ones(len(number), dtype=bool)
+
+    def _growth(self, windows: Windows, time: Array) -> Array:
+        assert self.admission is not None
+        frequencies = channel_frequencies_hz(self.site)
+        step = self.admission.magnetometer_step
+        return variance_growth(windows, time, step, self.settings, frequencies)
+
+
+class SlotReceiver(Receiver):
+    """Of coils driven in turn: each slot a row at its own time, judged by whole cycles."""
+
+    def __init__(self, site: Site, settings: LockinSettings | SlotSettings | None = None) -> None:
+        super().__init__(site)
+        self._given = settings
+
+    @cached_property
+    def settings(self) -> SlotSettings:
+        """Removal and taper, chosen by the drives where they were not given."""
+        given = self._given
+        return given if isinstance(given, SlotSettings) else slot_settings_of(self.site, given)
+
+    @property
+    def remembered(self) -> int:
+        """For how many slots one that was admitted tells the ambient field and the noise."""
+        return history_of(self.site, self.settings) * schedule(self.site).count
+
+    def check(self) -> None:
+        """Refuse a schedule that not all coils keep, as `Receiver.check`."""
+        schedule(self.site)
+        slot_settings_of(self.site, None if isinstance(self._given, SlotSettings) else self._given)
+
+    def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
+        """Lay slots by the schedule, from the first that is whole, as `Receiver.begin`."""
+        slots = schedule(self.site)
+        rate_hz = sample_rate_hz(waveform)
+        check_carriers(self.site, rate_hz, self.settings)
+        grid = Grid(
+            centre=slots.start + 0.5 * slots.duration,
+            step=slots.duration,
+            length=slots.duration,
+            early=0.5 / rate_hz,
+            rounding=ROUNDING * slots.duration,
+            together=slots.count,
+        )
+        elapsed = float(waveform.time[0]) - 1.0 / rate_hz - slots.start
+        self.next_number = int(np.ceil(elapsed / slots.duration + ROUNDING))
+        # The plateau of a pulse is no saturation.
+        self._begin(waveform, imu, grid, LEAST_SHARE_OF_SLOT, clips=not is_pulsed(self.site))
+
+    def phasors(
+        self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
+    ) -> tuple[FieldSamples, IntArray]:
+        """Return the phasors of driven slots, freed of what the silent ones tell."""
+        assert self.admission is not None
+        rate_hz = 1.0 / self.admission.magnetometer_step
+        return demodulate_slots(waveform, imu, site, self.settings, windows, rate_hz)
+
+    def _driven(self, number: IntArray) -> BoolArray:
+        return driven_slots(self.site, number)
+
+    def _growth(self, windows: Windows, time: Array) -> Array:  # noqa: ARG002
+        """Return one: the few columns of a slot stay apart without a few samples."""
+        return np.ones(len(windows))
+
+
+def usual_lockin(site: Site, mains_hz: float = 50.0) -> LockinSettings:
+    """Return the window and step of a site where nothing else is asked: of slots, theirs.
+
+    Raises
+    ------
+    InputError
+        Where its drives cannot be separated.
+    """
+    return (slot_lockin if has_schedule(site) else default_settings)(site, mains_hz)
+
+
+def received(
+    waveform: Waveform,
+    imu: ImuSamples,
+    site: Site,
+    settings: LockinSettings | SlotSettings | None = None,
+) -> tuple[FieldSamples, Counter[str]]:
+    """Return the phasors of a whole waveform, and how many windows were dropped for which reason.
+
+    Parameters
+    ----------
+    settings : LockinSettings or SlotSettings, optional
+        As of `Receiver.of`.
+
+    Raises
+    ------
+    InputError
+        Where no window is usable.
+    """
+    receiver = Receiver.of(site, settings)
+    _, found = receiver.whole(waveform, imu)
+    return found, receiver.dropped

@@ -1,0 +1,191 @@
+"""The clock that a stream was sampled by, where its stamps scatter about it.
+
+Stamps of a host are taken when samples arrive, not when they were measured.  A sampler that ticks
+evenly is found again under them: each sample is given its tick, lost ones leave theirs out, and a
+smooth curve through stamps and ticks is the clock.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import make_lsq_spline
+
+from magfusion.units import Array, ComplexArray, IntArray
+
+EVEN = 0.01  # of a step; stamps that scatter less are a clock's own
+MOST_SCATTER = 0.45  # of a step, root mean square; beyond, ticks cannot be told apart
+PIECE = 200  # samples whose ticks are found at once
+KEPT = 150  # of them: those at the end may belong to another tick
+MOST_LOST = 40  # ticks in a piece; a longer silence is a gap
+GAP = 10.0  # steps
+LOSS = 8.0  # log-likelihood ratio that a lost sample costs
+MEMORY = 2000  # samples that tell where the next ticks are
+MOST_PIECES = 40  # that tell the usual step
+SEARCHED = 0.08  # of the median step, either way
+KNOT = 10.0  # s; a clock drifts more slowly
+FEWEST = 50  # samples
+
+
+@dataclass(frozen=True, eq=False)
+class SamplingClock:
+    """The even clock under a stream's stamps.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        When the samples were taken (s).
+    step : float
+        Between two ticks (s).
+    scatter : float
+        Root mean square of stamps about the clock (s).
+    lost : int
+        Ticks without a sample, gaps aside.
+    """
+
+    time: Array
+    step: float
+    scatter: float
+    lost: int
+
+
+def sampling_clock(stamps: Array) -> SamplingClock | None:
+    """Return the even clock under stamps that scatter; None where they scatter little, or none is.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (n,)
+        Strictly increasing (s).
+    """
+    if len(stamps) < PIECE or _even(stamps, float(np.median(np.diff(stamps)))):
+        return None
+    step = _usual_step(stamps)
+    if _even(stamps, step):
+        return None
+    whole = np.diff(stamps) / step
+    breaks = np.flatnonzero(whole > GAP) + 1
+    parts = [_of_stretch(part, step) for part in np.split(stamps, breaks)]
+    off = np.concatenate([p.time for p in parts]) - stamps
+    scatter = float(np.sqrt(np.mean(off**2)))
+    if not EVEN * step < scatter < MOST_SCATTER * step:
+        return None
+    time = np.concatenate([p.time for p in parts])
+    if np.any(np.diff(time) <= 0.0):
+        return None
+    return SamplingClock(time, step, scatter, sum(p.lost for p in parts))
+
+
+def _even(stamps: Array, step: float) -> bool:
+    """Return whether stamps lie whole steps apart."""
+    whole = np.diff(stamps) / step
+    return bool(np.sqrt(np.mean((whole - np.round(whole)) ** 2)) < EVEN)
+
+
+def _usual_step(stamps: Array) -> float:
+    """Return the time between two ticks (s): the period that the stamps of each piece keep best.
+
+    By the length of the mean phasor (Rayleigh's test), which lost samples do not change.
+    """
+    usual = float(np.median(np.diff(stamps)))
+    count = len(stamps) // PIECE
+    pieces = stamps[: count * PIECE].reshape(count, PIECE)[:MOST_PIECES]
+    width = SEARCHED
+    for _ in range(3):
+        tried = usual * (1.0 + np.linspace(-width, width, 161))
+        kept = [float(np.sum(np.abs(_phasor(pieces, step)) ** 2)) for step in tried]
+        usual, width = float(tried[int(np.argmax(kept))]), 0.1 * width
+    return usual
+
+
+def _phasor(stamps: Array, step: float) -> ComplexArray:
+    """Return the mean of each row's phases in a period."""
+    return np.asarray(np.mean(np.exp(2j * np.pi * (stamps - stamps[..., :1]) / step), axis=-1))
+
+
+def _of_stretch(stamps: Array, step: float) -> SamplingClock:
+    tick = _ticks(stamps, step)
+    time = _smooth_clock(tick, stamps)
+    lost = int(tick[-1] - tick[0] + 1 - len(tick))
+    return SamplingClock(time, step, 0.0, lost)
+
+
+def _ticks(stamps: Array, step: float) -> IntArray:
+    """Return the tick of each sample, counted from the first, piece by piece."""
+    tick = np.zeros(len(stamps), dtype=np.int64)
+    begin = 0
+    while begin < len(stamps):
+        own = stamps[begin : begin + PIECE]
+        first = max(0, begin - MEMORY)
+        if begin - first >= 2 * FEWEST:
+            slope, start = np.polyfit(tick[first:begin] - tick[begin - 1], stamps[first:begin], 1)
+        else:
+            slope, start = step, _phase(own, step) - step
+        previous = int(tick[begin - 1]) if begin else -1
+        scatter = max(_scatter(own, slope), EVEN * step)
+        slip = _slips((own - start) / slope - np.arange(1, len(own) + 1), scatter / slope)
+        kept = len(own) if begin + PIECE >= len(stamps) else KEPT
+        tick[begin : begin + kept] = previous + 1 + np.arange(kept) + slip[:kept]
+        begin += kept
+    return tick - tick[0]
+
+
+def _phase(stamps: Array, step: float) -> float:
+    """Return when the tick of a piece's first sample is (s)."""
+    return float(stamps[0] + step * np.angle(_phasor(stamps[:FEWEST], step)) / (2.0 * np.pi))
+
+
+def _scatter(stamps: Array, step: float) -> float:
+    """Return how far stamps lie from an even clock (s), lost samples aside."""
+    apart = np.diff(stamps) / step
+    apart = step * (apart - np.maximum(np.round(apart), 1.0))
+    return float(np.median(np.abs(apart)) / 0.6745 / np.sqrt(2.0))
+
+
+def _slips(late: Array, sigma: float) -> IntArray:
+    """Return how many ticks before each sample of a piece have none, the likeliest way.
+
+    Dynamic programming over the number of lost ticks, which only grows.
+
+    Parameters
+    ----------
+    late : ndarray, shape (n,)
+        How much later than without a loss each sample is, in ticks.
+    sigma : float
+        Scatter of the stamps, in ticks.
+    """
+    if np.max(np.abs(late)) < 0.5:
+        return np.zeros(len(late), dtype=np.int64)
+    lost = np.arange(MOST_LOST + 1)
+    cost = np.where(lost == 0, 0.0, LOSS)
+    came = np.zeros((len(late), len(lost)), dtype=np.int64)
+    for k, own in enumerate(late):
+        best = np.minimum.accumulate(cost)
+        at = np.maximum.accumulate(np.where(cost == best, lost, 0))
+        fewer = np.concatenate([[np.inf], best[:-1]]) + LOSS
+        jump = fewer < cost
+        came[k] = np.where(jump, np.concatenate([[0], at[:-1]]), lost)
+        cost = np.where(jump, fewer, cost) + 0.5 * np.minimum((own - lost) / sigma, 5.0) ** 2
+    slip = np.empty(len(late), dtype=np.int64)
+    state = int(np.argmin(cost))
+    for k in range(len(late) - 1, -1, -1):
+        slip[k] = state
+        state = int(came[k, state])
+    return slip
+
+
+def _smooth_clock(tick: IntArray, stamps: Array) -> Array:
+    """Return the time of each tick (s): straight lines that bend every `KNOT` at most."""
+    if len(stamps) < FEWEST:
+        return stamps
+    span = stamps[-1] - stamps[0]
+    inner = np.linspace(tick[0], tick[-1], max(int(span / KNOT), 1) + 1)[1:-1]
+    ends = (float(tick[0]), float(tick[-1]))
+    knots = np.concatenate([[ends[0]] * 2, inner, [ends[1]] * 2])
+    weight = np.ones(len(stamps))
+    found = stamps
+    for _ in range(4):
+        spline = make_lsq_spline(tick.astype(float), stamps, knots, k=1, w=weight)
+        found = np.asarray(spline(tick.astype(float)))
+        off = np.abs(stamps - found)
+        sigma = np.median(off) / 0.6745
+        weight = 1.0 / np.maximum(1.0, off / max(3.0 * sigma, 1e-12))
+    return found

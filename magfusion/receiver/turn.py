@@ -1,0 +1,47 @@
+"""What the gyro tells of a measured field: how it turns against axes that stand still."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import Site
+from magfusion.model.strapdown import attitude_at, attitude_from_gyro
+from magfusion.units import Array
+
+
+def on_clock(
+    imu: ImuSamples, time_offset: float, gyro_bias_body: Array | None = None
+) -> ImuSamples:
+    """Return an inertial stream on the clock of the waveform, freed of the gyro's bias.
+
+    Parameters
+    ----------
+    time_offset : float
+        IMU time offset (s).
+    gyro_bias_body : ndarray, shape (3,) or (len(imu), 3), optional
+        (rad/s)
+    """
+    gyro = imu.gyro_body if gyro_bias_body is None else imu.gyro_body - gyro_bias_body
+    return replace(imu, time=imu.time + time_offset, gyro_body=gyro)
+
+
+def turn_of(imu: ImuSamples, site: Site) -> Callable[[Array], Array]:
+    """Return what gives, at times (m,), the ``measured_from_still`` (m, 3, 3) of a field.
+
+    The axes stand still as the body's do at the first inertial sample.
+
+    Parameters
+    ----------
+    imu : ImuSamples
+        As from `on_clock`.
+    """
+    attitude, sensor = attitude_from_gyro(imu.time, imu.gyro_body), site.platform.magnetometer
+    measured_from_body = sensor.matrix @ sensor.body_from_sensor.T
+
+    def measured_from_still(time: Array) -> Array:
+        still_from_body = attitude_at(attitude, imu.time, imu.gyro_body, time).as_matrix()
+        return measured_from_body @ np.swapaxes(still_from_body, 1, 2)
+
+    return measured_from_still

@@ -1,1 +1,0 @@
-"""Recorded data: the log and its readers and writers."""

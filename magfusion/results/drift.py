@@ -1,0 +1,336 @@
+"""Whether an error grows with time: slopes with their standard errors, Allan deviation, verdicts.
+
+Neighbouring errors of one run are alike, so that a slope's standard error comes from the scatter
+between independent worlds, or, where there is one alone, from how long its errors are alike
+(`magfusion.results.trend`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.stats import f as fisher
+from scipy.stats import t as student
+
+from magfusion.results.trend import trend
+from magfusion.units import Array, BoolArray
+
+DAY, HOUR = 86_400.0, 3600.0  # s
+CONFIDENCE = 0.95  # with which a slope is told to be within its limit
+CERTAIN = 0.999  # and beyond it: many slopes are judged, and one may not fail by chance
+FEWEST_COMMON = 5  # worlds whose scatter determines three slopes
+THREE_SIGMA = 0.0027  # how often chance alone goes beyond three standard errors
+# Columns of an error, as of the estimators' states.
+ATTITUDE, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
+ACCEL_BIAS, GYRO_BIAS = slice(9, 12), slice(12, 15)
+
+Verdict = Literal["pass", "fail", "undecided"]
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorSeries:
+    """Errors of the states of one run.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    measured : ndarray of bool, shape (n,)
+        Whether a field was measured there; the states between are carried on by the IMU.
+    error, sigma : ndarray, shape (n, 15)
+        Attitude (rad), position (m) and velocity (m/s) in world axes, so that what goes one way
+        for days adds up whatever way the body looks; biases of the accelerometer (m/s^2) and the
+        gyro (rad/s) in body axes.
+    pose_nees, bias_nees : ndarray, shape (n,)
+        Normalised errors squared, of six degrees of freedom each.
+    """
+
+    time: Array
+    measured: BoolArray
+    error: Array
+    sigma: Array
+    pose_nees: Array
+    bias_nees: Array
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def rows(self, chosen: BoolArray) -> "ErrorSeries":
+        """Return some of the states."""
+        return ErrorSeries(
+            self.time[chosen],
+            self.measured[chosen],
+            self.error[chosen],
+            self.sigma[chosen],
+            self.pose_nees[chosen],
+            self.bias_nees[chosen],
+        )
+
+    def size(self, part: slice) -> Array:
+        """Return the length of a part of the error, shape (n,)."""
+        return np.asarray(np.linalg.norm(self.error[:, part], axis=1))
+
+
+@dataclass(frozen=True)
+class Slope:
+    """Growth of an error in a day.
+
+    Parameters
+    ----------
+    freedom : int
+        Degrees of freedom of the standard error.
+    """
+
+    per_day: float
+    standard_error: float
+    freedom: float
+
+    @property
+    def margin(self) -> float:
+        """Half the interval that holds the true slope with `CONFIDENCE`."""
+        return self._margin(CONFIDENCE)
+
+    def _margin(self, confidence: float) -> float:
+        return float(student.ppf(0.5 + 0.5 * confidence, self.freedom) * self.standard_error)
+
+    def verdict(self, limit: float) -> Verdict:
+        """Return whether the slope is within plus or minus a limit.
+
+        It passes only where all of its interval does, and fails where none of the interval of
+        `CERTAIN` does: a run too short to tell is not one that has passed, nor has it failed.
+        """
+        size = abs(self.per_day)
+        return within(size - self._margin(CERTAIN), size + self.margin, limit)
+
+
+def within(low: float, high: float, limit: float) -> Verdict:
+    """Return whether an interval lies below a limit: all of it, none of it, or neither."""
+    if high < limit:
+        return "pass"
+    return "fail" if low > limit else "undecided"
+
+
+@dataclass(frozen=True, eq=False)
+class CommonSlope:
+    """What the components of an error have in common in all worlds: the way they go with time.
+
+    The length of an error hides it: a drift of a millimetre adds nothing to a constant error of a
+    centimetre that lies across it.
+
+    Parameters
+    ----------
+    per_day : ndarray, shape (3,)
+        Mean over the worlds.
+    standard_error : ndarray, shape (3,)
+        From their scatter.
+    probability : float
+        That chance alone gives slopes as far from none, by Hotelling's test of all three
+        components at once; below `THREE_SIGMA` they are beyond three standard errors.
+    """
+
+    per_day: Array
+    standard_error: Array
+    probability: float
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return whether the worlds drift one way."""
+        return "fail" if self.probability < THREE_SIGMA else "pass"
+
+
+def common_slope(times: Sequence[Array], values: Sequence[Array]) -> CommonSlope:
+    """Return the mean slope of the components of an error over worlds.
+
+    Parameters
+    ----------
+    times : sequence of ndarray, shape (n,)
+        One of each world (s).
+    values : sequence of ndarray, shape (n, 3)
+
+    Raises
+    ------
+    ValueError
+        With fewer than `FEWEST_COMMON` worlds, whose scatter in three components is not known.
+    """
+    worlds = len(values)
+    if worlds < FEWEST_COMMON:
+        raise ValueError(f"at least {FEWEST_COMMON} worlds are needed; got {worlds}")
+    rates = np.array([np.polyfit(t / DAY, v, 1)[0] for t, v in zip(times, values, strict=True)])
+    mean, cov = np.mean(rates, axis=0), np.cov(rates, rowvar=False) / worlds
+    square = float(mean @ np.linalg.solve(cov, mean))
+    freedom = worlds - 3
+    chance = float(fisher.sf(square * freedom / (3 * (worlds - 1)), 3, freedom))
+    return CommonSlope(mean, np.sqrt(np.diag(cov)), chance)
+
+
+def slope_of_one(time: Array, value: Array) -> Slope:
+    """Return the slope of one world's errors, however long they are alike.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    value : ndarray, shape (n,)
+
+    Raises
+    ------
+    ValueError
+        Where fewer than three blocks hold any value.
+    """
+    return Slope(*trend(time / DAY, value))
+
+
+def slope_over_worlds(times: Sequence[Array], values: Sequence[Array]) -> Slope:
+    """Return the mean slope of several worlds, its standard error from their scatter.
+
+    Parameters
+    ----------
+    times, values : sequence of ndarray, shape (n,)
+        One of each world (s); a single one is left to `slope_of_one`.
+    """
+    if len(values) == 1:
+        return slope_of_one(times[0], values[0])
+    rates = [np.polyfit(t / DAY, v, 1)[0] for t, v in zip(times, values, strict=True)]
+    error = float(np.std(rates, ddof=1) / np.sqrt(len(rates)))
+    return Slope(float(np.mean(rates)), error, len(rates) - 1)
+
+
+def allan_deviation(value: Array, step: float, points: int = 40) -> tuple[Array, Array]:
+    """Return averaging times and the overlapping Allan deviation of a series.
+
+    The deviation at m samples is the root of half the mean squared difference of neighbouring means
+    of m samples (IEEE Std 952-1997, annex C): it falls as 1 / sqrt(m) for white errors, and rises
+    as sqrt(m / 3) for a random walk.
+
+    Parameters
+    ----------
+    value : ndarray, shape (n,) or (n, axes)
+        At equal distances; axes are averaged in square.
+    step : float
+        (s)
+    points : int
+        At most so many times, in equal ratios.
+
+    Returns
+    -------
+    time, deviation : ndarray, shape (m,)
+        Up to a third of the series (s; unit of the values).
+    """
+    columns = value.reshape(len(value), -1)
+    most = len(columns) // 3
+    if most < 1:
+        return np.empty(0), np.empty(0)
+    counts = np.unique(np.geomspace(1, most, points).astype(int))
+    total = np.concatenate([np.zeros((1, columns.shape[1])), np.cumsum(columns, axis=0)])
+    found = []
+    for m in counts:
+        mean = (total[m:] - total[:-m]) / m
+        found.append(np.sqrt(0.5 * np.mean((mean[m:] - mean[:-m]) ** 2)))
+    return counts * step, np.array(found)
+
+
+def evenly(series: ErrorSeries, interval: float) -> ErrorSeries:
+    """Return the measured states at multiples of an interval (s): one weight for all hours."""
+    off = np.abs(series.time / interval - np.round(series.time / interval))
+    return series.rows(series.measured & (off * interval < 1e-6))
+
+
+def in_windows(time: Array, value: Array, edges: Array) -> Array:
+    """Return the mean of each window, NaN where it is empty, shape (windows,)."""
+    own = np.searchsorted(edges, time, side="right") - 1
+    out = np.full(len(edges) - 1, np.nan)
+    for k in np.unique(own[(own >= 0) & (own < len(out))]):
+        out[k] = np.mean(value[own == k])
+    return out
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A part of the error that is judged.
+
+    Parameters
+    ----------
+    name, unit : str
+        As in the report.
+    part : slice
+        Of an error's columns.
+    scale : float
+        From SI to the unit.
+    limit : float
+        Slope that is still none, by design (unit per day): about what the error itself is of a good
+        installation would take days to gather.
+    """
+
+    name: str
+    unit: str
+    part: slice
+    scale: float
+    limit: float
+
+    @property
+    def symbol(self) -> str:
+        """The unit as it is printed."""
+        return {"deg_h": "deg/h", "m_s2": "m/s^2"}.get(self.unit, self.unit)
+
+
+DEG_PER_H = float(np.rad2deg(HOUR))
+QUANTITIES = (
+    Quantity("position", "m", POSITION, 1.0, 2e-3),
+    Quantity("attitude", "deg", ATTITUDE, float(np.rad2deg(1.0)), 0.05),
+    Quantity("gyro_bias", "deg_h", GYRO_BIAS, DEG_PER_H, 5.0),
+    Quantity("accel_bias", "m_s2", ACCEL_BIAS, 1.0, 5e-3),
+)
+
+
+def settled_after(hours: float) -> float:
+    """Return when slopes begin to count (s): after twelve hours, or a quarter of a shorter run."""
+    return HOUR * min(12.0, 0.25 * hours)
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """What is drawn of an estimator.
+
+    Parameters
+    ----------
+    worlds : tuple of ErrorSeries
+        Errors in each world, at equal distances.
+    interval : float
+        These distances (s).
+    pace : ndarray, shape (pieces, 6)
+        Of the first world: begin (s), processor time (s), updates, memory (MiB), squared
+        innovation in units of its expectation, processor time of one sample of a bare loop at that
+        time (s).
+    """
+
+    name: str
+    worlds: tuple[ErrorSeries, ...]
+    interval: float
+    pace: Array
+
+    @property
+    def errors(self) -> ErrorSeries:
+        """Errors in the first world."""
+        return self.worlds[0]
+
+    def hourly(self) -> tuple[Array, dict[str, Array]]:
+        """Return the middles of the hours (h) and means over all worlds of what is squared.
+
+        Returns
+        -------
+        time : ndarray, shape (hours,)
+        levels : dict of str to ndarray, shape (hours,)
+            Squared errors of pose and bias, and squared innovations of the first world, all in
+            units of what they should be.
+        """
+        edges = HOUR * np.arange(np.ceil(self.errors.time[-1] / HOUR) + 1)
+        time = np.concatenate([w.time for w in self.worlds])
+        levels = {
+            name: in_windows(time, np.concatenate([getattr(w, kind) for w in self.worlds]), edges)
+            / 6.0
+            for name, kind in (("pose", "pose_nees"), ("bias", "bias_nees"))
+        }
+        detected = self.pace[np.isfinite(self.pace[:, 4])]
+        levels["innovation"] = in_windows(detected[:, 0], detected[:, 4], edges)
+        return 0.5 * (edges[1:] + edges[:-1]) / HOUR, levels

@@ -1,0 +1,268 @@
+"""Errors of an estimated trajectory against the truth, as evo computes them."""
+
+import warnings
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.model.trajectory import Trajectory, interpolate
+from magfusion.units import Array, BoolArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeErrors:
+    """Relative pose errors (RPE) over pairs of epochs.
+
+    Parameters
+    ----------
+    pairs : ndarray of int, shape (m, 2)
+        First and second epoch of each pair.
+    translation : ndarray, shape (m,)
+        (m)
+    rotation : ndarray, shape (m,)
+        Geodesic angle (rad).
+    """
+
+    pairs: IntArray
+    translation: Array
+    rotation: Array
+
+    @property
+    def translation_rmse(self) -> float:
+        """Root mean square of the translation errors (m)."""
+        return _rms(self.translation)
+
+    @property
+    def rotation_rmse_deg(self) -> float:
+        """Root mean square of the rotation errors (deg)."""
+        return float(np.rad2deg(_rms(self.rotation)))
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryErrors:
+    """Estimate minus truth at each of the estimate's times for which there is a truth.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Seconds since the log's epoch.
+    compared : ndarray of bool, shape (epochs of the estimate,)
+        Which epochs of the estimate were compared.
+    position_world : ndarray, shape (n, 3)
+        (m)
+    pose_body : ndarray, shape (n, 6)
+        ``Pose3.localCoordinates(truth, estimate)``: rotation, translation in body axes (rad, m).
+    attitude : ndarray, shape (n,)
+        Geodesic angle (rad).
+    aligned_position_world : ndarray, shape (n, 3)
+        After the rigid motion of the estimate that fits the positions best (Umeyama, no scale; m).
+    aligned_attitude : ndarray, shape (n,)
+        After the one constant world rotation that fits the attitudes best (rad).
+    relative : RelativeErrors
+        Over consecutive pairs of compared epochs.
+    world_from_body : ndarray, shape (n, 3, 3)
+        Of the estimate.
+    pose_cov : ndarray, shape (n, 6, 6), optional
+        Of the estimate, where it has one.
+    nees : ndarray, shape (n,), optional
+        Normalised estimation error squared, six degrees of freedom, where there is a covariance.
+    """
+
+    time: Array
+    compared: BoolArray
+    position_world: Array
+    pose_body: Array
+    attitude: Array
+    aligned_position_world: Array
+    aligned_attitude: Array
+    relative: RelativeErrors
+    world_from_body: Array
+    pose_cov: Array | None = None
+    nees: Array | None = None
+
+    @property
+    def ate(self) -> float:
+        """Absolute trajectory error: root mean square of the position error (m)."""
+        return _rms(np.linalg.norm(self.position_world, axis=1))
+
+    @property
+    def attitude_rmse_deg(self) -> float:
+        """Root mean square of the attitude error (deg)."""
+        return float(np.rad2deg(_rms(self.attitude)))
+
+    @property
+    def aligned_ate(self) -> float:
+        """Absolute trajectory error after rigid alignment of the positions (m)."""
+        return _rms(np.linalg.norm(self.aligned_position_world, axis=1))
+
+    @property
+    def aligned_attitude_rmse_deg(self) -> float:
+        """Root mean square of the attitude error after one constant world rotation (deg)."""
+        return float(np.rad2deg(_rms(self.aligned_attitude)))
+
+    @property
+    def attitude_body(self) -> Array:
+        """Rotation vector of the attitude error in body axes (rad), shape (n, 3)."""
+        return self.pose_body[:, :3]
+
+    @property
+    def attitude_sigma_body(self) -> Array | None:
+        """Standard deviation of `attitude_body` (rad), shape (n, 3)."""
+        if self.pose_cov is None:
+            return None
+        return np.asarray(np.sqrt(np.diagonal(self.pose_cov, axis1=1, axis2=2)[:, :3]))
+
+    @property
+    def position_sigma_world(self) -> Array | None:
+        """Standard deviation of `position_world` (m), shape (n, 3)."""
+        if self.pose_cov is None:
+            return None
+        turn, cov_body = self.world_from_body, self.pose_cov[:, 3:, 3:]
+        return np.asarray(np.sqrt(np.einsum("nij,njk,nik->ni", turn, cov_body, turn)))
+
+    @property
+    def inside_3_sigma(self) -> float | None:
+        """Fraction of the pose error's components within three of their own sigmas."""
+        if self.pose_cov is None:
+            return None
+        sigma = np.sqrt(np.diagonal(self.pose_cov, axis1=1, axis2=2))
+        return float(np.mean(np.abs(self.pose_body) <= 3.0 * sigma))
+
+
+def trajectory_errors(
+    estimate: Trajectory, truth: Trajectory, *, max_gap: float = 0.1, delta_frames: int = 1
+) -> TrajectoryErrors:
+    """Compare an estimate with the truth, interpolated to the estimate's times.
+
+    Parameters
+    ----------
+    max_gap : float
+        Longest step of the truth across which it is interpolated (s).
+    delta_frames : int
+        Length of the relative errors' pairs, in compared epochs.
+
+    Returns
+    -------
+    TrajectoryErrors
+        ``ate``, ``aligned_ate`` and ``relative`` agree with evo's APE and RPE.
+
+    Raises
+    ------
+    InputError
+        Where fewer than three epochs of the estimate have a truth.
+    """
+    true, compared = interpolate(truth, estimate.time, max_gap)
+    if len(true) < 3:
+        raise InputError(
+            f"The truth covers {len(true)} of the estimate's {len(estimate)} epochs within"
+            f" {max_gap} s of a sample, and at least 3 are needed; check that both use the"
+            " same clock or allow a longer gap."
+        )
+    rotation, position = estimate.world_from_body[compared], estimate.position_world[compared]
+    pose_body = pose_errors(rotation, position, true)
+    cov = None if estimate.pose_cov is None else estimate.pose_cov[compared]
+    return TrajectoryErrors(
+        time=true.time,
+        compared=compared,
+        position_world=position - true.position_world,
+        pose_body=pose_body,
+        attitude=np.linalg.norm(pose_body[:, :3], axis=1),
+        aligned_position_world=_align(position, true.position_world) - true.position_world,
+        aligned_attitude=_aligned_attitude(rotation, true.world_from_body),
+        relative=relative_errors(rotation, position, true, frame_pairs(len(true), delta_frames)),
+        world_from_body=rotation,
+        pose_cov=cov,
+        nees=None if cov is None else _nees(pose_body, cov),
+    )
+
+
+def pose_errors(world_from_body: Array, position_world: Array, truth: Trajectory) -> Array:
+    """Return ``Pose3.localCoordinates(truth, estimate)`` of each epoch, shape (n, 6).
+
+    Rotation, then translation, in body axes (rad, m).
+    """
+    pairs = zip(
+        _poses(truth.world_from_body, truth.position_world),
+        _poses(world_from_body, position_world),
+        strict=True,
+    )
+    return np.array([true.localCoordinates(estimated) for true, estimated in pairs])
+
+
+def frame_pairs(epochs: int, delta: int) -> IntArray:
+    """Return consecutive pairs of indices ``delta`` epochs apart, shape (m, 2)."""
+    ids = np.arange(0, epochs, delta)
+    return np.stack([ids[:-1], ids[1:]], axis=1)
+
+
+def time_pairs(time: Array, delta: float) -> IntArray:
+    """Return consecutive pairs of indices at least ``delta`` seconds apart, shape (m, 2)."""
+    ids = [0]
+    while (following := int(np.searchsorted(time, time[ids[-1]] + delta))) < len(time):
+        ids.append(following)
+    return np.stack([ids[:-1], ids[1:]], axis=1).astype(np.int64)
+
+
+def relative_errors(
+    world_from_body: Array, position_world: Array, truth: Trajectory, pairs: IntArray
+) -> RelativeErrors:
+    """Compare the motion between two epochs with the true one (RPE of the TUM benchmark).
+
+    Parameters
+    ----------
+    world_from_body : ndarray, shape (n, 3, 3)
+    position_world : ndarray, shape (n, 3)
+        (m)
+    truth : Trajectory
+        At the same n epochs.
+    pairs : ndarray of int, shape (m, 2)
+        From `frame_pairs` or `time_pairs`.
+    """
+    step, shift = _motion(world_from_body, position_world, pairs)
+    true_step, true_shift = _motion(truth.world_from_body, truth.position_world, pairs)
+    # The shifts' difference need not be turned: its length is the same in all axes.
+    return RelativeErrors(
+        pairs=pairs,
+        translation=np.linalg.norm(shift - true_shift, axis=1),
+        rotation=(true_step.inv() * step).magnitude(),
+    )
+
+
+def _motion(
+    world_from_body: Array, position_world: Array, pairs: IntArray
+) -> tuple[Rotation, Array]:
+    first, second = pairs.T
+    start = Rotation.from_matrix(world_from_body[first]).inv()
+    shift = start.apply(position_world[second] - position_world[first])
+    return start * Rotation.from_matrix(world_from_body[second]), shift
+
+
+def _poses(world_from_body: Array, position_world: Array) -> list[gtsam.Pose3]:
+    return [
+        gtsam.Pose3(gtsam.Rot3(r), p) for r, p in zip(world_from_body, position_world, strict=True)
+    ]
+
+
+def _align(position: Array, target: Array) -> Array:
+    centre, target_centre = position.mean(axis=0), target.mean(axis=0)
+    with warnings.catch_warnings():
+        # Along a line, or at rest, many rotations fit equally well: the residual is theirs all.
+        warnings.filterwarnings("ignore", "Optimal rotation is not uniquely", UserWarning)
+        rotation, _ = Rotation.align_vectors(target - target_centre, position - centre)
+    return np.asarray(rotation.apply(position - centre) + target_centre)
+
+
+def _aligned_attitude(estimated: Array, true: Array) -> Array:
+    offset = Rotation.from_matrix(estimated) * Rotation.from_matrix(true).inv()
+    return np.asarray((offset.mean().inv() * offset).magnitude())
+
+
+def _nees(error: Array, cov: Array) -> Array:
+    return np.asarray(np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[..., None])[..., 0]))
+
+
+def _rms(value: Array) -> float:
+    return float(np.sqrt(np.mean(value**2)))

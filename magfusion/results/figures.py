@@ -1,0 +1,208 @@
+"""Figures of a job: the objects of which both ``report.json`` and the screen are made.
+
+A figure's key in the flat ``report.json`` is its name, in which ``{beacon}`` is the beacon's name:
+``{beacon}.position_x_m`` is written ``A.position_x_m``.  A beacon may have any name.
+One that is also the name of another owner of parameters (`OWNERS`), or that begins with
+``beacon:``, is written ``beacon:NAME``; so is one whose key another figure of the report already
+has.  All other names are written as they are.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+Value = float | int | str | bool | list[str] | list[dict[str, str | float]] | None
+
+OWNERS = frozenset({"earth", "imu", "magnetometer", "sensor"})  # of parameters, beside beacons
+DETERMINED_RATIO = 0.5  # posterior over prior sigma below which the data, not the prior, spoke
+
+
+class Section(StrEnum):
+    """Where the screen shows a figure."""
+
+    TITLE = "title"
+    VERDICT = "verdict"
+    ERRORS = "errors"
+    SUMMARY = "summary"
+    CALIBRATION = "calibration"
+    TRANSFER = "transfer"
+    DIRECTIONS = "directions"
+    NOTES = "notes"  # the value is sentences
+    REMARKS = "remarks"  # the same, after the notes
+    REPORT = "report"  # of interest only in report.json
+
+
+class Column(StrEnum):
+    """Columns of the tables of errors, in the order in which they are shown."""
+
+    RMS = "rms"
+    ALIGNED = "aligned"
+    FIXED = "survey fixed"  # with the declared calibration
+    CALIBRATED = "calibrated"
+    LAGGED = "lagged"
+    SIGMA = "sigma per axis"
+    NONE = ""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of a job.
+
+    Parameters
+    ----------
+    name : str
+        Key of ``report.json``, with ``{beacon}`` in the place of the beacon's name.
+    unit : str
+        As the screen shows it; the key has a suffix of its own.
+    beacon : str, optional
+        Of which it is; the screen lists the same figure of several beacons in one line.
+    label : str
+        What the screen calls it; default: the name without its unit.
+    column : Column
+        Of the section's table.
+    note : str
+        A warning that the screen shows beside the figure.
+    remark : str
+        A sentence that the screen shows after all notes.
+    """
+
+    name: str
+    value: Value
+    unit: str = ""
+    beacon: str | None = None
+    section: Section = Section.SUMMARY
+    label: str = ""
+    column: Column = Column.NONE
+    note: str = ""
+    remark: str = ""
+
+    @property
+    def key(self) -> str:
+        """Key in the report, unless another figure has it already."""
+        return self.key_of(self.beacon and owner_key(self.beacon))
+
+    def key_of(self, owner: str | None) -> str:
+        """Return the key with the beacon's name written as given."""
+        return self.name if owner is None else self.name.replace("{beacon}", owner)
+
+    @property
+    def title(self) -> str:
+        """What the screen calls it."""
+        unit = self.unit.lower().translate({ord("/"): "_", ord(" "): "_", ord("^"): None})
+        plain = self.name.replace("{beacon}", "").removesuffix(f"_{unit}")
+        return self.label or plain.strip("_").replace("_", " ")
+
+    def entries(self, key: str) -> dict[str, Value]:
+        """Return what the report holds of it under a key."""
+        return {key: self.value}
+
+
+@dataclass(frozen=True)
+class Estimate(Figure):
+    """One calibration parameter after the fit; the value is its change from the declared one.
+
+    Parameters
+    ----------
+    label : str
+        Of the vector that it is a component of, which is one line on the screen.
+    sigma, prior_sigma : float
+        Posterior and prior standard deviation; a prior of zero is none.
+    is_open : bool
+        Whether the measurements leave it open, whatever its sigma.
+    """
+
+    section: Section = Section.CALIBRATION
+    sigma: float = 0.0
+    prior_sigma: float = 0.0
+    is_open: bool = False
+
+    @property
+    def change(self) -> float:
+        """From the declared value."""
+        return number(self.value)
+
+    @property
+    def determined(self) -> bool:
+        """Whether the data, rather than the prior, fixed the parameter."""
+        known = not self.prior_sigma or self.sigma < DETERMINED_RATIO * self.prior_sigma
+        return known and not self.is_open
+
+    def entries(self, key: str) -> dict[str, Value]:
+        """Return change and sigmas under keys that begin alike."""
+        sigmas = {f"{key}_sigma": self.sigma, f"{key}_prior_sigma": self.prior_sigma}
+        return {key: self.value, **sigmas}
+
+
+class Figures(Mapping[str, Value]):
+    """The figures of a job in their order; as a mapping, the content of ``report.json``.
+
+    Raises
+    ------
+    ValueError
+        Where two figures that are of no beacon have one key.
+    """
+
+    def __init__(self, *figures: Figure) -> None:
+        self.all = figures
+        self._report: dict[str, Value] = {}
+        for figure in figures:
+            owner = figure.beacon and owner_key(figure.beacon)
+            while not self._report.keys().isdisjoint(
+                entries := figure.entries(figure.key_of(owner))
+            ):
+                if owner is None:
+                    raise ValueError(f"two figures are called {figure.name}")
+                owner = f"beacon:{owner}"
+            self._report |= entries
+
+    def __getitem__(self, key: str) -> Value:
+        return self._report[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._report)
+
+    def __len__(self) -> int:
+        return len(self._report)
+
+    def __or__(self, other: "Figures") -> "Figures":
+        return Figures(*self.all, *other.all)
+
+    def prefixed(self, prefix: str) -> "Figures":
+        """Return the same under keys that begin with a prefix."""
+        return Figures(*(replace(f, name=prefix + f.name) for f in self.all))
+
+    def of(self, section: Section) -> list[Figure]:
+        """Return the figures that one part of the screen shows."""
+        return [figure for figure in self.all if figure.section is section]
+
+
+def heading(job: str, log: str) -> Figures:
+    """Return the first figures of every report: what was done, and with what."""
+    return Figures(
+        Figure("job", job, section=Section.TITLE), Figure("log", log, section=Section.TITLE)
+    )
+
+
+def determined_figures(estimates: list[Estimate]) -> Figures:
+    """Return the names of the parameters that the data determined, and of the others."""
+    return Figures(
+        Figure("determined", [e.key for e in estimates if e.determined], section=Section.REPORT),
+        Figure(
+            "undetermined", [e.key for e in estimates if not e.determined], section=Section.REPORT
+        ),
+    )
+
+
+def calibration_record(log_name: str, estimates: list[Estimate]) -> dict[str, object]:
+    """Return what a refined site says of its origin."""
+    return {"log": log_name, **determined_figures(estimates)}
+
+
+def owner_key(name: str) -> str:
+    """Return how keys of the report write the name of a beacon."""
+    return f"beacon:{name}" if name in OWNERS or name.startswith("beacon:") else name
+
+
+def number(value: Value) -> float:
+    """Return a figure's value as a number, NaN where it is none."""
+    return float(value) if isinstance(value, int | float) else float("nan")

@@ -1,0 +1,181 @@
+"""Ways to move the calibration that no measurement observes, or hardly any.
+
+A common motion of all beacons, turns of a beacon that its drive phase undoes, a rotation that the
+mounting and the magnetometer's matrix share: tangent vectors of the calibration by name.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.model.field import skew
+from magfusion.model.parameters import (
+    BEACON_POSITION,
+    BEACON_ROTATION,
+    CENTIMETRE,
+    DEGREES,
+    LOG_MOMENT,
+    MATRIX,
+    PERCENT,
+    PHASE,
+    SENSOR_ROTATION,
+    Block,
+    Calibration,
+    Parameter,
+    Unit,
+    dimension,
+)
+from magfusion.model.site import Beacon
+from magfusion.units import Array
+
+NEARLY_NULL = 0.03  # relative change of a drive that passes for none: coils differ by percents
+_AXES = "xyz"
+Parts = dict[tuple[Parameter, str], Array]
+
+
+class Gauge(NamedTuple):
+    """A way to move the calibration that changes no measurement, or hardly any.
+
+    Parameters
+    ----------
+    name : str
+        E.g. ``all beacons shifted together along x``.
+    unit : Unit
+        Of the amplitude.
+    direction : ndarray, shape (dimension,)
+        Tangent vector of amplitude one.
+    exact : bool
+        False where gravity or acceleration may observe it.
+    """
+
+    name: str
+    remedy: str
+    unit: Unit
+    direction: Array
+    exact: bool = True
+
+
+def gauges(calibration: Calibration, blocks: tuple[Block, ...]) -> list[Gauge]:
+    """Return the gauge directions of what is estimated, those that are nearly one last.
+
+    Parameters
+    ----------
+    blocks : tuple of Block
+        A gauge that would move what is not among them is none.
+    """
+    beacons = calibration.site.beacons
+    found = [*_shifts(beacons, blocks), *_turns(beacons, blocks, (2,))]
+    found += [*_of_sensor(calibration, blocks)]
+    for beacon in beacons:
+        found += _of_drive(beacon, blocks)
+    return found + _turns(beacons, blocks, (0, 1)) + _scale(beacons, blocks)
+
+
+def _scale(beacons: tuple[Beacon, ...], blocks: tuple[Block, ...]) -> list[Gauge]:
+    """Return what the field cannot observe: a larger world, its moments larger with the cube."""
+    parts: Parts = {}
+    for b in beacons:
+        parts[BEACON_POSITION, b.name] = b.position_world
+        parts[LOG_MOMENT, b.name] = np.full(len(b.coils), 3.0)
+    direction = _joined(blocks, parts)
+    name = "all distances larger together and the moments with their cube"
+    remedy = "acceleration alone observes it; move farther and faster, or measure a distance"
+    return [] if direction is None else [Gauge(name, remedy, PERCENT, direction, False)]
+
+
+def _joined(blocks: tuple[Block, ...], parts: Parts) -> Array | None:
+    """Return the tangent vector of these parts; None where one of them is not estimated."""
+    out, left = np.zeros(dimension(blocks)), dict(parts)
+    for block in blocks:
+        value = left.pop(block.key, None)
+        if value is not None:
+            out[block.columns] = value
+    return None if any(np.any(value != 0.0) for value in left.values()) else out
+
+
+def _shifts(beacons: tuple[Beacon, ...], blocks: tuple[Block, ...]) -> list[Gauge]:
+    found = []
+    for axis, step in zip(_AXES, np.eye(3), strict=True):
+        direction = _joined(blocks, {(BEACON_POSITION, b.name): step for b in beacons})
+        if direction is not None:
+            name = f"all beacons shifted together along {axis}"
+            remedy = "gauge: no log can determine it; survey one beacon better"
+            found.append(Gauge(name, remedy, CENTIMETRE, direction))
+    return found
+
+
+def _turns(
+    beacons: tuple[Beacon, ...], blocks: tuple[Block, ...], axes: tuple[int, ...]
+) -> list[Gauge]:
+    found = []
+    for k in axes:
+        axis_world = np.eye(3)[k]
+        parts: Parts = {}
+        for b in beacons:
+            parts[BEACON_POSITION, b.name] = np.cross(axis_world, b.position_world)
+            parts[BEACON_ROTATION, b.name] = b.world_from_beacon.T @ axis_world
+        direction = _joined(blocks, parts)
+        if direction is None:
+            continue
+        if k == 2:
+            name = "all beacons turned together about the vertical"
+            remedy = "gauge: no log can determine it; survey the bearing between two beacons better"
+        else:
+            name = f"all beacons tilted together about {_AXES[k]}"
+            remedy = "gravity alone observes it; stand still, in several attitudes"
+        found.append(Gauge(name, remedy, DEGREES, direction, exact=k == 2))
+    return found
+
+
+def _of_sensor(calibration: Calibration, blocks: tuple[Block, ...]) -> Iterator[Gauge]:
+    matrix = calibration.site.platform.magnetometer.matrix
+    place = (MATRIX, MATRIX.owner)
+    moments: Parts = {(LOG_MOMENT, b.name): np.ones(len(b.coils)) for b in calibration.site.beacons}
+    direction = _joined(blocks, moments | {place: -matrix.ravel()})
+    if direction is not None:
+        name = "all moments larger together and the magnetometer's gain smaller"
+        remedy = "gauge: no log can determine it; measure one beacon's moment, or the gain"
+        yield Gauge(name, remedy, PERCENT, direction)
+    for axis, step in zip(_AXES, np.eye(3), strict=True):
+        turned: Parts = {(SENSOR_ROTATION, SENSOR_ROTATION.owner): step}
+        direction = _joined(blocks, turned | {place: (matrix @ skew(step)).ravel()})
+        if direction is not None:
+            name = f"the mounting turned about the sensor's {axis} and the matrix turned back"
+            remedy = "gauge: no log can determine it; hold one of the two"
+            yield Gauge(name, remedy, DEGREES, direction)
+
+
+def _of_drive(beacon: Beacon, blocks: tuple[Block, ...]) -> list[Gauge]:
+    """Return turns of one beacon that its coils' currents undo, as that of a rotating one."""
+    drive = beacon.moments_beacon.T @ beacon.excitation  # (3, tones)
+    turned = [(skew(axis) @ drive).ravel() for axis in np.eye(3)]
+    shifted = [
+        np.where(np.arange(len(beacon.tones)) == k, 1j * drive, 0.0).ravel()
+        for k in range(0 if beacon.synchronised else len(beacon.tones))
+    ]
+    grown = [
+        (beacon.moments_beacon[j][:, None] * beacon.excitation[j]).ravel()
+        for j in range(len(beacon.coils))
+    ]
+    change = np.stack([*turned, *shifted, *grown], axis=1)
+    change = np.concatenate([change.real, change.imag]) / np.linalg.norm(drive)
+    _, size, right = np.linalg.svd(change, full_matrices=True)
+    size = np.concatenate([size, np.zeros(len(right) - len(size))])
+    found = []
+    for step in right[size < NEARLY_NULL]:
+        turn = float(np.linalg.norm(step[:3]))
+        tones = len(shifted)
+        step = np.where(np.abs(step) < NEARLY_NULL, 0.0, step)
+        parts: Parts = {(BEACON_ROTATION, beacon.name): step[:3]}
+        if tones:
+            parts[PHASE, beacon.name] = step[3 : 3 + tones]
+        parts[LOG_MOMENT, beacon.name] = step[3 + tones :]
+        direction = _joined(blocks, parts)
+        if direction is None or turn < NEARLY_NULL:
+            continue
+        against = " against its drive phase" if tones else ""
+        name = f"beacon {beacon.name} turned about its own axis{against}"
+        remedy = "gauge: its field does not change; nothing depends on it"
+        found.append(Gauge(name, remedy, DEGREES, direction / turn))
+    return found

@@ -1,0 +1,169 @@
+"""What a log's motion covered, and what motion is missing for what the calibration left open."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.model.noise import sensor_positions
+from magfusion.model.parameters import (
+    BEACON_POSITION,
+    BeaconParameter,
+    Block,
+    Calibration,
+    prior_sigma,
+)
+from magfusion.model.samples import ImuSamples
+from magfusion.model.strapdown import resting
+from magfusion.model.trajectory import Trajectory
+from magfusion.results.figures import DETERMINED_RATIO
+from magfusion.results.observability import Observability, parameter_names
+from magfusion.units import DEGREE, Array, BoolArray
+
+HARDLY_TURNED = 15.0  # deg, root mean square about an axis
+HARDLY_MOVED = 0.5  # m, between the extremes
+FEW_RESTS = 0.01  # of the time
+MOST_NAMED = 3
+_AXES = "xyz"
+
+
+@dataclass(frozen=True, eq=False)
+class MotionCoverage:
+    """Where the platform was and how it was turned.
+
+    Parameters
+    ----------
+    nearest : mapping
+        Beacon to the sensor's least distance from it (m).
+    spread_deg : mapping
+        Beacon to the largest angle, seen from it, between the sensor and its mean direction.
+    extent_world : ndarray, shape (3,)
+        Between the extremes of the position (m).
+    turned_deg : ndarray, shape (3,)
+        Root mean square of the turn from the mean attitude, about each axis of the body.
+    rest_share : float
+        Of the samples at which the platform stood still.
+    """
+
+    nearest: Mapping[str, float]
+    spread_deg: Mapping[str, float]
+    extent_world: Array
+    turned_deg: Array
+    rest_share: float
+
+
+def motion_coverage(
+    states: Trajectory, calibration: Calibration, imu: ImuSamples
+) -> MotionCoverage:
+    """Return what a motion covered.
+
+    Parameters
+    ----------
+    imu : ImuSamples
+        Its rests are counted.
+    """
+    sensor_world = sensor_positions(calibration.site, states)
+    nearest, spread = {}, {}
+    for beacon in calibration.site.beacons:
+        offset = sensor_world - beacon.position_world
+        distance = np.linalg.norm(offset, axis=1, keepdims=True)
+        mean = np.mean(offset / distance, axis=0)
+        cosine = (offset / distance) @ (mean / max(float(np.linalg.norm(mean)), 1e-12))
+        nearest[beacon.name] = float(np.min(distance))
+        spread[beacon.name] = float(np.max(np.arccos(np.clip(cosine, -1.0, 1.0))) / DEGREE)
+    turned = Rotation.from_matrix(states.world_from_body)
+    motion = calibration.site.platform.motion
+    still = resting(imu.time, imu.gyro_body, imu.accel_body, motion=motion)
+    away = (turned.mean().inv() * turned).as_rotvec() / DEGREE
+    return MotionCoverage(
+        nearest=nearest,
+        spread_deg=spread,
+        extent_world=np.ptp(states.position_world, axis=0),
+        turned_deg=np.sqrt(np.mean(away**2, axis=0)),
+        rest_share=float(np.mean(still)),
+    )
+
+
+def missing_motion(
+    covered: MotionCoverage,
+    calibration: Calibration,
+    blocks: tuple[Block, ...],
+    found: Observability,
+) -> list[str]:
+    """Return sentences on what motion would determine what is open, the gauge left aside."""
+    open_ = _open(calibration, blocks, found)
+    out = [_of_beacon(covered, b.name, open_.get(b.name, [])) for b in calibration.site.beacons]
+    out += [_of_turning(covered, blocks, found), _of_extent(covered, blocks, found)]
+    if covered.rest_share < FEW_RESTS:
+        out.append(
+            "The platform never stood still: the IMU's biases, and with them the vertical, rest"
+            " on its motion alone; add stops of some seconds, in several attitudes."
+        )
+    return [sentence for sentence in out if sentence]
+
+
+def _is_open(found: Observability, columns: slice) -> BoolArray:
+    """Tell which parameters of a block the log left open; what is all gauge is not among them."""
+    return np.nan_to_num(found.ratio_but_for_gauge[columns]) > DETERMINED_RATIO
+
+
+def _open(
+    calibration: Calibration, blocks: tuple[Block, ...], found: Observability
+) -> dict[str, list[str]]:
+    """Return each beacon's open parameters with their sigmas, weakest first."""
+    names, prior = parameter_names(blocks, calibration), prior_sigma(blocks)
+    listed: dict[str, list[tuple[float, str]]] = {}
+    for block in blocks:
+        parameter = block.parameter
+        if not (isinstance(parameter, BeaconParameter) and parameter.declared):
+            continue
+        rows = np.arange(block.columns.start, block.columns.stop)
+        for row in rows[_is_open(found, block.columns)]:
+            name, unit, scale = names[row]
+            ratio = float(found.ratio_but_for_gauge[row])
+            short = name.replace(f" of beacon {block.owner}", "")
+            text = f"{short} ({ratio * prior[row] / scale:.2g} {unit})"
+            listed.setdefault(block.owner, []).append((ratio, text))
+    return {owner: [text for _, text in sorted(rows)[::-1]] for owner, rows in listed.items()}
+
+
+def _of_beacon(covered: MotionCoverage, name: str, open_: list[str]) -> str:
+    if not open_:
+        return ""
+    more = f" and {len(open_) - MOST_NAMED} more" if len(open_) > MOST_NAMED else ""
+    return (
+        f"The platform never came nearer than {covered.nearest[name]:.1f} m to beacon {name} and"
+        f" saw it within {covered.spread_deg[name]:.0f} deg of one direction: open are"
+        f" {', '.join(open_[:MOST_NAMED])}{more}; pass it closer, and on another side."
+    )
+
+
+def _of_turning(covered: MotionCoverage, blocks: tuple[Block, ...], found: Observability) -> str:
+    hardly = np.flatnonzero(covered.turned_deg < HARDLY_TURNED)
+    waiting = [
+        block.parameter.by_turning
+        for block in blocks
+        if block.parameter.by_turning and np.any(_is_open(found, block.columns))
+    ]
+    if not waiting or not len(hardly):
+        return ""
+    axes = " and ".join(_AXES[k] for k in hardly)
+    angles = ", ".join(f"{covered.turned_deg[k]:.0f}" for k in hardly)
+    return (
+        f"The platform hardly turned about its {axes} ({angles} deg rms): open is"
+        f" {' and '.join(waiting)}; turn it about all three axes."
+    )
+
+
+def _of_extent(covered: MotionCoverage, blocks: tuple[Block, ...], found: Observability) -> str:
+    """Name the axes along which it hardly moved, where beacons' places along them are open."""
+    waiting = np.zeros(3, dtype=bool)
+    for block in blocks:
+        if block.parameter == BEACON_POSITION:
+            waiting |= _is_open(found, block.columns)
+    hardly = np.flatnonzero(waiting & (covered.extent_world < HARDLY_MOVED))
+    if not len(hardly):
+        return ""
+    listed = ", ".join(f"{100.0 * covered.extent_world[k]:.0f} cm along {_AXES[k]}" for k in hardly)
+    return f"The platform moved by only {listed}, where places of beacons are open; move farther."

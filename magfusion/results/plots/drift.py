@@ -1,0 +1,135 @@
+"""Errors over days as a picture: with their sigmas, their Allan deviation, memory and time."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from magfusion.results.drift import (
+    HOUR,
+    QUANTITIES,
+    Course,
+    Quantity,
+    allan_deviation,
+    in_windows,
+)
+
+_AXES = ("tab:red", "tab:green", "tab:blue")
+
+
+def write_plot(path: Path, courses: list[Course], figures: Mapping[str, object]) -> None:
+    """Write a PNG, a column for each estimator."""
+    rows = len(QUANTITIES) + 3
+    figure = Figure(figsize=(1.0 + 6.5 * len(courses), 2.6 * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(rows, len(courses), squeeze=False)
+    for column, course in enumerate(courses):
+        for row, quantity in enumerate(QUANTITIES):
+            _draw_error(grid[row, column], course, quantity, figures)
+        title = f"{course.name}\n{grid[0, column].get_title()}"
+        grid[0, column].set_title(title, fontsize=9)
+        _draw_consistency(grid[-3, column], course)
+        _draw_allan(grid[-2, column], course)
+        _draw_pace(grid[-1, column], course)
+    for row in range(len(QUANTITIES)):  # one scale for both
+        limits = np.array([axes.get_ylim() for axes in grid[row]])
+        for axes in grid[row]:
+            axes.set_ylim(limits[:, 0].min(), limits[:, 1].max())
+    figure.suptitle(
+        f"{figures['hours']:g} h, {figures['worlds']} world(s), {figures['drive']} drive, phase"
+        f" {figures['phase']}, clock {figures['clock_ppm']:g} ppm: {figures['stability']}"
+    )
+    figure.savefig(path, dpi=100, metadata={"Software": None})
+
+
+def _draw_error(
+    axes: Axes, course: Course, quantity: Quantity, figures: Mapping[str, object]
+) -> None:
+    """Draw the components of an error, and three of their sigmas."""
+    hours = course.errors.time / HOUR
+    error = quantity.scale * course.errors.error[:, quantity.part]
+    sigma = 3.0 * quantity.scale * np.max(course.errors.sigma[:, quantity.part], axis=1)
+    axes.fill_between(hours, -sigma, sigma, color="0.88", linewidth=0, label="3 sigma")
+    for name, colour, component in zip("xyz", _AXES, error.T, strict=True):
+        axes.plot(hours, component, color=colour, linewidth=0.5, label=name)
+    key = f"{course.name}_{quantity.name}"
+    slope = figures[f"{key}_slope_{quantity.unit}_per_day"]
+    axes.set_title(
+        f"{quantity.name.replace('_', ' ')}: {slope:+.2g} +-"
+        f" {figures[f'{key}_slope_standard_error']:.1g} {quantity.unit} a day,"
+        f" {figures[f'{key}_drift_stability']}",
+        fontsize=9,
+    )
+    settled = hours >= float(str(figures["settled_after_h"]))
+    shown = np.concatenate([np.abs(error[settled]).ravel(), sigma[settled]])
+    bound = 1.3 * float(np.quantile(shown, 0.999))
+    axes.set(ylabel=f"({quantity.unit})", ylim=(-bound, bound), xlabel="time (h)")
+    axes.legend(fontsize=7, ncols=4, loc="upper right")
+
+
+def write_stability(path: Path, courses: list[Course]) -> None:
+    """Write figures 9 and 10 of paper 004 as a PNG: lengths of the errors, and their hourly means.
+
+    The paper shows a place at rest; here the platform walks once an hour.
+    """
+    figure = Figure(figsize=(1.0 + 6.5 * len(courses), 6.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(2, len(courses), squeeze=False, sharex=True, sharey="row")
+    for row, quantity in enumerate(QUANTITIES[:2]):
+        for axes, course in zip(grid[row], courses, strict=True):
+            _draw_length(axes, course, quantity)
+            axes.set_title(f"{course.name}: {quantity.name}", fontsize=9)
+        grid[row, 0].set_ylabel(f"error ({quantity.unit})")
+    for axes in grid[-1]:
+        axes.set_xlabel("time (h)")
+    count = len(courses[0].worlds)
+    figure.suptitle(f"Does the error grow?  Each minute of {count} world(s); thick: hourly mean")
+    figure.savefig(path, dpi=100, metadata={"Software": None})
+
+
+def _draw_length(axes: Axes, course: Course, quantity: Quantity) -> None:
+    time = np.concatenate([w.time for w in course.worlds])
+    length = quantity.scale * np.concatenate([w.size(quantity.part) for w in course.worlds])
+    for world in course.worlds:
+        own = quantity.scale * world.size(quantity.part)
+        axes.plot(world.time / HOUR, own, linewidth=0.3, color="0.7")
+    edges = HOUR * np.arange(np.ceil(time.max() / HOUR) + 1)
+    middle = 0.5 * (edges[1:] + edges[:-1]) / HOUR
+    axes.plot(middle, in_windows(time, length, edges), color="tab:blue", linewidth=2.0)
+    axes.set_ylim(0.0, 1.5 * float(np.quantile(length, 0.999)))
+
+
+def _draw_consistency(axes: Axes, course: Course) -> None:
+    """Draw hourly means of squared errors and innovations in units of what they should be."""
+    hours, levels = course.hourly()
+    for name, level in levels.items():
+        axes.plot(hours, level, ".-", markersize=3, linewidth=0.8, label=name)
+    axes.axhline(1.0, color="0.5", linewidth=0.8)
+    axes.set(xlabel="time (h)", ylabel="squared, of expected", yscale="log")
+    axes.legend(fontsize=7, ncols=3)
+
+
+def _draw_allan(axes: Axes, course: Course) -> None:
+    """Draw the Allan deviation of each error."""
+    for quantity in QUANTITIES:
+        error = quantity.scale * course.errors.error[:, quantity.part]
+        time, deviation = allan_deviation(error, course.interval)
+        if len(time):
+            label = f"{quantity.name.replace('_', ' ')} ({quantity.unit})"
+            axes.loglog(time / HOUR, deviation, label=label)
+    axes.set(xlabel="averaged over (h)", ylabel="Allan deviation")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=7)
+
+
+def _draw_pace(axes: Axes, course: Course) -> None:
+    made = course.pace[course.pace[:, 2] > 0.0]
+    axes.plot(made[:, 0] / HOUR, 1e3 * made[:, 1] / made[:, 2], ".", markersize=1, color="0.5")
+    axes.set(xlabel="time (h)", ylabel="an update (ms)", yscale="log")
+    other = axes.twinx()
+    other.plot(course.pace[:, 0] / HOUR, course.pace[:, 3], color="tab:purple")
+    other.set_ylabel("memory (MiB)", color="tab:purple")
+    other.set_ylim(0.0, 1.2 * float(np.max(course.pace[:, 3])))

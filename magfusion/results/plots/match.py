@@ -1,0 +1,80 @@
+"""Attitudes found from the field as a picture, and the database they were found in."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from magfusion.files.attitude_table import AttitudeDatabase
+from magfusion.papers.p001_magnetometer.matching import Matches, wrap
+from magfusion.units import DEGREE, NANOTESLA, Array
+
+_NAMES = ("roll", "pitch", "yaw")
+
+
+def write_match_plot(
+    path: Path, time: Array, matches: Matches, found: tuple[int, ...], true_rpy: Array | None
+) -> None:
+    """Write a PNG of the angles found over time, and of their errors where a truth is known.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    matches : Matches
+        Shapes (n, hypotheses, ...).
+    found : tuple of int
+        Which of roll, pitch and yaw were found and not given.
+    true_rpy : ndarray, shape (n, 3), optional
+        (rad); NaN where it is not known.
+    """
+    columns = 1 if true_rpy is None else 2
+    figure = Figure(figsize=(6.5 * columns, 1.0 + 2.5 * len(found)), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(len(found), columns, squeeze=False, sharex=True)
+    sure = matches.determined[:, 0]
+    for row, k in zip(panels, found, strict=True):
+        angle = matches.rpy[..., k] / DEGREE
+        if matches.ambiguous.any():
+            row[0].plot(time, angle[:, 1], ".", ms=2, color="0.75", label="other solution")
+        if not sure.all():
+            row[0].plot(time[~sure], angle[~sure, 0], "x", color="red", label="not determined")
+        row[0].plot(time[sure], angle[sure, 0], ".", ms=3, label="found")
+        row[0].set(ylabel=f"{_NAMES[k]} (deg)")
+        if true_rpy is not None:
+            row[0].plot(time, true_rpy[:, k] / DEGREE, "-", lw=0.6, color="black", label="truth")
+            error = wrap(matches.rpy[:, 0, k] - true_rpy[:, k]) / DEGREE
+            bound = 3.0 * matches.sigma[:, 0, k] / DEGREE
+            row[1].fill_between(time[sure], -bound[sure], bound[sure], color="0.85", lw=0)
+            row[1].plot(time[sure], error[sure], ".", ms=3)
+            row[1].set(ylabel=f"error of {_NAMES[k]} (deg); grey: 3 sigma")
+        row[0].legend(loc="upper right", fontsize="small")
+    for axes in panels[-1]:
+        axes.set(xlabel="time (s)")
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+
+
+def write_database_plot(path: Path, database: AttitudeDatabase, residual: Array) -> None:
+    """Write a PNG of the attitudes that a database holds, and of what no uniform field explains.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n, 3)
+        Of each entry (T).
+    """
+    figure = Figure(figsize=(8.0, 5.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    size = np.linalg.norm(residual, axis=1) / NANOTESLA
+    roll, pitch, yaw = database.rpy.T / DEGREE
+    if database.angles == "roll":
+        axes.plot(roll, size, ".", ms=4)
+        axes.set(ylabel="distance from a uniform field (nT)")
+        axes.set(title=f"{len(database)} entries at pitch {pitch[0]:.1f}, yaw {yaw[0]:.1f} deg")
+    else:
+        points = axes.scatter(roll, pitch, c=size, s=5)
+        figure.colorbar(points, label="distance from a uniform field (nT)")
+        axes.set(ylabel="pitch (deg)", title=f"{len(database)} entries at yaw {yaw[0]:.1f} deg")
+    axes.set(xlabel="roll (deg)", xlim=(-180.0, 180.0))
+    figure.savefig(path, dpi=110, metadata={"Software": None})

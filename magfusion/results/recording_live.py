@@ -1,0 +1,106 @@
+"""The rerun viewer, fed while the platform moves."""
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.estimation.state import POSITION, State
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.results.recording import layout, log_beacons
+from magfusion.results.recording_plots import TIMELINE
+from magfusion.results.shapes import ellipsoids, scene_scale
+
+_PATH = (70, 170, 255)
+_AXES = ("x", "y", "z")
+_PIECE = 50  # states to a strip of the path
+
+
+class LiveView:
+    """Draws states one by one.
+
+    Parameters
+    ----------
+    recording : rr.RecordingStream
+        Connected to a viewer, or to a file.
+    """
+
+    def __init__(self, site: Site, recording: rr.RecordingStream) -> None:
+        self.recording = recording
+        self._scale = scene_scale(
+            site, Trajectory(np.empty(0), np.empty((0, 3, 3)), np.empty((0, 3)))
+        )
+        self._path: list[list[float]] = []
+        self._strips = 0
+        log_beacons(recording, site, self._scale)
+        recording.log(
+            "world/estimate/body", rr.TransformAxes3D(0.06 * self._scale.size), static=True
+        )
+        recording.send_blueprint(_blueprint())
+
+    def show(self, state: State, distortion: dict[str, float]) -> None:
+        """Draw a state, and how well each beacon's field is explained."""
+        recording = self.recording
+        recording.set_time(TIMELINE, duration=state.time)
+        turn = Rotation.from_matrix(state.world_from_body)
+        place = state.position_world
+        pose = rr.Transform3D(translation=place, quaternion=rr.Quaternion(xyzw=turn.as_quat()))
+        recording.log("world/estimate/body", pose)
+        self._extend(place.tolist())
+        half_sizes, axes = ellipsoids(
+            Rotation.from_matrix(state.world_from_body[None]), state.cov[None, POSITION, POSITION]
+        )
+        sigma = rr.Ellipsoids3D(
+            half_sizes=3.0 * half_sizes,
+            centers=[place],
+            quaternions=axes.as_quat(),
+            colors=(*_PATH, 110),
+        )
+        recording.log("world/estimate/three_sigma", sigma)
+        for axis, value in zip(_AXES, place, strict=True):
+            recording.log(f"plots/position_m/{axis}", rr.Scalars(float(value)))
+        spread = state.world_from_body @ state.cov[POSITION, POSITION] @ state.world_from_body.T
+        for axis, variance in zip(_AXES, np.diagonal(spread), strict=True):
+            recording.log(
+                f"plots/position_sigma_mm/{axis}", rr.Scalars(1e3 * float(np.sqrt(variance)))
+            )
+        for name, level in distortion.items():
+            own = f"plots/innovations/{rr.escape_entity_path_part(name)}"
+            recording.log(own, rr.Scalars(float(np.sqrt(level))))
+
+    def _extend(self, place: list[float]) -> None:
+        """Draw the path in strips, so that no message grows with the run."""
+        self._path.append(place)
+        strip = rr.LineStrips3D([self._path], radii=rr.Radius.ui_points(1.2), colors=_PATH)
+        self.recording.log(f"world/estimate/path/{self._strips}", strip, static=True)
+        if len(self._path) >= _PIECE:
+            self._path, self._strips = [place], self._strips + 1
+
+
+def open_live_view(site: Site) -> LiveView:
+    """Open a viewer that waits for states.
+
+    Raises
+    ------
+    InputError
+        Where no viewer can be started.
+    """
+    recording = rr.RecordingStream("magfusion")
+    try:
+        recording.spawn()
+    except RuntimeError as error:
+        raise InputError(
+            f"--live: the viewer cannot be started ({str(error).splitlines()[0]}); leave it out"
+        ) from error
+    return LiveView(site, recording)
+
+
+def _blueprint() -> rrb.Blueprint:
+    plots = rrb.Vertical(
+        rrb.TimeSeriesView(origin="plots/position_m", name="Position (m)"),
+        rrb.TimeSeriesView(origin="plots/position_sigma_mm", name="Sigma of the position (mm)"),
+        rrb.TimeSeriesView(origin="plots/innovations", name="Innovations"),
+    )
+    return layout(rrb.Spatial3DView(origin="world", name="Scene"), plots)

@@ -1,0 +1,330 @@
+"""Figures that several jobs have in common, and the file that they are written to."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.batch import AMBIGUOUS_CHI_SQUARE, Smoothed
+from magfusion.estimation.self_survey import Placement
+from magfusion.estimation.snapshot.ambiguity import ambiguities, relations
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.results.errors import TrajectoryErrors, trajectory_errors
+from magfusion.results.figures import (
+    DETERMINED_RATIO,
+    Column,
+    Estimate,
+    Figure,
+    Figures,
+    Section,
+    Value,
+    determined_figures,
+)
+from magfusion.results.observability import Observability, observability
+from magfusion.results.refinement import parameter_estimates
+from magfusion.units import Array
+
+POOR_FIT = 3.0  # whitened residual, one where noise and model are as declared
+_REPORT, _ERRORS, _SUMMARY = Section.REPORT, Section.ERRORS, Section.SUMMARY
+
+
+def write_report(directory: Path, figures: Figures) -> None:
+    """Write ``report.json``."""
+    text = json.dumps(dict(figures), indent=1, allow_nan=False, default=float)
+    (directory / "report.json").write_text(text + "\n")
+
+
+def where_found(name: str, found: bool, value: Value, label: str = "") -> Figure:
+    """Return a figure that the screen shows only where there is something to say."""
+    return Figure(name, value, section=_SUMMARY if found else _REPORT, label=label)
+
+
+def error_figures(
+    errors: TrajectoryErrors, column: Column = Column.RMS, prefix: str = ""
+) -> Figures:
+    """Return the errors against the truth: absolute, aligned, relative, and their consistency.
+
+    Parameters
+    ----------
+    column : Column
+        Of the screen's table; only errors of the result itself have their consistency shown.
+    prefix : str
+        Of the keys.
+    """
+    own, aligned = (_REPORT, _REPORT) if prefix else (_SUMMARY, _ERRORS)
+    relative, attitude_deg = errors.relative, errors.aligned_attitude_rmse_deg
+    rows = (
+        ("ate_m", errors.ate, "m", _ERRORS, "position", column),
+        ("attitude_rmse_deg", errors.attitude_rmse_deg, "deg", _ERRORS, "attitude", column),
+        ("aligned_ate_m", errors.aligned_ate, "m", aligned, "position", Column.ALIGNED),
+        ("aligned_attitude_rmse_deg", attitude_deg, "deg", aligned, "attitude", Column.ALIGNED),
+        ("rpe_translation_m", relative.translation_rmse, "m", _ERRORS, "step, position", column),
+        ("rpe_rotation_deg", relative.rotation_rmse_deg, "deg", _ERRORS, "step, attitude", column),
+    )
+    figures = [
+        Figure(name, value, unit, None, section, row, place)
+        for name, value, unit, section, row, place in rows
+    ]
+    figures.append(Figure("compared_epochs", len(errors.time), section=own))
+    if errors.nees is not None and errors.pose_cov is not None:
+        sigma = np.sqrt(np.diagonal(errors.pose_cov, axis1=1, axis2=2))
+        ratio = np.abs(errors.pose_body) / sigma
+        mean, inside = float(np.mean(errors.nees)), errors.inside_3_sigma
+        figures += [
+            Figure("nees_mean", mean, section=own, label="mean NEES (6 expected)"),
+            Figure("nees_median", float(np.median(errors.nees)), section=_REPORT),
+            Figure("inside_3_sigma", inside, section=own, label="share within 3 sigma"),
+            *(
+                Figure(
+                    f"{part}_inside_3_sigma", float(np.mean(ratio[:, k] <= 3.0)), section=_REPORT
+                )
+                for part, k in (("position", slice(3, 6)), ("attitude", slice(0, 3)))
+            ),
+        ]
+    return Figures(*(replace(f, name=prefix + f.name) for f in figures))
+
+
+def sigma_figures(pose_cov: Array) -> Figures:
+    """Return the median of the estimated standard deviations of a pose's components."""
+    sigma = np.median(np.sqrt(np.diagonal(pose_cov, axis1=1, axis2=2)).reshape(-1, 2, 3), (0, 2))
+    rows = (
+        ("position_sigma_median_m", float(sigma[1]), "m", "position"),
+        ("attitude_sigma_median_deg", float(np.rad2deg(sigma[0])), "deg", "attitude"),
+    )
+    return Figures(
+        *(
+            Figure(name, value, unit, None, _ERRORS, row, Column.SIGMA)
+            for name, value, unit, row in rows
+        )
+    )
+
+
+def dropped_figures(dropped: Mapping[str, int], what: str = "windows") -> Figures:
+    """Return how many windows (or epochs) were dropped, in all and for each reason."""
+    total = sum(dropped.values())
+    return Figures(
+        where_found(f"{what}_dropped", total > 0, total),
+        *(
+            Figure(f"{what}_dropped_{reason.replace(' ', '_')}", count)
+            for reason, count in dropped.items()
+        ),
+    )
+
+
+def residual_figure(beacon: str, rms: float) -> Figure:
+    """Return the whitened residual of a beacon: one where noise and model are as declared."""
+    note = (
+        f"The residual of beacon {beacon} is {rms:.3g} where about 1 is expected; check the survey"
+        " of what the beacon is, where it is and how it is driven."
+    )
+    return Figure(
+        "residual_rms_{beacon}",
+        rms,
+        beacon=beacon,
+        label="residual rms (1 expected)",
+        note=note if rms > POOR_FIT else "",
+    )
+
+
+def residual_figures(residual: Array, channels: tuple[tuple[str, int], ...]) -> Figures:
+    """Return the whitened residual of each beacon."""
+    found = []
+    for name in dict.fromkeys(beacon for beacon, _ in channels):
+        own = residual[:, [beacon == name for beacon, _ in channels]]
+        if np.any(np.isfinite(own)):
+            found.append(residual_figure(name, float(np.sqrt(np.nanmean(own**2)))))
+    return Figures(*found)
+
+
+def rival_figures(chi_square: float | None) -> Figures:
+    """Return by how much the second-best trajectory explains the log worse, and what follows."""
+    ambiguous = chi_square is not None and chi_square < AMBIGUOUS_CHI_SQUARE
+    note = (
+        f"Another trajectory explains the log nearly as well (its chi square is only"
+        f" {chi_square:.3g} larger); add a beacon, or record more motion."
+        if ambiguous
+        else ""
+    )
+    return Figures(
+        Figure("rival_chi_square", chi_square, section=_REPORT),
+        Figure("ambiguous", ambiguous, section=_REPORT, note=note),
+    )
+
+
+def _earth_figures(result: Smoothed) -> Figures:
+    """Return how the Earth field was explained, and where it had to do without beacons."""
+    if result.earth_residual is None or result.earth_disturbed is None:
+        return Figures()
+    rms = float(np.sqrt(np.mean(result.earth_residual**2)))
+    disturbed_epochs = int(np.sum(result.earth_disturbed))
+    undetected = int(np.sum(~result.fields.valid.any(axis=1)))
+    return Figures(
+        Figure("earth_residual_rms", rms, label="residual rms of the Earth field (1 expected)"),
+        Figure("earth_disturbed_epochs", disturbed_epochs, label="epochs, Earth field disturbed"),
+        Figure("epochs_without_beacon", undetected),
+    )
+
+
+def smoothed_figures(result: Smoothed, directions: Section = _REPORT) -> Figures:
+    """Return the figures of a smoothed log.
+
+    Parameters
+    ----------
+    directions : Section
+        Where the screen shows the directions of the calibration that are determined and open.
+    """
+    states = result.states
+    estimates = parameter_estimates(
+        result.declared, result.calibration, result.blocks, result.calibration_cov
+    )
+    figures = Figures(
+        Figure("epochs", len(states)),
+        Figure("duration_s", float(states.time[-1] - states.time[0]), "s"),
+        Figure("window_s", float(np.median(result.fields.window)), "s"),
+        Figure("passes", result.passes, section=_REPORT),
+        Figure("iterations", result.iterations, section=_REPORT),
+        Figure(
+            "converged",
+            result.converged,
+            section=_REPORT if result.converged else _SUMMARY,
+        ),
+        Figure("cost", result.cost, section=_REPORT),
+        where_found("intervals_bridged", result.bridged > 0, result.bridged),
+        Figure(
+            "start_epochs_not_first_hypothesis",
+            int(np.sum(result.start.chosen > 0)),
+            section=_REPORT,
+        ),
+    )
+    figures |= Figures(*(replace(f, note="") for f in rival_figures(result.rival_chi_square).all))
+    figures |= Figures(
+        Figure("time_offset_s", result.calibration.time_offset, section=_REPORT),
+    )
+    figures |= dropped_figures(result.dropped)
+    figures |= residual_figures(result.residual, result.fields.channels) | _earth_figures(result)
+    if states.pose_cov is not None:
+        figures |= sigma_figures(states.pose_cov)
+    if result.blocks:
+        known = observability(result.calibration, result.blocks, result.calibration_cov)
+        figures |= observability_figures(estimates, known, directions)
+    return figures | Figures(*estimates) | determined_figures(estimates)
+
+
+def observability_figures(
+    estimates: list[Estimate], found: Observability, section: Section = _REPORT
+) -> Figures:
+    """Return what a log determined of the calibration, parameter by parameter and in words."""
+    count, determined = len(found.direction_ratio), found.determined
+    share = f"of {count} directions of the calibration are determined"
+    figures = [
+        Figure("directions", count, section=_REPORT),
+        Figure("directions_determined", determined, section=section, label=share),
+        Figure("directions_gauge", len(found.gauge), section=_REPORT),
+    ]
+    beside = found.ratio_but_for_gauge
+    for one, ratio, rest in zip(estimates, found.ratio, beside, strict=True):
+        left = float(rest) if np.isfinite(rest) else None
+        figures += [
+            Figure(f"{one.name}_ratio", float(ratio), "", one.beacon, _REPORT),
+            Figure(f"{one.name}_ratio_but_for_gauge", left, "", one.beacon, _REPORT),
+        ]
+    known = [e.key for e, rest in zip(estimates, beside, strict=True) if rest < DETERMINED_RATIO]
+    return Figures(
+        *figures,
+        Figure("determined_but_for_gauge", known, section=_REPORT),
+        *(
+            Figure(name, [one.words for one in open_], section=section, label="open")
+            for name, open_ in (("gauge", found.gauge), ("weakest_directions", found.weakest))
+        ),
+    )
+
+
+def placement_figures(placed: tuple[Placement, ...], site: Site) -> Figures:
+    """Return where beacons of unknown place were found, with what else would explain the log."""
+    if not placed:
+        return Figures()
+    figures = [Figure("placed", [placement.name for placement in placed], section=_REPORT)]
+    final = {beacon.name: beacon for beacon in site.beacons}
+    for placement in placed:
+        name, found = placement.name, final[placement.name].position_world
+        figures += [
+            Figure(f"placed_{{beacon}}_{axis}_m", float(value), "m", name, _REPORT)
+            for axis, value in zip("xyz", found, strict=True)
+        ]
+        places = [
+            f"beacon {name} at ({_listed(one.beacon.position_world, 2)}) m:"
+            f" chi square larger by {one.chi_square:.3g}"
+            f" ({'whole log' if one.smoothed else 'along the first trajectory'})"
+            for one in placement.hypotheses
+        ]
+        rival = placement.hypotheses[1].chi_square if len(places) > 1 else None
+        note = (
+            f"The log leaves more than one place for beacon {name} ({'; '.join(places)}); record"
+            " more motion, in all three directions."
+            if rival is not None and rival <= AMBIGUOUS_CHI_SQUARE
+            else ""
+        )
+        remark = (
+            f"beacon {name} was placed at ({_listed(found, 3)}) m; {len(places)} place(s)"
+            " explained its field"
+        )
+        figures += [
+            Figure("hypotheses_{beacon}", places, "", name, _REPORT, note=note, remark=remark),
+            Figure("hypotheses_{beacon}_rival_chi_square", rival, "", name, _REPORT),
+        ]
+    return Figures(*figures)
+
+
+def _listed(place: Array, digits: int) -> str:
+    return ", ".join(f"{x:.{digits}f}" for x in place)
+
+
+def fix_figures(fixes: Fixes, site: Site) -> Figures:
+    """Return the figures of single-epoch fixes, with sentences on their ambiguities."""
+    share = fixes.probability
+    second = share[:, 1] if share.shape[1] > 1 else np.zeros(len(fixes))
+    epochs, ambiguous = len(fixes), int(np.sum(second > 0.05))
+    undetermined = int(np.sum(~fixes.determined[:, 0]))
+    notes = (
+        f"{ambiguous} of {epochs} epochs are ambiguous: fixes.parquet holds every pose that"
+        " explains them; add a beacon, or smooth, so that the motion decides.",
+        f"{undetermined} of {epochs} epochs leave a direction of the pose open (undetermined in"
+        " fixes.parquet); add a beacon or a coil.",
+    )
+    words = ambiguities(relations(fixes, site))
+    counts = (("ambiguous_epochs", ambiguous), ("undetermined_epochs", undetermined))
+    return Figures(
+        Figure("epochs", epochs),
+        *(
+            replace(where_found(name, count > 0, count), note=note if count else "")
+            for (name, count), note in zip(counts, notes, strict=True)
+        ),
+        Figure("residual_rms_median", float(np.median(fixes.residual_rms[:, 0]))),
+        *(
+            Figure(f"ambiguity_{kind}_epochs", count, section=_REPORT)
+            for kind, count in words.epochs.items()
+        ),
+        Figure("ambiguity", words.open, section=Section.NOTES),
+        Figure("ambiguity_settled", words.settled, section=Section.REMARKS),
+    )
+
+
+def compared_with_truth(
+    estimate: Trajectory, log: Log, column: Column = Column.RMS, prefix: str = ""
+) -> tuple[TrajectoryErrors | None, Figures]:
+    """Return the errors against the log's truth, if it has one there, and their figures."""
+    if log.truth is None:
+        return None, Figures()
+    try:
+        errors = trajectory_errors(estimate, log.truth)
+    except InputError as error:  # a truth elsewhere does not make the trajectory worthless
+        note = f"There is no comparison with the truth: {error}"
+        missing = Figure(f"{prefix}not_compared", str(error), section=_REPORT)
+        return None, Figures(missing if prefix else replace(missing, note=note))
+    return errors, error_figures(errors, column, prefix)

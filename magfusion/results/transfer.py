@@ -1,0 +1,63 @@
+"""Whether the calibrations by two logs agree."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.model.parameters import PHASE, Block, Calibration, difference, prior_sigma
+from magfusion.results.figures import DETERMINED_RATIO
+from magfusion.units import Array
+
+
+class Estimated(NamedTuple):
+    """A calibration with its posterior."""
+
+    declared: Calibration
+    calibration: Calibration
+    blocks: tuple[Block, ...]
+    cov: Array
+
+
+class Agreement(NamedTuple):
+    """The difference of two calibrations in its own sigmas.
+
+    Parameters
+    ----------
+    by_parameter : ndarray, shape (parameters,)
+        Difference over the root of the sum of both posterior variances.
+    by_direction : ndarray, shape (determined,)
+        Along each direction that both logs determined, in the sigmas that the difference has.
+    """
+
+    by_parameter: Array
+    by_direction: Array
+
+
+def agreement(first: Estimated, second: Estimated) -> Agreement:
+    """Compare the calibrations of one installation by two logs.
+
+    Both began at the same survey, and where a log says nothing both stay there: such directions,
+    the gauge among them, agree without proof and are left out.  In the others the pull of the
+    survey is taken off the sigma of the difference: with ``K = I - P P0^-1`` it has the covariance
+    ``(K1 - K2) P0 (K1 - K2)^T + sum(P - P P0^-1 P)``, which is less than the sum of the posteriors.
+
+    Parameters
+    ----------
+    first, second : Estimated
+        With the same parameters and priors.
+    """
+    # A log has its phases of its own: they refer to its own middle.
+    kept = np.array([b.parameter != PHASE for b in first.blocks for _ in b.sigma], dtype=bool)
+    prior = prior_sigma(first.blocks)[kept]
+    step = difference(first.calibration, second.calibration, first.blocks)[kept] / prior
+    scaled = [part.cov[np.ix_(kept, kept)] / prior[:, None] / prior for part in (first, second)]
+    both = scaled[0] + scaled[1]
+    pulled = scaled[1] - scaled[0]
+    own = pulled @ pulled + sum(p - p @ p for p in scaled)
+    value, vector = np.linalg.eigh(0.5 * both)
+    determined = vector[:, np.sqrt(np.maximum(value, 0.0)) < DETERMINED_RATIO]
+    variance = np.einsum("ik,ij,jk->k", determined, own, determined)
+    return Agreement(
+        by_parameter=step / np.sqrt(np.diagonal(both)),
+        by_direction=(determined.T @ step) / np.sqrt(variance),
+    )

@@ -1,0 +1,61 @@
+"""The verdict on a result, as figures: first on the screen and in ``report.json``."""
+
+import numpy as np
+
+from magfusion.model.trust import Finding, StateTrust, Trust, Unverified
+from magfusion.results.figures import Figure, Figures, Section
+
+
+def trust_figures(trust: Trust) -> Figures:
+    """Return verdict, reasons, remarks and what is unverified, for the head of a report."""
+    return Figures(
+        Figure("verdict", str(trust.verdict), section=Section.VERDICT),
+        Figure("reasons", _said(trust.reasons), section=Section.VERDICT),
+        Figure("remarks", _said(trust.remarks), section=Section.VERDICT),
+        Figure("unverified", [_unverified(u) for u in trust.unverified], section=Section.VERDICT),
+    )
+
+
+def said_as_notes(trust: Trust) -> Figures:
+    """Return all that was said as the key ``notes``, which these reports always had.
+
+    The screen says it with the verdict.
+    """
+    sentences = [finding.text for finding in trust.ordered]
+    return Figures(Figure("notes", sentences, section=Section.REPORT))
+
+
+def _said(findings: tuple[Finding, ...]) -> list[dict[str, str | float]]:
+    return [{"code": f.code, "text": f.text} for f in findings]
+
+
+def _unverified(one: Unverified) -> dict[str, str | float]:
+    return {
+        "parameter": one.name,
+        "sigma": one.sigma,
+        "position_m": one.position_m,
+        "rotation_deg": one.rotation_deg,
+    }
+
+
+def level_figures(states: StateTrust) -> Figures:
+    """Return the median protection levels, and in how many states beacons were left out."""
+    known = np.isfinite(states.protection_level_m)
+    deg = states.protection_level_deg[np.isfinite(states.protection_level_deg)]
+    left_out = sum(1 for names in states.excluded if names)
+    return Figures(
+        Figure(
+            "protection_level_median_m",
+            float(np.median(states.protection_level_m[known])) if np.any(known) else None,
+            "m",
+            label="protection level, position",
+        ),
+        Figure(
+            "protection_level_median_deg",
+            float(np.median(deg)) if len(deg) else None,
+            "deg",
+            label="protection level, attitude",
+        ),
+        Figure("states_without_level", int(np.sum(~known)), section=Section.REPORT),
+        Figure("states_with_exclusion", left_out, section=Section.REPORT),
+    )

@@ -1,0 +1,159 @@
+"""Many independent tasks at once: on all cores of this machine, or on a Dask cluster."""
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import numpy as np
+
+from magfusion.errors import EstimationError, InputError
+
+Input = TypeVar("Input")
+Output = TypeVar("Output")
+Report = Callable[[str, int, int], None]  # stage, done, total
+
+CONNECT_S = 10.0  # patience with a cluster, s
+# A worker has one core: threads of its linear algebra would only fight each other for it.
+_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def run_many(
+    task: Callable[[Input, np.random.Generator], Output],
+    inputs: Sequence[Input],
+    *,
+    seed: int = 0,
+    cluster: str | None = None,
+    workers: int | None = None,
+    report: Report | None = None,
+) -> list[Output]:
+    """Run a task on every input, each with random numbers of its own.
+
+    The generators are spawned from ``seed`` by the place of the input, so that results depend
+    neither on the number of workers nor on where they run.
+
+    Parameters
+    ----------
+    task : callable
+        Function of an input and a Generator, defined at the top of a module; a block of runs in
+        one call keeps the cost of passing it on small.
+    inputs : sequence
+    cluster : str, optional
+        Address of a Dask scheduler (``tcp://host:8786``) whose workers have magfusion installed.
+    workers : int, optional
+        Processes on this machine, all cores by default; one runs the tasks right here.
+    report : callable, optional
+        Called with the stage, the tasks done and all tasks.
+
+    Returns
+    -------
+    list
+        In the order of ``inputs``.
+
+    Raises
+    ------
+    InputError
+        Where the cluster cannot be used, or ``workers`` is below one.
+    EstimationError
+        Where a process of this machine was ended from outside.
+    """
+    if workers is not None and workers < 1:
+        raise InputError(f"--workers must be at least 1; got {workers}")
+    tell = report or (lambda _stage, _done, _total: None)
+    seeds = np.random.SeedSequence(seed).spawn(len(inputs))
+    count = min(workers or len(os.sched_getaffinity(0)), len(inputs))
+    if cluster is None and count <= 1:
+        return list(_here(task, list(zip(inputs, seeds, strict=True)), tell))
+    with _processes(count) if cluster is None else _dask(cluster) as executor:
+        return _gather(executor, task, list(zip(inputs, seeds, strict=True)), tell)
+
+
+def _run(
+    task: Callable[[Input, np.random.Generator], Output],
+    one: Input,
+    seed: np.random.SeedSequence,
+) -> Output:
+    return task(one, np.random.default_rng(seed))
+
+
+def _here(
+    task: Callable[[Any, np.random.Generator], Output],
+    given: list[tuple[Any, np.random.SeedSequence]],
+    tell: Report,
+) -> Iterator[Output]:
+    tell("runs", 0, len(given))
+    for done, (one, seed) in enumerate(given, start=1):
+        yield _run(task, one, seed)
+        tell("runs", done, len(given))
+
+
+def _gather(
+    executor: Executor,
+    task: Callable[[Any, np.random.Generator], Output],
+    given: list[tuple[Any, np.random.SeedSequence]],
+    tell: Report,
+) -> list[Output]:
+    futures = [executor.submit(_run, task, one, seed) for one, seed in given]
+    tell("runs", 0, len(futures))
+    try:
+        for done, future in enumerate(as_completed(futures), start=1):
+            future.result()
+            tell("runs", done, len(futures))
+    except BaseException:
+        for future in futures:
+            future.cancel()
+        raise
+    return [future.result() for future in futures]
+
+
+@contextmanager
+def _processes(count: int) -> Iterator[Executor]:
+    # Spawned, not forked: a fork copies the locks of other threads as they happen to be.
+    context = multiprocessing.get_context("spawn")
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    try:
+        with ProcessPoolExecutor(count, mp_context=context) as executor:
+            yield executor
+    except BrokenProcessPool as error:
+        raise EstimationError(
+            "a worker process was ended from outside, perhaps for want of memory; give fewer"
+            " --workers"
+        ) from error
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
+def _dask(address: str) -> Iterator[Executor]:
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise InputError(
+            f"--cluster {address}: dask is not installed; pip install 'magfusion[cluster]'"
+        ) from error
+    try:
+        client = Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(
+            f"--cluster {address}: no Dask scheduler answers there; start one with dask scheduler,"
+            " and give the address that it prints"
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=CONNECT_S)
+        except TimeoutError as error:
+            raise InputError(
+                f"--cluster {address}: the scheduler has no workers; start some with dask worker"
+                f" {address}"
+            ) from error
+        # Equal inputs are still runs of their own.
+        with client.get_executor(pure=False) as executor:
+            yield executor

@@ -1,0 +1,153 @@
+"""A mistake names itself on a short log; a clean log names none."""
+
+from functools import lru_cache
+
+import mistake_case
+import pytest
+from mistake_case import Case, good_case, simulated
+from mistake_list import MISTAKES
+
+from magfusion.estimation.integrity.diagnosis import cause_of, diagnosed, seen_in_streams
+from magfusion.estimation.integrity.explanation import Explanation, clearly_best
+from magfusion.estimation.integrity.recording import recorded
+from magfusion.model.trust import CODES, Finding, Trust, Verdict
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.log import SimulationConfig
+from magfusion.simulation.motion import Rests
+
+SECONDS = 16.0
+
+# One of each kind, with the code that is to be named.
+NAMED = {
+    "phase_sign": "phase_sign",
+    "coil_reversed": "coil_reversed",
+    "coils_swapped_all": "coils_swapped",
+    "positions_swapped": "beacons_swapped",
+    "moments_rms": "moment_units",
+    "matrix_scale_5pct": "field_scale",
+    "moments_A_20pct": "moments",
+    "moved_50cm": "beacon_pose",
+    "beacon_turned_90deg": "beacon_pose",
+    "beacon_inverse": "angle_convention",
+    "beacon_rpy_radians": "angle_units",
+    "phase_rad_for_deg": "phase_units",
+    "phase_10deg_one": "phase",
+    "survey_mirrored": "survey_axes",
+    "survey_in_feet": "length_units",
+    "mounting_x180": "mounting",
+    "lever_in_cm": "lever_arm",
+    "one_never_on": "silent_beacon",
+    "gyro_sign": "gyro_sign",
+    "gyro_deg_s": "gyro_units",
+    "accel_sign": "gravity_sign",
+    "accel_in_g": "accel_units",
+    "gravity_removed": "gravity_missing",
+    "imu_xy_swapped": "imu_axes",
+    "imu_1s_late": "time_offset",
+    "epoch_12ms": "epoch_shift",
+    "magnetometer_clock_1000ppm": "sample_rate",
+    "magnetometer_z_sign": "magnetometer_axes",
+    "body_iron": "magnetometer_matrix",
+    "false_20pct_15s": "beacon_fault",
+    "drives_free_running": "beacon_clock",
+}
+
+
+QUICK = ("coil_reversed", "moments_rms", "moved_50cm", "gyro_sign", "gravity_removed", "epoch_12ms")
+
+
+@lru_cache(maxsize=1)
+def _short() -> Case:
+    config = SimulationConfig(
+        box_world=DEMO_BOX_WORLD,
+        duration=SECONDS,
+        motion="turn",
+        time_offset=0.004,
+        rests=Rests(start=2.0, move=20.0),
+    )
+    return simulated(demo_site(coil_radius=None), config, seed=5)
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_a_mistake_names_itself(name: str) -> None:
+    _names_itself(name, NAMED[name])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(set(NAMED) - set(QUICK)))
+def test_every_mistake_names_itself(name: str) -> None:
+    _names_itself(name, NAMED[name])
+
+
+def _names_itself(name: str, code: str) -> None:
+    case = MISTAKES[name].change(_short())
+    found = cause_of(case.log, case.site)
+    assert found is not None
+    explanation, text = found
+    assert explanation.code == code
+    assert code in CODES
+    assert "chi square" in text
+    assert explanation.after < 0.4 * explanation.before
+
+
+@pytest.mark.parametrize("seed", [1])
+@pytest.mark.parametrize("motion", ["walk", "static"])
+def test_a_clean_log_names_none(motion: str, seed: int) -> None:
+    config = SimulationConfig(
+        box_world=DEMO_BOX_WORLD,
+        duration=12.0,
+        motion="walk" if motion == "walk" else "static",
+        time_offset=0.0,
+    )
+    case = simulated(demo_site(coil_radius=None), config, seed)
+    assert cause_of(case.log, case.site) is None
+
+
+def test_nothing_is_tried_of_what_is_trustworthy_or_explains_itself() -> None:
+    case = MISTAKES["gyro_sign"].change(_short())
+    assert diagnosed(case.log, case.site, Trust()) is None
+    frozen = Finding("frozen_imu", "The IMU stands still.")
+    assert diagnosed(case.log, case.site, Trust((frozen,))) is None
+    doubt = Trust((Finding("not_converged", "It did not converge."),))
+    found = diagnosed(case.log, case.site, doubt)
+    assert found is not None
+    assert found.verdict is Verdict.DOUBTFUL
+    assert (doubt | Trust((found,))).ordered[0].code == "gyro_sign"
+
+
+def test_of_two_causes_that_explain_alike_none_is_named() -> None:
+    one = Explanation("phase", "", "", 5000.0, 100.0, 400.0)
+    assert clearly_best([one]) is one
+    assert clearly_best([one, Explanation("moments", "", "", 5000.0, 110.0, 400.0)]) is None
+    # The same cause in other words is no rival; nor is what explains less.
+    assert clearly_best([one, Explanation("phase", "", "", 5000.0, 101.0, 400.0)]) is one
+    assert clearly_best([one, Explanation("moments", "", "", 5000.0, 400.0, 400.0)]) is one
+    assert clearly_best([Explanation("phase", "", "", 500.0, 400.0, 400.0)]) is None
+    assert clearly_best([]) is None
+
+
+@pytest.mark.slow
+def test_most_mistakes_in_motion_are_named_rightly_and_few_wrongly(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(mistake_case, "DURATION", 30.0)
+    good_case.cache_clear()
+    right, wrong, asked = 0, [], 0
+    for name, mistake in MISTAKES.items():
+        if not mistake.codes or name not in NAMED:
+            continue
+        case = mistake.change(good_case("rough", 3))
+        if seen_in_streams(Trust(recorded(case.log, case.site))):
+            continue
+        found = cause_of(case.log, case.site)
+        asked += 1
+        if found is None:
+            continue
+        if found[0].code in mistake.codes:
+            right += 1
+        else:
+            wrong.append((name, found[0].code))
+    good_case.cache_clear()
+    assert right >= 0.6 * asked
+    # Next of kin: coil and phase, units and scale, lever arm and place.
+    assert len(wrong) <= 0.2 * asked, wrong

@@ -1,0 +1,46 @@
+"""What is wrong with single samples of a recording is left out, counted and said."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.batch import smooth
+from magfusion.estimation.integrity.mending import mended
+from magfusion.model.trust import Verdict
+from magfusion.results.errors import trajectory_errors
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.log import SimulationConfig, simulate_log
+
+
+def test_false_inertial_samples_are_left_out_and_counted() -> None:
+    site, rng = demo_site(), np.random.default_rng(6)
+    log = simulate_log(site, SimulationConfig(DEMO_BOX_WORLD, duration=20.0), rng).log
+    assert mended(log, site) is log
+    rows = rng.choice(np.arange(10, len(log.imu) - 10), 12, replace=False)
+    gyro = log.imu.gyro_body.copy()
+    gyro[rows] += rng.choice([-4.0, 4.0], (12, 3))  # rad/s
+    spoilt = replace(log, imu=replace(log.imu, gyro_body=gyro))
+    good = mended(spoilt, site)
+    assert len(log.imu) - len(good.imu) >= 11
+    assert not np.isin(log.imu.time[rows], good.imu.time).any()
+    (finding,) = good.noticed
+    assert finding.code == "imu_spikes"
+    assert finding.verdict is Verdict.TRUSTWORTHY
+    errors = trajectory_errors(smooth(spoilt, site).states, log.truth)
+    whole = trajectory_errors(smooth(log, site).states, log.truth)
+    assert errors.attitude_rmse_deg < 1.2 * whole.attitude_rmse_deg + 0.01  # deg
+    assert errors.ate < 1.2 * whole.ate + 0.0005  # m
+
+
+def test_a_false_magnetometer_sample_is_a_missing_one() -> None:
+    site, rng = demo_site(), np.random.default_rng(7)
+    log = simulate_log(site, SimulationConfig(DEMO_BOX_WORLD, duration=12.0), rng).log
+    assert log.waveform is not None
+    field = log.waveform.measured_sensor.copy()
+    rows = np.arange(100, len(field) - 100, 400)
+    field[rows, 1] += 3e-4  # T
+    spoilt = replace(log, waveform=replace(log.waveform, measured_sensor=field))
+    good = mended(spoilt, site)
+    assert good.waveform is not None
+    np.testing.assert_array_equal(good.waveform.time, np.delete(log.waveform.time, rows))
+    assert [finding.code for finding in good.noticed] == ["false_samples"]

@@ -1,0 +1,75 @@
+"""The suite of mistakes: each can be made, and what is silent is counted as such."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mistake_case import LOGS, good_case
+from mistake_list import GOOD, MISTAKES
+from mistakes import Config, Row, run, summed, table
+
+from magfusion.files.site import save_site
+from magfusion.model.trust import CODES
+
+ROW = Row(
+    mistake="lever_20cm",
+    log="moving",
+    estimator="smooth",
+    exit=0,
+    verdict="trustworthy",
+    codes=(),
+    text="",
+    unverified=(),
+    error_m=0.2,
+    error_deg=0.1,
+    claimed_m=0.002,
+    claimed_deg=0.1,
+    nees=5000.0,
+    seconds=1.0,
+)
+
+
+def test_there_are_enough_and_every_one_can_be_made(tmp_path: Path) -> None:
+    assert len(MISTAKES) >= 60
+    good = good_case("moving", 1)
+    for mistake in MISTAKES.values():
+        case = mistake.change(good)
+        if mistake.name == "earth_in_gauss":  # no file may say so
+            continue
+        save_site(case.site, tmp_path / "site.yaml")
+        imu_same = np.array_equal(case.imu.time, good.imu.time) and np.array_equal(
+            np.hstack([case.imu.gyro_body, case.imu.accel_body]),
+            np.hstack([good.imu.gyro_body, good.imu.accel_body]),
+        )
+        wave_same = np.array_equal(case.waveform.time, good.waveform.time) and np.array_equal(
+            case.waveform.measured_sensor, good.waveform.measured_sensor
+        )
+        assert case.site is not good.site or not (imu_same and wave_same), mistake.name
+    assert GOOD.change(good) is good
+
+
+def test_silent_is_what_is_wrong_and_neither_said_nor_listed() -> None:
+    assert ROW.silent
+    assert not replace(ROW, nees=10.0).silent
+    assert not replace(ROW, verdict="doubtful").silent
+    assert not replace(ROW, unverified=("sensor.position_x_m",)).silent
+    assert replace(ROW, unverified=("sensor.rotation_x_deg",)).silent
+    good = replace(ROW, mistake="good", nees=6.0)
+    right = replace(ROW, verdict="doubtful", codes=("lever_arm",), seconds=4.0)
+    rows = [good, ROW, right, replace(right, codes=("geometry",), seconds=1.0)]
+    found = summed(rows)
+    assert found.silent == ("lever_20cm (moving, smooth)",)
+    assert found.right_first == pytest.approx(1.0 / 3.0)
+    assert found.slow == ("lever_20cm (moving, smooth)",)
+    assert "SILENT" in table(rows)
+
+
+@pytest.mark.slow
+def test_a_few_mistakes_on_each_log_make_no_traceback() -> None:
+    few = ("lever_20cm", "magnetometer_in_nt", "false_20pct_15s")
+    rows = run(Config(mistakes=few, estimators=("smooth",)), {"workers": 1})
+    assert len(rows) == 4 * len(LOGS)
+    assert not summed(rows).tracebacks
+    assert all(row.exit == 2 for row in rows if row.mistake == "magnetometer_in_nt")
+    assert set(code for row in rows for code in row.codes) <= set(CODES)

@@ -1,0 +1,154 @@
+"""Noise that tunes itself: what was declared wrongly is found, and the sigmas are honest."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import chi2
+
+from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.integrity.tuned_noise import tuned_noise
+from magfusion.estimation.noise_tuning import NORMAL, STUDENT, Tuned, tuned_site
+from magfusion.files.site import load_site, save_site
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Verdict
+from magfusion.results.errors import trajectory_errors
+from magfusion.results.refinement import result_site
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.log import SimulationConfig, simulate_log
+
+
+def simulated(seed: int, duration: float = 30.0) -> Log:
+    config = SimulationConfig(DEMO_BOX_WORLD, duration=duration, motion="walk", perturb=False)
+    return simulate_log(demo_site(), config, np.random.default_rng(seed)).log
+
+
+def declared(imu: float = 1.0, model: float = 1.0) -> Site:
+    """Return the demo site, exact, with its densities declared too large by factors."""
+    site = demo_site()
+    own = site.platform.imu
+    noisy = replace(own, gyro_noise=imu * own.gyro_noise, accel_noise=imu * own.accel_noise)
+    platform = replace(site.platform, imu=noisy)
+    return replace(site, model_error=model * site.model_error, platform=platform)
+
+
+def found(result: Smoothed, key: str) -> np.ndarray:
+    return np.array([t.found for t in result.noise if t.key == key])
+
+
+def mean_nees(result: Smoothed, log: Log) -> float:
+    assert log.truth is not None
+    nees = trajectory_errors(result.states, log.truth).nees
+    assert nees is not None
+    return float(np.mean(nees))
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    return simulated(1)
+
+
+@pytest.fixture(scope="module")
+def plain(log: Log) -> Smoothed:
+    return smooth(log, declared())
+
+
+def test_the_dipole_model_is_found_to_be_better_than_declared(log: Log, plain: Smoothed) -> None:
+    """A coil of 0.1 m is a dipole within a thousandth here; half a per cent was declared."""
+    error = found(plain, "model_error")
+    assert len(error) == 4
+    assert np.all(error < 0.6 * 0.005)
+    assert np.mean(error) < 0.4 * 0.005
+    assert np.all((found(plain, "noise_factor") > 0.5) & (found(plain, "noise_factor") < 1.3))
+    untuned = smooth(log, declared(), SmootherSettings(tune=False))
+    assert untuned.noise == ()
+    assert log.truth is not None
+    better, before = (trajectory_errors(r.states, log.truth).ate for r in (plain, untuned))
+    assert better < 0.8 * before
+
+
+def test_densities_declared_too_small_are_found(log: Log) -> None:
+    result = smooth(log, declared(imu=1.0 / 5.0))
+    for kind, true in (("gyro_noise", 3e-4), ("accel_noise", 3e-3)):
+        assert 0.5 * true < found(result, kind)[0] < 2.0 * true, kind
+    untuned = smooth(log, declared(imu=1.0 / 5.0), SmootherSettings(tune=False))
+    assert mean_nees(untuned, log) > mean_nees(result, log)
+
+
+def test_what_is_declared_too_large_of_the_imu_stays(log: Log) -> None:
+    """Scale and vibration may be in it, which are not white."""
+    result = smooth(log, declared(imu=3.0))
+    assert found(result, "gyro_noise") == pytest.approx(3.0 * 3e-4)
+
+
+def test_a_result_is_the_same_again(log: Log, plain: Smoothed) -> None:
+    again = smooth(log, declared())
+    assert again.noise == plain.noise
+    assert np.array_equal(again.states.position_world, plain.states.position_world)
+
+
+def test_the_refined_site_has_what_was_found(plain: Smoothed, tmp_path: Path) -> None:
+    save_site(result_site(plain, "a log"), tmp_path / "site.yaml")
+    site = load_site(tmp_path / "site.yaml")
+    by_name = {b.name: b for b in site.beacons}
+    for one in plain.noise:
+        part = site.platform.imu if one.owner == "imu" else by_name[one.owner]
+        assert getattr(part, one.key) == pytest.approx(one.found, rel=1e-12)
+
+
+def test_a_site_that_says_nothing_of_it_is_as_before(tmp_path: Path) -> None:
+    save_site(demo_site(), tmp_path / "site.yaml")
+    text = (tmp_path / "site.yaml").read_text()
+    assert "noise_factor" not in text
+    assert "correlation_m" not in text
+    site = load_site(tmp_path / "site.yaml")
+    assert site.model_error_length == Site.model_error_length
+    assert all(b.model_error is None and b.noise_factor == 1.0 for b in site.beacons)
+
+
+def test_more_than_three_times_the_noise_is_a_doubt_and_less_is_only_said() -> None:
+    louder, quieter = Tuned("B", "model_error", 0.005, 0.04), Tuned("A", "noise_factor", 1.0, 0.2)
+    usual = Tuned("imu", "gyro_noise", 3e-4, 8e-4)
+    doubt, remark = tuned_noise([usual, louder, quieter])
+    assert doubt.verdict is Verdict.DOUBTFUL
+    assert "beacon B is 0.04 and not 0.005" in doubt.text
+    assert "gyroscope" not in doubt.text
+    assert remark.verdict is Verdict.TRUSTWORTHY
+    assert "beacon A" in remark.text
+    assert list(tuned_noise([usual])) == []
+    site = tuned_site(demo_site(), [louder, quieter, usual])
+    assert [b.model_error for b in site.beacons] == [None, 0.04, None, None]
+    assert site.platform.imu.gyro_noise == 8e-4
+
+
+@pytest.mark.parametrize("components", [3, 6])
+def test_the_gain_of_the_robust_fit_leaves_normal_residuals_as_they_are(components: int) -> None:
+    def influence(square: float) -> float:
+        share = NORMAL[components] * square / STUDENT
+        weight = (STUDENT + components) * share / (1.0 + share)
+        return float(weight * chi2.pdf(square, components))
+
+    assert quad(influence, 0.0, 100.0)[0] == pytest.approx(components, rel=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [1.0, 3.0, 1.0 / 3.0])
+def test_the_mean_nees_is_honest_whatever_was_declared(factor: float) -> None:
+    """Fifty logs, each with its own survey error as declared."""
+    site, values, untuned = declared(factor, factor), [], []
+    for seed in range(50):
+        config = SimulationConfig(DEMO_BOX_WORLD, duration=15.0, motion="walk")
+        log = simulate_log(demo_site(), config, np.random.default_rng(seed)).log
+        values.append(mean_nees(smooth(log, site), log))
+        if seed < 10:
+            raw = smooth(log, site, SmootherSettings(tune=False))
+            untuned.append(mean_nees(raw, log))
+    # On the safe side: what the survey's errors leave in the residuals is counted as model error,
+    # and a density of the IMU is never taken for smaller than it was declared.
+    low, high = 2.8, 7.0
+    assert low < np.mean(values) < high, (np.mean(values), np.mean(untuned))
+    if factor > 1.0:
+        assert np.mean(untuned) < low, np.mean(untuned)

@@ -1,0 +1,405 @@
+"""The equations of the four papers: each number is there, and what is said of it is so.
+
+What other tests hold is not repeated: `test_tracker` and `test_antenna` (000),
+`test_magnetometer_calibration` (001), `test_beacon_calibration` (002), `test_ellipse`,
+`test_direction`, `test_rssi` and `test_fingerprint` (004).
+"""
+
+import ast
+import inspect
+import re
+from types import ModuleType
+
+import beacon_calibration
+import numpy as np
+import pytest
+from beacon_calibration import PLACES_WORLD
+from scipy.spatial.transform import Rotation
+
+from magfusion.files.attitude_table import AttitudeDatabase
+from magfusion.model.antenna import Antenna
+from magfusion.model.physics.disturbance import sphere_polarizability
+from magfusion.papers.p000_tracker import equations as p000
+from magfusion.papers.p001_magnetometer import equations as p001
+from magfusion.papers.p001_magnetometer.matching import predict_field
+from magfusion.papers.p001_magnetometer.matching_database import nearest_entries, prepare
+from magfusion.papers.p002_beacon import equations as p002
+from magfusion.papers.p002_beacon.calibration import calibrate_as_printed
+from magfusion.papers.p004_fingerprints import equations as p004
+from magfusion.simulation.field import phasors_world
+from magfusion.units import DEGREE, MU0_OVER_4PI
+
+PAPERS = {"000": (p000, 20), "001": (p001, 20), "002": (p002, 33), "004": (p004, 31)}
+NAME = re.compile(r"eq_(\d\d)_\w+")
+VERDICT = re.compile(r"\b(Right|Misprint|False|Corrected|Unclear)\b")
+
+# The register ----------------------------------------------------------------------------------
+
+
+def told(module: ModuleType) -> dict[str, str]:
+    """Return the text under each name of a module, in the order of the file."""
+    nodes = ast.parse(inspect.getsource(module)).body
+    texts: dict[str, str] = {}
+    for node, below in zip(nodes, [*nodes[1:], None], strict=True):
+        if isinstance(node, ast.FunctionDef):
+            texts[node.name] = ast.get_docstring(node) or ""
+        elif isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            text = below.value if isinstance(below, ast.Expr) else None
+            texts[node.targets[0].id] = str(text.value) if isinstance(text, ast.Constant) else ""
+    return {name: text for name, text in texts.items() if NAME.fullmatch(name)}
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+def test_every_number_of_a_paper_is_a_function_or_has_a_reason(paper: str) -> None:
+    module, last = PAPERS[paper]
+    names = [name for name in vars(module) if NAME.fullmatch(name)]
+    numbers = [int(name[3:5]) for name in names]
+    assert all(callable(getattr(module, name)) for name in names)
+    assert numbers == sorted(numbers), "not in the order of the paper"
+    assert set(numbers).isdisjoint(module.NOT_FUNCTIONS)
+    assert {*numbers, *module.NOT_FUNCTIONS} == set(range(1, last + 1))
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+def test_every_equation_says_what_is_known_of_it(paper: str) -> None:
+    module, _ = PAPERS[paper]
+    texts = told(module)
+    assert texts.keys() == {name for name in vars(module) if NAME.fullmatch(name)}
+    for name, text in texts.items():
+        assert VERDICT.search(text), f"{name} has no verdict"
+        if name.endswith("_as_printed"):
+            assert re.search(r"\b(Misprint|False)\b", text), f"{name} could do without its suffix"
+
+
+# 000 -------------------------------------------------------------------------------------------
+
+
+def test_000_eq_5_needs_one_ambient_vector_and_eq_10_a_moment_a_coil() -> None:
+    rng = np.random.default_rng(1)
+    attitude = Rotation.random(20, rng=rng).as_matrix()
+    position = rng.standard_normal((20, 3))
+    sent, seen = (np.eye(3) + 0.1 * rng.standard_normal((3, 3)) for _ in range(2))
+    ideal = p000.eq_01_coupling(MU0_OVER_4PI, attitude, position, sent)
+    antenna = Antenna(sent.T, np.zeros((3, 3)), seen, np.zeros((3, 3)))
+    found = p000.eq_10_coupling(antenna, np.swapaxes(attitude, 1, 2), position).value
+    np.testing.assert_allclose(found, seen @ ideal, rtol=0, atol=1e-12 * np.max(np.abs(ideal)))
+    silent = np.max(np.abs(ideal)) * rng.standard_normal((20, 3, 1))
+    measured = p000.eq_05_coupling(MU0_OVER_4PI, attitude, position, sent, silent * np.ones(3))
+    left = measured - silent
+    np.testing.assert_allclose(left, ideal, rtol=0, atol=1e-13 * np.max(np.abs(measured)))
+
+
+def test_000_eq_18_is_a_rotation_to_first_order_and_eq_20_its_inverse() -> None:
+    rng = np.random.default_rng(2)
+    point, axis, shift = rng.standard_normal((3, 50, 3))
+    for angle in (0.01, 0.1):
+        turn = angle * axis / np.linalg.norm(axis, axis=1, keepdims=True)
+        actual = p000.eq_18_point_as_printed(point, 1.0, turn, shift)
+        rotated = Rotation.from_rotvec(turn).apply(point) + shift
+        error = np.linalg.norm(actual - rotated, axis=1) / np.linalg.norm(point, axis=1)
+        assert 0.1 * angle**2 < np.max(error) < angle**2
+        back = p000.eq_20_ideal_point_as_printed(actual, turn, shift)
+        np.testing.assert_allclose(back, point, rtol=0, atol=1e-12)
+
+
+# 001 -------------------------------------------------------------------------------------------
+
+NED = np.array([2.7e-5, -4e-6, 4.7e-5])  # T
+BIAS, SCALE = np.array([6e-6, -2e-6, 3e-6]), np.array([1.1, 0.93, 1.02])
+E = np.array([[0.0, 0.02, -0.01], [0.015, 0.0, 0.03], [-0.02, 0.01, 0.0]])
+SENSOR = (BIAS, SCALE, E)
+
+
+def test_001_readings_on_the_table_are_those_of_the_printed_lines() -> None:
+    exy, ezy, exz, eyz = E[1, 0], E[1, 2], E[2, 0], E[2, 1]
+    signs = np.array([[1, 1, 1], [-1, -1, 1], [1, -1, -1], [-1, 1, -1]])  # north, east, down
+    along_z = BIAS[2] + SCALE[2] * (signs * NED) @ [exz, eyz, 1.0]
+    along_y = BIAS[1] + SCALE[1] * (signs * NED) @ [exy, 1.0, ezy]
+    for position in range(4):
+        z = (p001.eq_04_z_at_1, p001.eq_05_z_at_2, p001.eq_06_z_at_3, p001.eq_07_z_at_4)[position]
+        y = (p001.eq_12_y_at_1, p001.eq_13_y_at_2, p001.eq_14_y_at_3, p001.eq_15_y_at_4)[position]
+        assert z(NED, *SENSOR) == pytest.approx(along_z[position], rel=1e-12)
+        assert y(NED, *SENSOR) == pytest.approx(along_y[position], rel=1e-12)
+    assert p001.eq_08_sum(along_z) == pytest.approx(4.0 * BIAS[2], rel=1e-9)
+    assert p001.eq_09_bias(along_z) == pytest.approx(BIAS[2], rel=1e-9)
+    assert p001.eq_10_signed_sum(along_z) == pytest.approx(4.0 * NED[2] * SCALE[2], rel=1e-12)
+    assert p001.eq_11_scale(along_z, NED[2]) == pytest.approx(SCALE[2], rel=1e-12)
+    assert p001.eq_16_misalignment(along_y, NED[2], SCALE[1]) == pytest.approx(ezy, rel=1e-9)
+
+
+def test_001_eq_16_finds_what_eq_2_has_with_bz_and_nothing_as_printed() -> None:
+    on_table = p001.SENSOR_FROM_NED[:4] @ NED
+    for voltage, found in ((p001.eq_02_voltage_y, E[1, 2]), (p001.eq_02_voltage_y_as_printed, 0.0)):
+        readings = voltage(on_table, *SENSOR)
+        assert p001.eq_16_misalignment(readings, NED[2], SCALE[1]) == pytest.approx(found, abs=1e-9)
+
+
+def test_001_the_database_asks_what_eq_17_to_20_ask() -> None:
+    rng = np.random.default_rng(3)
+    north = NED * [1.0, 1.0, -1.0]  # world z is up
+    for angles, nearest, distance in (
+        ("roll", p001.eq_17_nearest, p001.eq_19_distance),
+        ("roll-pitch", p001.eq_18_nearest, p001.eq_20_distance),
+    ):
+        rpy = rng.uniform([-3.0, -0.5, 0.3], [3.0, 0.5, 0.3], (80, 3))
+        if angles == "roll":
+            rpy[:, 1] = 0.1
+        entries = predict_field(rpy, north)
+        index = prepare(AttitudeDatabase(entries, rpy, angles, "drawn"))
+        asked = entries[:20] + 1e-6 * rng.standard_normal((20, 3))
+        apart, row = nearest_entries(index, asked)
+        np.testing.assert_array_equal(row[:, 0], nearest(asked, entries))
+        np.testing.assert_allclose(distance(asked, entries[row[:, 0]]), apart[:, 0], rtol=1e-9)
+
+
+def test_001_eq_18_does_not_see_a_turn_about_the_field() -> None:
+    rpy = np.array([0.2, -0.3, 0.4])
+    about = Rotation.from_rotvec(2.0 * NED / np.linalg.norm(NED))
+    turned = (about * Rotation.from_euler("xyz", rpy)).as_euler("xyz")
+    assert np.max(np.abs(turned - rpy)) > 1.0  # rad
+    apart = p001.eq_20_distance(predict_field(rpy, NED), predict_field(turned, NED))
+    assert apart < 1e-15  # T
+
+
+# 002 -------------------------------------------------------------------------------------------
+
+
+def test_002_eq_2_and_3_are_a_coil_of_turns() -> None:
+    """Against the exact field on the axis of a current sheet."""
+    current, turns, radius, length = 8.0, 120.0, 0.075, 0.35
+    moment = p002.eq_03_moment(current, turns, radius)
+    axis = np.linspace(1.0, 4.0, 5)
+    offset = axis[:, None] * [0.0, 0.0, 1.0]
+    field = p002.eq_02_field(offset, np.array([0.0, 0.0, moment]), radius, length)[:, 2]
+    ends = axis[:, None] + 0.5 * length * np.array([1.0, -1.0])
+    cosine = ends / np.hypot(ends, radius)
+    exact = 2.0 * np.pi * MU0_OVER_4PI * current * turns / length * (cosine[:, 0] - cosine[:, 1])
+    np.testing.assert_allclose(field, exact, rtol=1e-5)
+
+
+def test_002_the_law_of_cosines_and_the_misfit_vanish_at_the_true_centre() -> None:
+    places = np.array([[2.0, 2.0, 0.5], [-2.0, 2.0, 0.5], [2.0, -2.0, 0.5], [-2.0, -2.0, 0.7]])
+    centre = np.array([0.1, -0.2, 0.05])
+    reach = np.linalg.norm(places - centre, axis=1)
+    direction = p002.eq_18_direction(centre, places)
+    np.testing.assert_allclose(centre + reach[:, None] * direction, places, rtol=0, atol=1e-12)
+    length = p002.eq_10_lengths(places)
+    assert length[:2] == pytest.approx([4.0, 4.0])  # of the first and the second, and the third
+    cosine = p002.eq_09_cosines(direction)
+    left = p002.eq_11_misfit(reach, cosine, length)
+    np.testing.assert_allclose(left, 0.0, rtol=0, atol=1e-12)
+    assert p002.eq_12_misfit(centre, places, reach) == pytest.approx(0.0, abs=1e-12)
+    moved = p002.eq_12_misfit(centre + np.array([0.0, 0.0, 0.01]), places, reach)
+    assert moved == pytest.approx(np.sum((0.01 * direction[:, 2]) ** 2), rel=0.05)
+    np.testing.assert_allclose(  # what Eq 14-16 say of any orthogonal matrix
+        p002.eq_09_cosines(direction @ Rotation.from_rotvec(centre).as_matrix()), cosine, rtol=1e-12
+    )
+
+
+def test_002_eq_26_holds_to_first_order_only() -> None:
+    """Noise with both signs: what its mean leaves is the bias, 7 mm of the centre at 5 %."""
+    attitude, magnetometers = beacon_calibration.paper_rotation(), PLACES_WORLD[:3]
+    beacon = beacon_calibration.beacon(np.zeros(3), attitude)
+    phasor = phasors_world(beacon, magnetometers)[:, 0] @ attitude
+    coils = np.stack([phasor.real, phasor.imag])
+    hemisphere = np.sign((magnetometers @ attitude)[:, 2])
+    draws = np.random.default_rng(9).standard_normal((2000, *coils.shape))
+    bias = []
+    for share in (0.01, 0.05):
+        noise = share * np.linalg.norm(coils, axis=-1, keepdims=True) * draws
+        drawn = coils + np.concatenate([noise, -noise])
+        seen = drawn[:, 0] + 1j * drawn[:, 1]
+        found = calibrate_as_printed(seen, magnetometers, beacon_calibration.MOMENT, hemisphere)
+        bias.append(np.abs(np.mean(found.centre_world, axis=0)))
+    np.testing.assert_allclose(bias[1], [2.7e-3, 6.0e-3, 2.9e-3], rtol=0, atol=1e-3)  # m
+    assert np.linalg.norm(bias[1]) / np.linalg.norm(bias[0]) == pytest.approx(25.0, rel=0.15)
+
+
+# 004 -------------------------------------------------------------------------------------------
+
+MOMENTS = np.array([65.0, 65.0])  # A m^2
+TURN = np.arange(40) * 2.0 * np.pi / 40.0  # rad, one period
+
+
+def places(count: int = 60, seed: int = 4) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return polar angle, azimuth and distance."""
+    rng = np.random.default_rng(seed)
+    low, high = [0.05, -np.pi, 1.0], [0.5 * np.pi - 0.01, np.pi, 15.0]
+    return tuple(rng.uniform(low, high, (count, 3)).T)
+
+
+def offsets() -> tuple[np.ndarray, np.ndarray]:
+    polar, azimuth, distance = places()
+    direction = p004.eq_02_direction(polar, azimuth)
+    return direction, direction * distance[:, None]
+
+
+def test_004_the_fields_are_the_printed_ones() -> None:
+    direction, offset = offsets()
+    u, v, e = direction.T
+    phase, moments = 0.7, np.array([70.0, 50.0])
+    first, second = p004.eq_01_coil_fields(offset, moments, phase)
+    unit = MU0_OVER_4PI / np.linalg.norm(offset, axis=1) ** 3
+    x = np.stack([3 * u**2 - 1, 3 * u * v, 3 * u * e]) * moments[0] * np.cos(phase) * unit
+    y = np.stack([3 * u * v, 3 * v**2 - 1, 3 * v * e]) * moments[1] * np.sin(phase) * unit
+    np.testing.assert_allclose(first.T / unit, x / unit, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(second.T / unit, y / unit, rtol=0, atol=1e-11)
+    total = p004.eq_04_field(offset, moments, phase)
+    np.testing.assert_allclose(total.T / unit, (x + y) / unit, rtol=0, atol=1e-11)
+    moment = np.array([*p004.eq_03_currents(moments, phase), 0.0])
+    np.testing.assert_allclose(total, p004.eq_12_field(offset, moment), rtol=0, atol=1e-18)
+    size = np.log(np.linalg.norm(total, axis=1))
+    np.testing.assert_allclose(p004.eq_13_log_field(offset, moment), size, rtol=1e-12)
+
+
+def test_004_currents_as_printed_turn_no_field() -> None:
+    printed = np.array(p004.eq_03_currents_as_printed(MOMENTS, TURN))
+    meant = np.array(p004.eq_03_currents(MOMENTS, TURN))
+    assert np.linalg.svd(printed, compute_uv=False)[1] < 1e-12 * np.max(MOMENTS)
+    np.testing.assert_allclose(np.hypot(*meant), MOMENTS[0], rtol=1e-12)
+
+
+def test_004_the_printed_normal_has_a_factor_that_averages_to_nothing() -> None:
+    direction, offset = offsets()
+    printed = p004.eq_05_normal_as_printed(offset[:, None], MOMENTS, TURN)
+    unit = (MU0_OVER_4PI * MOMENTS[0] / np.linalg.norm(offset, axis=1) ** 3) ** 2
+    expected = (np.sin(TURN) * np.cos(TURN))[:, None] * p004.eq_05_normal(direction)[:, None]
+    scaled = printed / unit[:, None, None]
+    np.testing.assert_allclose(scaled, expected, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.mean(scaled, axis=1), 0.0, rtol=0, atol=1e-12)
+
+
+def test_004_pairs_a_quarter_period_apart_give_one_normal_of_the_wrong_sign() -> None:
+    direction, offset = offsets()
+    fields = p004.eq_04_field(offset[:, None], MOMENTS, TURN)
+    later = p004.eq_04_field(offset[:, None], MOMENTS, TURN + 0.5 * np.pi)
+    unit = (MU0_OVER_4PI * MOMENTS[0] / np.linalg.norm(offset, axis=1) ** 3) ** 2
+    pairs = p004.eq_08_normal_as_printed(fields, later) / unit[:, None, None]
+    normal = p004.eq_05_normal(direction)
+    np.testing.assert_allclose(pairs, -normal[:, None] * np.ones((40, 1)), rtol=0, atol=1e-10)
+    mean = p004.eq_11_mean_as_printed(pairs)
+    np.testing.assert_allclose(mean, -normal, rtol=0, atol=1e-10)
+    lost = p004.eq_11_mean_as_printed(fields) / np.sqrt(unit)[:, None]
+    np.testing.assert_allclose(lost, 0.0, rtol=0, atol=1e-12)
+    phasor = fields[:, 0] - 1j * fields[:, 10]
+    np.testing.assert_allclose(p004.eq_11_normal(phasor) / unit[:, None], normal, atol=1e-10)
+
+
+def test_004_eq_6_divides_by_z_and_eq_7_needs_the_angle_of_both() -> None:
+    polar, azimuth, _ = places()
+    direction, _ = offsets()
+    normal = p004.eq_05_normal(direction)
+    tangent = p004.eq_06_tangent_of_polar(polar)
+    np.testing.assert_allclose(np.tan(p004.eq_06_polar_of_normal(normal)), tangent, rtol=1e-9)
+    assert np.median(np.abs(p004.eq_06_tangent_as_printed(normal) / tangent - 1.0)) > 0.2
+    np.testing.assert_allclose(p004.eq_07_direction(normal), direction, rtol=0, atol=1e-12)
+    printed = p004.eq_07_angles_as_printed(tangent, normal)
+    near = normal[:, 2] > 0.0  # the normal within 90 degrees of the axis
+    np.testing.assert_allclose(printed[0][near], polar[near], rtol=1e-9)
+    assert np.min(np.abs(printed[0][~near] - polar[~near])) > 70.0 * DEGREE
+    front = np.abs(azimuth) < 0.5 * np.pi
+    np.testing.assert_allclose(printed[1][front], azimuth[front], rtol=1e-9)
+    np.testing.assert_allclose(np.abs(printed[1] - azimuth)[~front], np.pi, rtol=1e-9)
+
+
+def test_004_the_angular_term_is_no_constant_and_the_printed_intercept_no_moment() -> None:
+    direction = np.eye(3)
+    moment = np.array([65.0, 0.0, 0.0])
+    term = np.exp(p004.eq_14_angular_term(direction, moment))
+    np.testing.assert_allclose(term, [130.0, 65.0, 65.0], rtol=1e-12)
+    # Table 1 has b of 9.057 to 9.353, ln(nT): 86 to 116 A m^2 of a minor semi-axis.
+    for printed, by_print, meant in ((9.353, 716.0, 115.5), (9.057, 532.0, 85.9)):
+        assert p004.eq_16_intercept_as_printed(np.log(by_print)) == pytest.approx(printed, abs=2e-3)
+        intercept = p004.eq_16_intercept(np.log(meant)) + np.log(1e9)
+        assert intercept == pytest.approx(printed, abs=2e-3)
+
+
+def test_004_eq_20_has_the_printed_elements_and_eq_23_inverts_it() -> None:
+    angles = np.random.default_rng(5).uniform(-1.5, 1.5, (50, 3)) * [1.0, 2.0, 2.0]
+    (sp, sg, sl), (cp, cg, cl) = np.sin(angles.T), np.cos(angles.T)
+    rows = [
+        [cg * cp, cg * sp * sl - sg * cl, cg * sp * cl + sg * sl],
+        [sg * cp, sg * sp * sl + cg * cl, sg * sp * cl - cg * sl],
+        [-sp, cp * sl, cp * cl],
+    ]
+    matrix = p004.eq_20_attitude(angles)
+    np.testing.assert_allclose(matrix, np.moveaxis(np.array(rows), -1, 0), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(p004.eq_23_angles(matrix), angles, rtol=0, atol=1e-9)
+    wrong = np.abs(p004.eq_23_angles_as_printed(matrix) - angles) > 1.0
+    np.testing.assert_array_equal(wrong, np.abs(angles) > 0.5 * np.pi)
+
+
+def test_004_eq_21_as_printed_is_no_rotation_where_directions_err() -> None:
+    rng = np.random.default_rng(6)
+    true = Rotation.random(30, rng=rng).as_matrix()
+    world = p004.eq_02_direction(*rng.uniform([0.2, -3.0], [1.3, 3.0], (30, 4, 2)).T.swapaxes(1, 2))
+    seen = p004.eq_18_pseudo_direction_as_printed(true[:, None], world)
+    seen = seen + 0.02 * rng.standard_normal(seen.shape)
+
+    def bent(matrix: np.ndarray) -> np.ndarray:
+        gram = np.swapaxes(matrix, 1, 2) @ matrix
+        return np.max(np.abs(gram - np.eye(3)), axis=(1, 2))
+
+    assert np.median(bent(p004.eq_21_attitude_as_printed(seen, world))) > 0.02
+    nearest = p004.eq_21_attitude(seen, world)
+    assert np.max(bent(nearest)) < 1e-12
+    apart = Rotation.from_matrix(nearest @ true).magnitude() / DEGREE
+    assert np.max(apart) < 10.0
+
+
+def test_004_rings_make_up_a_conducting_sphere_only_with_lenz_sign() -> None:
+    """Rings of one turn, R = 2 pi rho / (conductivity dA), through a sphere in a slow field."""
+    radius, conductivity, omega = 0.2, 1e6, 1e-3
+    x, weight = np.polynomial.legendre.leggauss(40)
+    height = radius * x[:, None]
+    widest = np.sqrt(radius**2 - height**2)
+    rho = 0.5 * widest * (x + 1.0)
+    section = weight[:, None] * weight * radius * 0.5 * widest
+    ring = (1.0, np.pi * rho**2, 2.0 * np.pi * rho / (conductivity * section), 1j * omega)
+    sphere = sphere_polarizability(radius, 1.0, conductivity, omega)
+    assert np.sum(p004.eq_24_ring_moment(*ring)).imag == pytest.approx(sphere.imag, rel=1e-6)
+    assert np.sum(p004.eq_24_ring_moment_as_printed(*ring)).imag > 0.0
+    # Two turns in the room of one: half the section and twice the length, each; the same copper.
+    two, one = (p004.eq_24_ring_moment(n, 0.1, 1e-3 * n**2, 1.0) for n in (2.0, 1.0))
+    assert two == pytest.approx(one, rel=1e-12)
+
+
+def test_004_the_fingerprint_is_the_mean_square_over_time_of_all_tones() -> None:
+    rng = np.random.default_rng(7)
+    phasor = rng.standard_normal((2, 3)) + 1j * rng.standard_normal((2, 3))
+    turn = np.exp(2j * np.pi * np.arange(400)[:, None] / 400.0 * [20.0, 30.0])
+    field = np.real(turn[:, :, None] * phasor).sum(axis=1)
+    rms = np.sqrt(np.mean(np.sum(field**2, axis=1)))
+    assert p004.eq_25_fingerprint(phasor) == pytest.approx(rms, rel=1e-12)
+
+
+def test_004_ranges_by_fingerprints_are_exact_where_the_line_is_and_as_printed_nowhere() -> None:
+    rng = np.random.default_rng(8)
+    beacons = np.array([[0.0, 0.0, 0.0], [6.2, 0.54, 0.0], [3.2, 4.28, 0.0]])
+    points, place = rng.uniform([1.0, 1.0, 0.4], [5.0, 3.5, 0.6], (4, 3)), np.array([2.6, 2.2, 0.5])
+    slope, intercept = np.full(3, -3.0), np.array([9.353, 9.217, 9.057])  # ln(nT), Table 1
+    reach = p004.distances(points, beacons)
+    known = np.exp(p004.eq_15_log_amplitude(reach, slope, intercept))
+    seen = np.exp(p004.eq_15_log_amplitude(p004.distances(place, beacons), slope, intercept))
+    ranges = p004.eq_28_range(reach, seen, known, slope)
+    true = p004.distances(place, beacons)
+    np.testing.assert_allclose(ranges, true * np.ones((4, 1)), rtol=1e-12)
+    assert p004.eq_29_misfit(place, beacons, ranges) == pytest.approx(0.0, abs=1e-20)
+    printed = p004.eq_28_range_as_printed(known, known, slope, intercept)
+    np.testing.assert_allclose(printed, 21.8 * np.ones((4, 3)), rtol=0.1)  # to itself
+    # Nor with exact distances: from beacons they are none from fingerprints.
+    assert p004.eq_29_misfit_as_printed(place, points, np.abs(ranges - reach)) > 0.01  # m^2
+
+
+def test_004_the_mean_over_fingerprints_meets_one_exactly() -> None:
+    place = np.array([[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0]]])
+    found = p004.eq_27_position(np.array([[0.2, 0.1, 0.4]]), place)
+    np.testing.assert_allclose(found, [[10.0 / 17.5, 5.0 / 17.5, 0.0]], rtol=1e-12)
+    met = p004.eq_27_position(np.array([[0.2, 0.0, 0.4]]), place)
+    np.testing.assert_array_equal(met, place[:, 1])
+
+
+def test_004_errors_are_means_of_sizes() -> None:
+    error = np.array([[3.0, 4.0, 0.0], [0.0, 0.0, -1.0]])
+    assert p004.eq_30_mean_position_error(error, np.zeros((2, 3))) == pytest.approx(3.0)
+    np.testing.assert_allclose(p004.eq_31_mean_angle_error(error), [7.0 / 3.0, 1.0 / 3.0])

@@ -1,0 +1,108 @@
+"""The even clock under stamps that scatter: ticks, lost samples, drift, and what is none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from magfusion.model.samples import ImuSamples, Log, Waveform
+from magfusion.receiver.even_clocks import on_even_clocks
+from magfusion.receiver.sampling_clock import sampling_clock
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.log import SimulationConfig, simulate_log
+from magfusion.units import Array
+
+STEP = 0.0035  # s
+COUNT = 6000
+
+
+def _stamped(
+    scatter: float, share_lost: float = 0.0, drift_ppm: float = 0.0, seed: int = 1
+) -> tuple[Array, Array]:
+    """Return when samples were taken and how a host stamped them (s)."""
+    rng = np.random.default_rng(seed)
+    tick = np.arange(COUNT)[rng.random(COUNT) >= share_lost]
+    taken = STEP * tick * (1.0 + 1e-6 * drift_ppm * np.sin(0.2 * np.pi * tick / COUNT))
+    stamps = taken + STEP * scatter * rng.standard_normal(len(taken))
+    kept = np.concatenate([[True], np.diff(np.maximum.accumulate(stamps)) > 0.0])
+    return taken[kept], stamps[kept]
+
+
+@pytest.mark.parametrize(
+    ("scatter", "share_lost", "drift_ppm"),
+    [(0.05, 0.0, 0.0), (0.05, 0.1, 0.0), (0.1, 0.05, 50.0), (0.2, 0.01, 0.0), (0.25, 0.0, 100.0)],
+)
+def test_samples_get_their_ticks_back(scatter: float, share_lost: float, drift_ppm: float) -> None:
+    taken, stamps = _stamped(scatter, share_lost, drift_ppm)
+    clock = sampling_clock(stamps)
+    assert clock is not None
+    off = clock.time - taken
+    assert np.mean(np.abs(off) > 0.5 * STEP) < 0.01  # given another tick
+    assert np.median(np.abs(off)) < 0.1 * scatter * STEP + 1e-5  # s
+    assert clock.scatter == pytest.approx(scatter * STEP, rel=0.1)
+    assert np.all(np.diff(clock.time) > 0.0)
+
+
+def test_lost_samples_are_counted() -> None:
+    _, stamps = _stamped(0.1, 0.05)
+    clock = sampling_clock(stamps)
+    assert clock is not None
+    assert clock.lost == COUNT - len(stamps)
+
+
+def test_a_clock_goes_on_behind_a_gap() -> None:
+    taken, stamps = _stamped(0.1)
+    kept = (taken < 8.0) | (taken > 11.0)
+    clock = sampling_clock(stamps[kept])
+    assert clock is not None
+    assert np.max(np.abs(clock.time - taken[kept])) < 0.1 * STEP
+
+
+@pytest.mark.parametrize("share_lost", [0.0, 0.2])
+def test_even_stamps_stay(share_lost: float) -> None:
+    taken, _ = _stamped(0.0, share_lost)
+    assert sampling_clock(taken) is None
+
+
+def test_stamps_without_a_clock_stay() -> None:
+    rng = np.random.default_rng(2)
+    assert sampling_clock(np.cumsum(rng.exponential(STEP, COUNT))) is None
+
+
+def _log() -> Log:
+    return simulate_log(
+        demo_site(), SimulationConfig(DEMO_BOX_WORLD, duration=12.0), np.random.default_rng(3)
+    ).log
+
+
+def _scattered(time: Array, seed: int) -> Array:
+    step = float(np.median(np.diff(time)))
+    stamps = time + 0.2 * step * np.random.default_rng(seed).standard_normal(len(time))
+    return np.asarray(np.maximum.accumulate(stamps) + 1e-9 * np.arange(len(time)))
+
+
+def test_the_tones_tell_a_host_that_stamps_late_from_a_sampler_that_samples_unevenly() -> None:
+    site, log = demo_site(), _log()
+    assert log.waveform is not None
+    imu, waveform = log.imu, log.waveform
+    late = replace(
+        log,
+        imu=ImuSamples(_scattered(imu.time, 1), imu.gyro_body, imu.accel_body),
+        waveform=Waveform(_scattered(waveform.time, 2), waveform.measured_sensor),
+    )
+    mended = on_even_clocks(late, site)
+    assert mended.waveform is not None
+    assert {k: v.replaced for k, v in mended.clocks.items()} == {
+        "imu": True,
+        "magnetometer": True,
+    }
+    assert np.max(np.abs(mended.waveform.time - waveform.time)) < 2e-4  # s
+    # The same stamps, and samples that were taken at them.
+    at = _scattered(waveform.time, 2)
+    values = [np.interp(at, waveform.time, axis) for axis in waveform.measured_sensor.T]
+    uneven = replace(log, waveform=Waveform(at, np.stack(values, axis=1)))
+    kept = on_even_clocks(uneven, site)
+    assert kept.waveform is not None
+    np.testing.assert_array_equal(kept.waveform.time, at)
+    assert not kept.clocks["magnetometer"].replaced
+    assert on_even_clocks(log, site) is log
