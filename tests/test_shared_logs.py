@@ -135,7 +135,9 @@ def test_a_turn_with_a_bad_survey_is_found_and_the_survey_mended(tmp_path: Path)
     assert (
         turn.report["held_aligned_attitude_rmse_deg"] > 1.5 * turn.errors.aligned_attitude_rmse_deg
     )
-    assert turn.report["held_ate_m"] > turn.report["ate_m"]
+    # Where the room itself stands is the mean error of the survey, which no log of it can mend:
+    # the absolute errors of both are as large as they claim, and neither need be the smaller.
+    assert turn.report["ate_m"] < 3.0 * np.sqrt(3.0) * turn.report["position_sigma_median_m"]
 
 
 @needs_shared_logs
