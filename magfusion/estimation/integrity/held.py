@@ -28,7 +28,7 @@ COVERED = 4.0  # mean squared Mahalanobis distance that a covariance of six stil
 HOPELESS = 25.0**2  # beyond which a linear step and its covariance say nothing of where it is
 MOST = 4  # causes that are named
 LEAST_SHARE = 0.03  # of the first cause's chi square; what is less may be its nonlinear rest
-UNCHECKED = 4.0  # chi square of a typical error that stays unnoticed
+UNCHECKED = 4.3**2  # chi square below which one of fifty suspects stays unnoticed
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +202,7 @@ def _length(metres: float) -> str:
 
 def _unverified(case: Case, score: Score) -> list[Unverified]:
     """Return what nothing in the log would contradict, and what it does to the poses."""
-    out = []
+    out, information = [], score.within_tolerance()
     for block in score.held:
         rows = np.arange(len(score.information))[block.columns]
         declared = score.spread[rows]
@@ -210,7 +210,7 @@ def _unverified(case: Case, score: Score) -> list[Unverified]:
         root = np.linalg.cholesky(cov) if np.all(np.diagonal(cov) > 1e-12) else np.eye(len(rows))
         widest = np.where(np.diagonal(root) > 1.0, np.diagonal(root), 1.0)
         value, vector = np.linalg.eigh(
-            widest[:, None] * score.information[np.ix_(rows, rows)] * widest
+            widest[:, None] * information[np.ix_(rows, rows)] * widest
         )
         free = vector[:, value < UNCHECKED]
         if not free.shape[1]:
@@ -218,7 +218,7 @@ def _unverified(case: Case, score: Score) -> list[Unverified]:
         by_pose = score.by_pose[..., rows]
         typical = by_pose @ (widest[:, None] * free)
         solved = np.linalg.solve(case.pose_cov, typical)
-        if np.mean(np.sum(typical * solved, axis=(1, 2))) < 1.0:
+        if np.mean(np.sum(typical * solved, axis=(1, 2))) < COVERED:
             continue
         moved = by_pose @ root
         unit = block.parameter.spoken

@@ -69,16 +69,24 @@ class Score:
             Of what they may be wrong by beyond what is declared.
         gradient : ndarray, shape (h,)
         """
-        tolerance = [np.full(len(b.sigma), TOLERANCE.get(b.parameter, 0.0)) for b in self.held]
-        own = np.concatenate(tolerance) / prior_sigma(self.held)
-        taken = self._taken(np.concatenate([self.spread, np.diag(own)], axis=1))
+        taken = self._taken(np.concatenate([self.spread, self._tolerance()], axis=1))
         left = self.information - self.information @ taken @ self.information
         gradient = self.gradient - self.information @ (taken @ self.gradient)
         return 0.5 * (left + left.T), gradient
 
+    def within_tolerance(self) -> Array:
+        """Return the information of what is held while all have their tolerance, shape (h, h)."""
+        taken = self._taken(self._tolerance())
+        left = self.information - self.information @ taken @ self.information
+        return np.asarray(0.5 * (left + left.T))
+
     def allowed(self, step: Array) -> Array:
         """Return a step with what all else then moves by, as far as its declared sigma allows."""
         return step + self._taken(self.spread) @ (self.gradient - self.information @ step)
+
+    def _tolerance(self) -> Array:
+        own = [np.full(len(b.sigma), TOLERANCE.get(b.parameter, 0.0)) for b in self.held]
+        return np.diag(np.concatenate(own) / prior_sigma(self.held))
 
     def _taken(self, spread: Array) -> Array:
         inner = np.eye(spread.shape[1]) + spread.T @ self.information @ spread
