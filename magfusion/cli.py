@@ -3,7 +3,12 @@
 import errno
 import inspect
 import json
+import os
+import signal
 import sys
+import threading
+import traceback
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import MISSING, Field
@@ -16,11 +21,14 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.files.standard_streams import binary_output, occupy_closed, until_closed
 from magfusion.jobs import GROUPS, JOBS
 from magfusion.jobs.settings import Command, Option, options
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figures
 
+DEBUG = "--debug"
+LONGEST_REASON = 200  # characters, of an error that was not foreseen
 _NAMED_BY_LOG = "; default: the log's name and the job's"
 _NOT_WRITTEN = "; default: nothing is written"
 
@@ -29,31 +37,71 @@ def main(arguments: list[str] | None = None) -> None:
     """Run the command line.
 
     Exits with 0 and the result; with 2 and one sentence for bad input or usage; with 1 and one
-    sentence for an estimator that failed; with 130 where the user interrupted.
+    sentence for an estimator that failed, or for what was not foreseen; with 130 where the user, or
+    SIGTERM, interrupted.  ``--debug``, anywhere, shows where any of them came from.
     """
     given = sys.argv[1:] if arguments is None else arguments
+    debug, status = DEBUG in given, 0
+    given = [part for part in given if part != DEBUG]
+    if arguments is None and not debug:
+        warnings.simplefilter("ignore")  # a library's warnings are no sentence of ours
+    occupy_closed()
     try:
-        status = application()(
-            args=given or ["--help"], prog_name="magfusion", standalone_mode=False
-        )
-    except typer.TyperException as error:
-        context = getattr(error, "ctx", None)
-        command = "magfusion" if context is None else context.command_path
-        _fail(2, f"{error.format_message().rstrip('.')}; see {command} --help")
-    except InputError as error:
-        _fail(2, str(error))
-    except EstimationError as error:
-        _fail(1, str(error))
-    except OSError as error:
-        _fail(2, _file_refusal(error))
-    except MemoryError:
-        _fail(2, "the memory does not suffice; use a shorter part, by --start and --end")
+        with _terminated_as_interrupted(), until_closed():
+            status = application()(
+                args=given or ["--help"], prog_name="magfusion", standalone_mode=False
+            )
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+    except Exception as error:
+        if debug:
+            traceback.print_exc()
+        status, sentence = _said(error)
+        _fail(status, sentence)
     raise SystemExit(status)
 
 
+def _said(error: Exception) -> tuple[int, str]:
+    """Return exit code and sentence of what ended a command."""
+    if isinstance(error, typer.TyperException):
+        context = getattr(error, "ctx", None)
+        command = "magfusion" if context is None else context.command_path
+        return 2, f"{error.format_message().rstrip('.')}; see {command} --help"
+    if isinstance(error, InputError):
+        return 2, str(error)
+    if isinstance(error, EstimationError):
+        return 1, str(error)
+    if isinstance(error, OSError):
+        return 2, _file_refusal(error)
+    if isinstance(error, MemoryError):
+        return 2, "the memory does not suffice; use a shorter part, by --start and --end"
+    reason = " ".join(f"{type(error).__name__}: {error}".split())[:LONGEST_REASON]
+    where = traceback.extract_tb(error.__traceback__)[-1]
+    return 1, (
+        f"stopped by what it did not foresee ({reason}; {Path(where.filename).name}, line"
+        f" {where.lineno}): a fault of magfusion; please report it to its maintainers, with the"
+        f" command, its input, and what it prints with {DEBUG}"
+    )
+
+
+@contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """Let SIGTERM end a command as Ctrl-C does: what is unfinished is removed."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    former = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, former)
+
+
 def _file_refusal(error: OSError) -> str:
-    place = error.filename if error.filename is not None else "a file"
-    remedy = "free some space" if error.errno == errno.ENOSPC else "allow it, or give another path"
+    # Whatever writes a file names it; what is left are the pipes.
+    place = error.filename if error.filename is not None else "standard input or output"
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    remedy = "free some space" if full else "allow it, or give another path"
     return f"{place}: cannot be read or written ({error.strerror or error}); {remedy}"
 
 
@@ -114,6 +162,9 @@ def _options(
             "--version", is_eager=True, callback=_print_version, help="Print the version."
         ),
     ] = False,
+    _debug: Annotated[
+        bool, typer.Option(DEBUG, help="Show where an error came from, in any command.")
+    ] = False,
 ) -> None:
     """Navigate by magnetic beacons and inertial sensors where there is no GNSS."""
 
@@ -125,11 +176,13 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
 
     def run(context: typer.Context, **values: Any) -> None:
         output, as_json = values.pop("output", None), values.pop("as_json", False)
+        if as_json:
+            binary_output()
         own = {field: _value(asked[field], value) for field, value in values.items()}
         settings = command.settings(**own)
         if output is None and "output" in wanted and not command.output_optional:
             # A log's name as the user sees it, even where it was given as ".".
-            log = Path(own["log"]).resolve().name if "log" in own else ""
+            log = Path(os.path.realpath(own["log"])).name if "log" in own else ""
             output = Path(command.output or f"{log}_{path.split()[-1].replace('-', '_')}")
         earlier = _stamp(output)
         with _progress() as report:
@@ -264,6 +317,9 @@ def _show_result(figures: Figures, output: Path | None, as_json: bool) -> None:
     """Show the figures of a job as a table, and as the last line in JSON where that is asked."""
     from magfusion.results.screen import show
 
-    show(figures, output)
-    if as_json:
-        sys.stdout.write(json.dumps(dict(figures), default=float) + "\n")
+    if sys.stdout is None:
+        return
+    with until_closed():
+        show(figures, output)
+        if as_json:
+            sys.stdout.write(json.dumps(dict(figures), default=float) + "\n")

@@ -53,7 +53,7 @@ def change_table(path: Path, change: Callable[[dict[str, Any]], object]) -> None
 def _listing(root: Path) -> dict[str, tuple[int, int]]:
     found = {}
     for path in root.rglob("*"):  # hidden names too
-        stat = path.stat()
+        stat = path.lstat()
         found[str(path.relative_to(root))] = (stat.st_size, stat.st_mtime_ns)
     return found
 

@@ -1,12 +1,17 @@
-"""Directories appear whole or not at all; for single files see `yaml_files.whole_file`."""
+"""Files and directories appear whole or not at all."""
 
 import os
+import platform
+import re
 import shutil
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from magfusion.errors import InputError
+
+UNFINISHED, FORMER = "unfinished", "former"  # what is written, and what it replaces, meanwhile
 
 
 def refuse_in_the_way(path: Path, replaces: Callable[[Path], bool]) -> None:
@@ -17,6 +22,8 @@ def refuse_in_the_way(path: Path, replaces: Callable[[Path], bool]) -> None:
     InputError
         As `whole_directory`.
     """
+    if path.is_symlink() and not path.exists():
+        raise InputError(f"{path}: is a symbolic link that leads nowhere; give another path.")
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; give the path of a directory to write.")
     if path.exists() and any(path.iterdir()) and not replaces(path):
@@ -24,6 +31,87 @@ def refuse_in_the_way(path: Path, replaces: Callable[[Path], bool]) -> None:
     nearest = next(parent for parent in (path, *path.parents) if parent.exists())
     if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
         raise InputError(f"{path}: cannot be written in {nearest}; give another path.")
+
+
+def real(path: Path) -> Path:
+    """Return a path without symbolic links, but for those that lead nowhere."""
+    return Path(os.path.realpath(path))
+
+
+@contextmanager
+def naming(path: Path, unfinished: Path | None = None) -> Iterator[None]:
+    """Name the path in errors of a system that does not say of which file they are.
+
+    Parameters
+    ----------
+    unfinished : Path, optional
+        What it is called while it is written; a user knows no such name.
+    """
+    try:
+        yield
+    except OSError as error:
+        named = str(path) if error.filename is None else str(error.filename)
+        error.filename = named if unfinished is None else named.replace(str(unfinished), str(path))
+        raise
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary name beside ``path`` that takes its place only if nothing fails."""
+    clear_abandoned(path)
+    unfinished = _beside(path, UNFINISHED)
+    try:
+        with naming(path, unfinished):
+            yield unfinished
+            unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def clear_abandoned(path: Path) -> None:
+    """Remove what a run that was killed left beside ``path``; give back what it had moved away."""
+    own = re.compile(abandoned_pattern(re.escape(path.name)))
+    for left in _entries(path.parent):
+        found = own.fullmatch(left.name)
+        if found is None or found["machine"] != _machine() or _runs(int(found["process"])):
+            continue
+        if found["kind"] == FORMER and not os.path.lexists(path):
+            left.rename(path)
+        elif left.is_dir():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.unlink(missing_ok=True)
+
+
+def abandoned_pattern(name: str) -> str:
+    """Return the regular expression of names beside one that is being written, itself one."""
+    kinds = f"{UNFINISHED}|{FORMER}"
+    return rf"\.{name}\.(?P<machine>[0-9a-f]{{8}})-(?P<process>\d+)\.(?P<kind>{kinds})"
+
+
+def _beside(path: Path, kind: str) -> Path:
+    return path.with_name(f".{path.name}.{_machine()}-{os.getpid()}.{kind}")
+
+
+def _machine() -> str:
+    # On a disk of several machines the number of a process says nothing of those elsewhere.
+    return f"{zlib.crc32(platform.node().encode()):08x}"
+
+
+def _entries(directory: Path) -> list[Path]:
+    with suppress(OSError):
+        return list(directory.iterdir())
+    return []
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        return True  # another user's
+    return True
 
 
 @contextmanager
@@ -40,14 +128,16 @@ def whole_directory(path: Path, replaces: Callable[[Path], bool]) -> Iterator[Pa
     InputError
         Where something else is at ``path``, or nothing can be written there.
     """
-    path = path.resolve()
+    path = real(path)
     refuse_in_the_way(path, replaces)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    clear_abandoned(path)
+    unfinished = _beside(path, UNFINISHED)
     made = [parent for parent in path.parents if not parent.exists()]
     try:
         _make(unfinished)
-        yield unfinished
-        _take_place(unfinished, path)
+        with naming(path, unfinished):
+            yield unfinished
+            _take_place(unfinished, path)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
         if not path.exists():
@@ -73,7 +163,7 @@ def _take_place(unfinished: Path, path: Path) -> None:
     if not path.exists():
         unfinished.rename(path)
         return
-    former = unfinished.with_name(f"{unfinished.name}.former")
+    former = _beside(path, FORMER)
     path.rename(former)
     try:
         unfinished.rename(path)

@@ -10,9 +10,10 @@ import pyarrow.parquet
 from pydantic import Field, ValidationError
 
 from magfusion.errors import InputError
+from magfusion.files.atomic import whole_file
 from magfusion.files.plausible import check_field
 from magfusion.files.table import TIME, Span, write_table
-from magfusion.files.yaml_files import StrictModel, whole_file
+from magfusion.files.yaml_files import StrictModel
 from magfusion.units import DEGREE, Array, BoolArray
 
 Angles = Literal["roll", "roll-pitch"]

@@ -19,7 +19,7 @@ import msgpack
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.files.yaml_files import whole_file
+from magfusion.files.atomic import whole_file
 from magfusion.units import AnyArray
 
 MAGIC = b"magfusion state\n"

@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet
 
 from magfusion.errors import InputError
-from magfusion.files.yaml_files import whole_file
+from magfusion.files.atomic import whole_file
 from magfusion.model.field_map import COMPONENTS, FieldMap
 from magfusion.units import Array
 

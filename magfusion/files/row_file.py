@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.ipc
 
 from magfusion.errors import InputError
-from magfusion.files.yaml_files import whole_file
+from magfusion.files.atomic import whole_file
 from magfusion.units import Array
 
 _KIND = {b"magfusion": b"rows"}  # by which an own file is known

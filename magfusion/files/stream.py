@@ -12,12 +12,17 @@ from pydantic import ConfigDict, Field, PlainValidator, ValidationError, model_v
 from pydantic_core import PydanticCustomError
 
 from magfusion.errors import InputError
+from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS
 from magfusion.files.yaml_files import StrictModel, sentence
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.units import Array, ComplexArray
 
 Format = Literal["json", "msgpack"]
 _CHUNK = 1 << 16  # bytes
+LARGEST_RECORD = 1 << 24  # bytes; minutes of samples
+# MessagePack reserves what a list announces before it reads it.
+LONGEST_LIST = 1 << 17
+LATEST = 1e-9 * LARGEST_TIME_NS  # s
 
 
 def _numbers(value: object, what: str) -> Array:
@@ -26,14 +31,14 @@ def _numbers(value: object, what: str) -> Array:
         found = np.asarray(value)
     except ValueError:
         found = np.empty(0, dtype=object)
-    if found.dtype.kind not in "iuf" or not np.all(np.isfinite(found)):
+    if found.dtype.kind not in "iuf" or not np.all(np.abs(found) < LARGEST_NUMBER):
         raise PydanticCustomError("numbers", "it should be {what}, finite", {"what": what})
     return np.asarray(found, dtype=float)
 
 
 def _times(value: object) -> Array:
     found = np.atleast_1d(_numbers(value, "a time in seconds, or a list of them"))
-    if found.ndim != 1:
+    if found.ndim != 1 or not np.all(np.abs(found) <= LATEST):
         raise PydanticCustomError("times", "it should be a time in seconds, or a list of them")
     return found
 
@@ -105,10 +110,10 @@ class FieldsRecord(_Arrays):
     ``covariance`` takes its place where the axes differ.
     """
 
-    time: float
-    window: float = Field(gt=0.0)
+    time: float = Field(ge=-LATEST, le=LATEST)
+    window: float = Field(ge=1e-6, le=3600.0)
     phasors: dict[str, Annotated[ComplexArray, PlainValidator(_phasor)]]
-    sigma: float | None = Field(default=None, gt=0.0)
+    sigma: float | None = Field(default=None, ge=1e-30, le=1.0)
     covariance: dict[str, Annotated[Array, PlainValidator(_covariance)]] | None = None
 
     @model_validator(mode="after")
@@ -195,26 +200,55 @@ def read_records(stream: BinaryIO, form: Format) -> Iterator[Numbered]:
     Raises
     ------
     InputError
-        Where MessagePack breaks off inside: it is unknown where the next record begins.
+        Where MessagePack is none, or a record of it too large: it is unknown where the next begins.
     """
-    if form == "json":
-        for number, line in enumerate(stream, 1):
-            if line.strip():
-                yield _checked(number, partial(Record.model_validate_json, line))
-        return
-    number, unpacker = 0, msgpack.Unpacker()
+    return _json_records(stream) if form == "json" else _msgpack_records(stream)
+
+
+def _json_records(stream: BinaryIO) -> Iterator[Numbered]:
+    number = 0
+    while line := stream.readline(LARGEST_RECORD + 1):
+        number += 1
+        if len(line) > LARGEST_RECORD:
+            while line and not line.endswith(b"\n"):
+                line = stream.readline(_CHUNK)
+            yield Numbered(number, None, _TOO_LARGE)
+        elif line.strip():
+            yield _checked(number, partial(Record.model_validate_json, line))
+
+
+_TOO_LARGE = f"is larger than {LARGEST_RECORD >> 20} MiB; write fewer samples in a record."
+
+
+def _msgpack_records(stream: BinaryIO) -> Iterator[Numbered]:
+    number, fed = 0, 0
+    unpacker = msgpack.Unpacker(
+        max_buffer_size=LARGEST_RECORD + _CHUNK,
+        max_str_len=LARGEST_RECORD,
+        max_bin_len=LARGEST_RECORD,
+        max_array_len=LONGEST_LIST,
+        max_map_len=LONGEST_LIST,
+    )
     # As much as has come: read() would wait for all of a chunk.
     while chunk := stream.read1(_CHUNK):  # type: ignore[attr-defined]
-        unpacker.feed(chunk)
         try:
+            unpacker.feed(chunk)
+            fed += len(chunk)
             for content in unpacker:
                 number += 1
                 yield _checked(number, partial(Record.model_validate, content))
-        except (ValueError, msgpack.UnpackException) as error:
+        except msgpack.BufferFull as error:
+            raise InputError(f"{_RECORD} {number + 1}: {_TOO_LARGE}") from error
+        except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
+            reason = str(error) or type(error).__name__
             raise InputError(
-                f"standard input, record {number + 1}: is no MessagePack ({error}); write whole"
-                " records"
+                f"{_RECORD} {number + 1}: is no MessagePack ({reason}); write whole records"
             ) from error
+    if unpacker.tell() < fed:
+        raise InputError(f"{_RECORD} {number + 1}: breaks off inside; write whole records")
+
+
+_RECORD = "standard input, record"
 
 
 def _checked(number: int, read: Callable[[], Record]) -> Numbered:

@@ -10,7 +10,7 @@ import pyarrow.parquet
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.files.yaml_files import whole_file
+from magfusion.files.atomic import whole_file
 from magfusion.units import Array, ComplexArray, IntArray
 
 _POSITION = ("position_x", "position_y", "position_z")

@@ -11,7 +11,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from magfusion.errors import InputError
-from magfusion.files.yaml_files import whole_file
+from magfusion.files.atomic import whole_file
 from magfusion.units import NANOSECOND, AnyArray, Array, IntArray
 
 TIME = "time_ns"

@@ -7,9 +7,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.files.atomic import whole_file
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
-from magfusion.files.yaml_files import whole_file
 from magfusion.model.trajectory import Trajectory
 
 _COLUMNS = "time_s x y z qx qy qz qw"

@@ -1,9 +1,6 @@
-"""Files appear whole or not at all, and YAML is checked against a model before it is believed."""
+"""YAML is checked against a model before it is believed."""
 
-import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -11,6 +8,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from magfusion.errors import InputError
+from magfusion.files.atomic import whole_file
 
 LARGEST_YAML = 1 << 20  # bytes
 
@@ -21,17 +19,6 @@ class StrictModel(BaseModel):
     """Refuses unknown keys, converts nothing, and takes finite numbers only."""
 
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
-
-
-@contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary name beside ``path`` that takes its place only if nothing fails."""
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        yield unfinished
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
 
 
 def read_yaml(path: Path, model: type[Model]) -> Model:

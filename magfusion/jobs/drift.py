@@ -94,6 +94,7 @@ def run_drift(settings: DriftSettings, output: Path, report: Report | None = Non
     EstimationError
         Where an estimator finds no start.
     """
+    from magfusion.files.atomic import real
     from magfusion.files.checkpoint import read_position
     from magfusion.jobs.drift_world import claim_place, run_world
     from magfusion.jobs.inputs import UNFINISHED_DRIFT, claim
@@ -103,7 +104,7 @@ def run_drift(settings: DriftSettings, output: Path, report: Report | None = Non
     from magfusion.simulation.monte_carlo import run_many
 
     claimed = claim(output, "drift")
-    place = output.resolve() / UNFINISHED_DRIFT
+    place = real(output) / UNFINISHED_DRIFT
     tasks = settings.tasks(place)
     claim_place(place)
     if settings.resume:

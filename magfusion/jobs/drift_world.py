@@ -17,6 +17,7 @@ from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.preintegration import preintegration_parameters
 from magfusion.estimation.state import ACCEL_BIAS, GYRO_BIAS, State, pose_of
+from magfusion.files.atomic import abandoned_pattern
 from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
 from magfusion.files.row_file import Mark, RowFile, claim_rows
 from magfusion.jobs.checkpoint import begin, save
@@ -295,5 +296,5 @@ def claim_place(place: Path) -> None:
             claim_checkpoint(path)
         elif path.name in (_ERROR_ROWS, _PACE_ROWS):
             claim_rows(path)
-        elif not re.fullmatch(r"\.(progress\.bin|(errors|pace)\.rows)\.\d+", path.name):
+        elif not re.fullmatch(abandoned_pattern(r"(progress\.bin|(errors|pace)\.rows)"), path.name):
             raise InputError(f"{path}: is not of an unfinished drift run and is kept; move it away")

@@ -9,7 +9,12 @@ from pathlib import Path
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.integrity.mending import mended
-from magfusion.files.atomic import refuse_in_the_way, whole_directory
+from magfusion.files.atomic import (
+    abandoned_pattern,
+    real,
+    refuse_in_the_way,
+    whole_directory,
+)
 from magfusion.files.bag import Topics
 from magfusion.files.fields import order_channels
 from magfusion.files.open import open_log
@@ -86,7 +91,8 @@ def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
     """Return whether a directory holds nothing but an earlier result of these jobs."""
     found = {entry.name for entry in path.iterdir()}
     # A checkpoint that was being written when its run was killed.
-    found = {name for name in found if not re.fullmatch(r"\.checkpoint\.(bin|rows)\.\d+", name)}
+    abandoned = re.compile(abandoned_pattern(r"checkpoint\.(bin|rows)"))
+    found = {name for name in found if not abandoned.fullmatch(name)}
     if any(found <= _UNFINISHED.get(kind, set()) for kind in kinds):
         return True
     try:
@@ -111,7 +117,7 @@ def claim(output: Path, *kinds: str) -> AbstractContextManager[Path]:
     def replaces(path: Path) -> bool:
         return _may_be_replaced(path, kinds)
 
-    refuse_in_the_way(output.resolve(), replaces)
+    refuse_in_the_way(real(output), replaces)
     return whole_directory(output, replaces)
 
 

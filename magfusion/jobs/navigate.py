@@ -95,8 +95,8 @@ def run(
 
 
 def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
+    from magfusion.files.standard_streams import binary_input, binary_output, until_closed
     from magfusion.jobs.inputs import Job
-    from magfusion.jobs.replay import until_closed
     from magfusion.jobs.stream import StreamSettings, run_stream
 
     if settings.site is None:
@@ -116,7 +116,7 @@ def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
         settings.resume,
     )
     with until_closed():
-        run_stream(settings.site, chosen, sys.stdin.buffer, sys.stdout.buffer, sys.stderr)
+        run_stream(settings.site, chosen, binary_input(), binary_output(), sys.stderr)
 
 
 def run_navigate(settings: NavigateSettings, output: Path, report: Report = quiet) -> Figures:

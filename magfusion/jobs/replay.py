@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -142,17 +139,6 @@ def run_replay(log: Log, sink: BinaryIO, form: Format, realtime: bool) -> None:
     sink.flush()
 
 
-@contextmanager
-def until_closed() -> Iterator[None]:
-    """End in peace where the reader of the output has gone."""
-    try:
-        yield
-    except BrokenPipeError:
-        # Python would complain once more when it flushes at its end.
-        with suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
 @dataclass(frozen=True, kw_only=True)
 class ReplaySettings(PartSettings, ReplayedSettings):
     """How a log is printed."""
@@ -161,11 +147,13 @@ class ReplaySettings(PartSettings, ReplayedSettings):
 def run(settings: ReplaySettings) -> None:
     """Print a log as records; see `run_replay`."""
     from magfusion.files.open import open_log
+    from magfusion.files.standard_streams import binary_output, until_closed
     from magfusion.jobs.inputs import topics_option
 
+    sink = binary_output()
     found = open_log(settings.log, settings.start, settings.end, topics_option(settings.topics))
     with until_closed():
-        run_replay(found, sys.stdout.buffer, settings.form, settings.realtime)
+        run_replay(found, sink, settings.form, settings.realtime)
 
 
 COMMAND = Command(ReplaySettings, run, reports=False)

@@ -1,6 +1,5 @@
 """Recordings for the rerun viewer: the scene in three dimensions beside the error plots."""
 
-import os
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -13,10 +12,12 @@ import rerun.blueprint as rrb
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.files.atomic import real
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import StateTrust, Trust
 from magfusion.results.errors import TrajectoryErrors
+from magfusion.results.recording_file import whole_recording
 from magfusion.results.recording_plots import (
     AXES,
     TIMELINE,
@@ -85,11 +86,7 @@ def write_recording(
         Of the states of the trajectory: protection levels and where it is in doubt.
     """
     scale = scene_scale(site, trajectory)
-    unfinished = path.with_name(f".{os.getpid()}.{path.name}")
-    recording = rr.RecordingStream("magfusion")
-    recording.save(unfinished)
-    try:
-        recording.send_recording_name(path.resolve().parent.name)
+    with whole_recording(path, real(path).parent.name) as recording:
         log_beacons(recording, site, scale)
         _log_path(recording, "world/estimate", trajectory, _ESTIMATE, 1.2)
         _log_body(recording, trajectory, scale)
@@ -112,11 +109,6 @@ def write_recording(
         _log_legend(recording, trajectory, truth is not None, bool(innovations), levels, scale)
         shown = _Shown(errors is not None, bool(innovations), levels, trust is not None)
         recording.send_blueprint(_blueprint(site, trajectory, shown, scale))
-        recording.disconnect()
-        unfinished.replace(path)
-    finally:
-        recording.disconnect()
-        unfinished.unlink(missing_ok=True)
 
 
 def open_viewer(path: Path) -> None:

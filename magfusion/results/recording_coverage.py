@@ -9,6 +9,7 @@ import rerun.blueprint as rrb
 from magfusion.model.site import Beacon, Site
 from magfusion.results.coverage import Coverage
 from magfusion.results.recording import eye_on, layout, log_beacons
+from magfusion.results.recording_file import whole_recording
 from magfusion.results.shapes import Scale
 from magfusion.units import Array
 
@@ -40,10 +41,7 @@ def write_coverage_recording(
     places = np.vstack([found.position_world, *(b.position_world for b in site.beacons)])
     low, high = places.min(axis=0), places.max(axis=0)
     scale = Scale(0.5 * (low + high), max(float(np.linalg.norm(high - low)), 1.0), 1)
-    recording = rr.RecordingStream("magfusion")
-    recording.save(path)
-    try:
-        recording.send_recording_name("coverage")
+    with whole_recording(path, "coverage") as recording:
         log_beacons(recording, site, scale)
         _log_points(recording, found, spacing)
         if extra is not None:
@@ -57,8 +55,6 @@ def write_coverage_recording(
         legend = rr.TextDocument(_legend(found, extra), media_type=rr.MediaType.MARKDOWN)
         recording.log("legend", legend, static=True)
         recording.send_blueprint(_blueprint(scale))
-    finally:
-        recording.disconnect()
 
 
 def _bounds(found: Coverage) -> Array:

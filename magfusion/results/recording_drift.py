@@ -8,6 +8,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from magfusion.results.drift import HOUR, QUANTITIES, Course
+from magfusion.results.recording_file import whole_recording
 from magfusion.units import Array
 
 MOST_POINTS = 5000  # of a series
@@ -17,10 +18,7 @@ _SIGMA = [150, 150, 150]
 
 def write_drift_recording(path: Path, courses: list[Course], figures: Mapping[str, object]) -> None:
     """Write a recording of errors, memory and times over the simulated hours."""
-    recording = rr.RecordingStream("magfusion")
-    recording.save(path)
-    try:
-        recording.send_recording_name("drift")
+    with whole_recording(path, "drift") as recording:
         for course in courses:
             _log_errors(recording, course)
             _log_consistency(recording, course)
@@ -32,8 +30,6 @@ def write_drift_recording(path: Path, courses: list[Course], figures: Mapping[st
         )
         recording.log("verdict", legend, static=True)
         recording.send_blueprint(_blueprint(courses))
-    finally:
-        recording.disconnect()
 
 
 def _log_errors(recording: rr.RecordingStream, course: Course) -> None:

@@ -1,0 +1,158 @@
+"""What single values of a site's file may be: types, bounds, and what is said of others."""
+
+import datetime
+import math
+import sys
+from typing import Any
+
+import numpy as np
+from pydantic import AfterValidator, PlainValidator, ValidationError
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from magfusion.units import Array
+
+# What no installation reaches and any value written in nT by mistake exceeds.
+LARGEST_EARTH_FIELD = 1e-3  # T
+LARGEST_OFFSET = 1e-2  # T
+LARGEST_NOISE_DENSITY = 1e-4  # T/sqrt(Hz)
+
+LARGEST_DISTANCE = 1e6  # m
+LARGEST_ANGLE = 1e4  # degrees; a few turns do no harm
+LOWEST_FREQUENCY, HIGHEST_FREQUENCY = 1e-2, 1e6  # Hz
+LARGEST_MOMENT, SMALLEST_MOMENT = 1e9, 1e-9  # A m^2
+LARGEST_LOG_MOMENT = 10.0  # a factor of 22,000
+LEAST_SIGMA = 1e-15  # in any unit; what is known better is known, which is zero
+SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3  # of a magnetometer matrix
+LARGEST_CONDITION = 1e6  # of a magnetometer matrix that can be undone to any use
+
+
+def refusal(remedy: str) -> PydanticCustomError:
+    """Return what a validator raises: only the remedy, as place and value are known."""
+    return PydanticCustomError("site", "{remedy}", {"remedy": remedy})
+
+
+def refusal_at(key: tuple[str | int, ...], found: object, remedy: str) -> ValidationError:
+    """Return the refusal of a value that a validator of its mapping found."""
+    detail = InitErrorDetails(type=refusal(remedy), loc=key, input=found)
+    return ValidationError.from_exception_data("site", [detail])
+
+
+def _fits(value: object, shape: tuple[int, ...]) -> bool:
+    if isinstance(value, list):
+        same_length = bool(shape) and len(value) == shape[0]
+        return same_length and all(_fits(v, shape[1:]) for v in value)
+    if shape or isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) <= sys.float_info.max
+
+
+_LISTS = {(3,): "a list of 3 numbers", (3, 3): "3 lists of 3 numbers"}
+
+
+def array(*shape: int, largest: float = math.inf, unit: str = "") -> PlainValidator:
+    """Return a reader of finite numbers in nested lists of a shape, none larger in size."""
+
+    def read(value: object) -> Array:
+        if not _fits(value, shape):
+            raise refusal(f"give {_LISTS[shape]}, all finite")
+        array = np.array(value, dtype=float)
+        if np.max(np.abs(array)) > largest:
+            raise refusal(f"give {_LISTS[shape]}, in size at most {largest:g} {unit}".rstrip())
+        return array
+
+    return PlainValidator(read)
+
+
+def sigma_array(*shape: int, largest: float) -> PlainValidator:
+    """Return a reader of one standard deviation for all, or one for each of a shape."""
+
+    def read(value: object) -> Array:
+        return np.broadcast_to(_spread(value, shape, _LISTS[shape], largest), shape).copy()
+
+    return PlainValidator(read)
+
+
+def coil_sigma(value: object) -> Array:
+    """Read one standard deviation for all coils, or one a coil."""
+    coils = len(value) if isinstance(value, list) else 1
+    return _spread(value, (coils,), "a list of one per coil", LARGEST_LOG_MOMENT)
+
+
+def _spread(value: object, shape: tuple[int, ...], lists: str, largest: float) -> Array:
+    if _fits(value, ()) or _fits(value, shape):
+        array = np.array(value, dtype=float)
+        known = array == 0.0
+        if np.all(known | ((array >= LEAST_SIGMA) & (array <= largest))):
+            return array
+    raise refusal(
+        f"give one number or {lists}, finite and not negative, at most {largest:g}; 0 for what is"
+        " known"
+    )
+
+
+def a_moment(value: Array) -> Array:
+    """Refuse a moment that no coil has."""
+    if not value.any():
+        raise refusal("give the peak moment in A m^2, not zero; remove a coil that is not driven")
+    if not SMALLEST_MOMENT <= math.hypot(*value) <= LARGEST_MOMENT:
+        raise refusal(
+            f"give the peak moment in A m^2, from {SMALLEST_MOMENT:g} to {LARGEST_MOMENT:g}"
+        )
+    return value
+
+
+def not_singular(value: Array) -> Array:
+    """Refuse a matrix that cannot be undone."""
+    if not np.linalg.cond(value) <= LARGEST_CONDITION:
+        raise refusal("give a matrix that can be inverted")
+    if not np.linalg.norm(value, 2) >= SMALLEST_SCALE:
+        raise refusal("give a matrix of tesla by tesla, near the identity")
+    return value
+
+
+def tesla(largest: float, unit: str = "T") -> AfterValidator:
+    """Return a check that a value is not in nanotesla by mistake."""
+
+    def check(value: Any) -> Any:
+        if math.hypot(*np.ravel(value)) > largest:
+            raise refusal(f"give it in {unit}, not n{unit} (at most {largest:g} {unit})")
+        return value
+
+    return AfterValidator(check)
+
+
+def at_least_one(what: str) -> AfterValidator:
+    """Return a check that a list is not empty."""
+
+    def check(value: list[Any]) -> list[Any]:
+        if not value:
+            raise refusal(f"describe at least one {what}")
+        return value
+
+    return AfterValidator(check)
+
+
+def first_version(value: int) -> int:
+    """Refuse another version of the format."""
+    if value != 1:
+        raise refusal("write 1, the version of the format that this magfusion reads")
+    return value
+
+
+def iso_date(value: object) -> str:
+    """Read a date."""
+    try:
+        return datetime.date.fromisoformat(str(value)).isoformat()
+    except ValueError:
+        raise refusal("give a date as YYYY-MM-DD") from None
+
+
+def between(least: float, most: float) -> AfterValidator:
+    """Return a check of bounds, themselves allowed."""
+
+    def check(value: float) -> float:
+        if not least <= value <= most:
+            raise refusal(f"it should lie between {least:g} and {most:g}")
+        return value
+
+    return AfterValidator(check)
