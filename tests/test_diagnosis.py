@@ -1,15 +1,25 @@
 """A mistake names itself on a short log; a clean log names none."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import mistake_case
+import numpy as np
 import pytest
 from mistake_case import Case, good_case, simulated
 from mistake_list import MISTAKES
 
-from magfusion.estimation.integrity.diagnosis import cause_of, diagnosed, seen_in_streams
+from magfusion.estimation.demodulation import demodulated
+from magfusion.estimation.integrity.diagnosis import (
+    cause_of,
+    diagnosed,
+    seen_in_streams,
+    with_cause,
+)
 from magfusion.estimation.integrity.explanation import Explanation, clearly_best
+from magfusion.estimation.integrity.motion_comparison import compared, surveyed
 from magfusion.estimation.integrity.recording import recorded
+from magfusion.model.parameters import initial_calibration
 from magfusion.model.trust import CODES, Finding, Trust, Verdict
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig
@@ -21,6 +31,8 @@ SECONDS = 16.0
 NAMED = {
     "phase_sign": "phase_sign",
     "coil_reversed": "coil_reversed",
+    "beacon_reversed": "coil_reversed",
+    "frequency_10mhz": "beacon_clock",
     "coils_swapped_all": "coils_swapped",
     "positions_swapped": "beacons_swapped",
     "moments_rms": "moment_units",
@@ -53,7 +65,14 @@ NAMED = {
 }
 
 
-QUICK = ("coil_reversed", "moments_rms", "moved_50cm", "gyro_sign", "gravity_removed", "epoch_12ms")
+QUICK = (
+    "beacon_reversed",
+    "moments_rms",
+    "moved_50cm",
+    "gyro_sign",
+    "gravity_removed",
+    "epoch_12ms",
+)
 
 
 @lru_cache(maxsize=1)
@@ -124,6 +143,44 @@ def test_of_two_causes_that_explain_alike_none_is_named() -> None:
     assert clearly_best([one, Explanation("moments", "", "", 5000.0, 400.0, 400.0)]) is one
     assert clearly_best([Explanation("phase", "", "", 500.0, 400.0, 400.0)]) is None
     assert clearly_best([]) is None
+
+
+def test_what_says_why_comes_before_what_only_says_where() -> None:
+    without = Explanation("beacon_fault", "", "", 5000.0, 80.0, 400.0, 3, "B", catch_all=True)
+    clock = Explanation("beacon_clock", "", "", 5000.0, 98.0, 400.0, 2, "B")
+    assert clearly_best([without, clock]) is clock
+    assert clearly_best([without, replace(clock, beacon="")]) is not without
+    # Which of two beacons it is, neither tells.
+    assert clearly_best([without, replace(clock, beacon="A")]) is None
+    # What leaves more than noise does not explain what the beacon's absence does.
+    assert clearly_best([without, replace(clock, after=300.0)]) is without
+
+
+def test_a_line_that_is_seen_comes_before_a_beacon_that_is_only_false() -> None:
+    case = MISTAKES["line_on_tone"].change(_short())
+    line = Finding("undeclared_line", "A line beside the tone of beacon B.")
+    trust = with_cause(Trust((line,)), case.log, case.site)
+    assert [finding.code for finding in trust.reasons] == ["undeclared_line", "beacon_fault"]
+
+
+def test_errors_of_a_rough_survey_are_no_contradiction_of_the_inertial_sensor() -> None:
+    site = good_case("rough", 3).site
+    config = SimulationConfig(box_world=DEMO_BOX_WORLD, duration=SECONDS, motion="turn")
+    case = simulated(site, config, seed=3)
+    samples = demodulated(case.log, site).fields
+    every = surveyed(samples, initial_calibration(site, float(np.mean(samples.time))))
+    known = compared(every, case.log.imu, site)
+    taken_for_sure = compared(
+        replace(every, by_survey=np.zeros((*every.by_survey.shape[:2], 0))), case.log.imu, site
+    )
+    assert known is not None
+    assert taken_for_sure is not None
+    assert known.explained(np.eye(3), np.eye(3))[0] < known.freedom
+    assert taken_for_sure.explained(np.eye(3), np.eye(3))[0] > 2.0 * known.freedom
+    wrong = MISTAKES["lever_20cm"].change(case)
+    found = cause_of(wrong.log, wrong.site)
+    assert found is not None
+    assert found[0].code == "lever_arm"
 
 
 @pytest.mark.slow

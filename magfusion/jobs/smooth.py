@@ -225,7 +225,7 @@ def _save_fixes_instead(
     import numpy as np
 
     from magfusion.estimation.demodulation import first_fixes, phasors
-    from magfusion.estimation.integrity.diagnosis import FIRST, with_cause
+    from magfusion.estimation.integrity.diagnosis import OF_CATCH_ALL, with_cause
     from magfusion.estimation.integrity.recording import BRIDGED, recorded
     from magfusion.jobs.fix import write_fix_result
     from magfusion.jobs.inputs import found_in
@@ -246,7 +246,7 @@ def _save_fixes_instead(
     trust = Trust((none, *recorded(log, site, BRIDGED, beacons=True)))
     if code != "geometry":  # of poses that no epoch determines nothing can be tried
         trust = with_cause(trust, log, site, settings.lockin)
-    if trust.ordered[0].weight == FIRST:
+    if trust.ordered[0].weight >= OF_CATCH_ALL:
         reason = trust.ordered[0].text.rstrip(".")
     figures = heading("smooth", log.name) | trust_figures(trust)
     figures |= Figures(Figure("failed", reason, section=Section.REPORT))

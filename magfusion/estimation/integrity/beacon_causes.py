@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.integrity.explanation import LEAST_FALL, Explanation
+from magfusion.estimation.integrity.explanation import Explanation
 from magfusion.estimation.integrity.field_causes import (
     LENGTH_FACTORS,
     MOMENT_FACTORS,
@@ -33,7 +33,6 @@ WORSE = 6.0  # times its sigmas, that a survey may be wrong
 SURVEYED = 0.3  # of chi square's freedom, that a survey leaves: snapshots weigh by its sigmas too
 MISFIT = 1.2  # chi square of snapshots over its freedom, above which fields are not explained
 SILENT = 0.2  # of the field that is expected
-ALIKE = 1.5  # times the chi square without a beacon, that a mistake in it may leave
 STEADY = 0.05  # spread of a gain over time that is none
 WIDE = (0.5, 1.0, 0.7, 3.0)  # sigmas: position (m), rotation (rad), log moment, phase (rad)
 
@@ -48,7 +47,8 @@ def beacon_causes(known: Snapshots) -> Iterator[Explanation]:
     for name in ranked[:SUSPECTS]:
         # No mistake in a beacon explains more than to leave it out.
         if _explained(known, left[name].chi_square, 0, "phase", "", "").clear:
-            yield from _of_one(known, left[name], name)
+            for one in _of_one(known, left[name], name):
+                yield replace(one, beacon=name)
 
 
 def matrix_causes(known: Snapshots, steady: float | None) -> Iterator[Explanation]:
@@ -156,7 +156,7 @@ def _of_one(known: Snapshots, left: Snapshots, name: str) -> Iterator[Explanatio
     yield from steady
     fault = _fault(known, left, name, gain)
     # Whatever is wrong with a beacon, to leave it out explains it.
-    if min(one.after for one in steady) > ALIKE * fault.after + LEAST_FALL / 2.0:
+    if not any(one.as_well_as(fault) for one in steady):
         yield fault
 
 
@@ -259,11 +259,12 @@ def _fault(known: Snapshots, left: Snapshots, name: str, gain: Array) -> Explana
     worst = 100.0 * float(np.nanmax(np.abs(gain - 1.0)))
     size = f"by up to {worst:.2g} %" if worst < 1e3 else "altogether"
     cause = f"the field of beacon {name} is false {size}"
-    if abs(usual - 1.0) < STEADY and 2 <= np.sum(false) < 0.8 * np.sum(np.isfinite(gain)):
+    passes = abs(usual - 1.0) < STEADY and 2 <= np.sum(false) < 0.8 * np.sum(np.isfinite(gain))
+    if passes:
         cause += f" {_when(known.samples.time, false)}"
     else:
         cause += ", in a way that no place and no strength of it explains"
-    return _explained(
+    fault = _explained(
         known,
         left.chi_square * known.freedom / max(left.freedom, 1.0),
         3,
@@ -271,6 +272,7 @@ def _fault(known: Snapshots, left: Snapshots, name: str, gain: Array) -> Explana
         cause,
         "Check its supply and what is near it; leave it out.",
     )
+    return replace(fault, catch_all=not passes)
 
 
 def _when(time: Array, chosen: BoolArray) -> str:

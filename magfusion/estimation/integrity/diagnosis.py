@@ -27,9 +27,8 @@ from magfusion.estimation.integrity.motion_causes import (
     motion_causes,
     timing_causes,
 )
-from magfusion.estimation.integrity.motion_comparison import compared
+from magfusion.estimation.integrity.motion_comparison import compared, surveyed
 from magfusion.estimation.integrity.phase_causes import phase_causes
-from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
@@ -52,8 +51,10 @@ OF_SAMPLES = {
 # What the streams show themselves, which comes before what follows of it.
 # What gravity, field and gyroscope are sure of where they fail a log, whatever follows of it.
 OF_COMPASSES = {"accel_units", "gravity_missing", "gravity_sign", "gyro_sign", "gyro_units"}
-SEEN = OF_SAMPLES | {"low_signal", "samples_lost", "silent_beacon", "undeclared_line"}
+SEEN = OF_SAMPLES | {"low_signal", "mains", "samples_lost", "silent_beacon", "undeclared_line"}
 FIRST = 1e6  # weight: a cause comes before what it causes
+OF_SEEN = FIRST / 2.0  # and before what the streams show, which may be beside it
+OF_CATCH_ALL = FIRST / 4.0  # but what only says where something is wrong may be of what they show
 LONGEST = 100.0  # s; of a longer log parts are tried
 PARTS = 4
 FEWEST = 8  # epochs
@@ -83,7 +84,10 @@ def diagnosed(
         said = cause_of(log, site, settings)
     except (EstimationError, InputError, np.linalg.LinAlgError):
         return None  # a log of which nothing can be tried
-    return None if said is None else Finding(said[0].code, said[1], trust.verdict, FIRST)
+    if said is None:
+        return None
+    weight = OF_CATCH_ALL if said[0].catch_all else FIRST
+    return Finding(said[0].code, said[1], trust.verdict, weight)
 
 
 def seen_in_streams(trust: Trust) -> bool:
@@ -102,7 +106,7 @@ def with_cause(trust: Trust, log: Log, site: Site, settings: LockinSettings | No
 
     def placed(finding: Finding) -> Finding:
         if finding.code in SEEN and finding.verdict is not Verdict.TRUSTWORTHY:
-            return replace(finding, verdict=trust.verdict, weight=FIRST / 2.0 + finding.weight)
+            return replace(finding, verdict=trust.verdict, weight=OF_SEEN + finding.weight)
         if diverged and finding.code not in ("diverged", "geometry"):
             # What is derived of a result that is none is no cause of it.
             return replace(finding, weight=min(finding.weight, 1.0))
@@ -164,7 +168,7 @@ def _unexplained(known: Snapshots) -> tuple[Explanation, str] | None:
             " line near a tone. Learn a field map (magfusion calibrate fieldmap), or declare"
             f" world.model_error {0.01 * share:.2g}.",
         )
-    return Explanation(code, text, "", before, before, freedom), text
+    return Explanation(code, text, "", before, before, freedom, catch_all=True), text
 
 
 def _demodulated(log: Log, site: Site, settings: LockinSettings | None) -> FieldSamples:
@@ -209,15 +213,15 @@ def _moves(known: Snapshots) -> bool:
 
 def _of_motion(known: Snapshots, samples: FieldSamples, imu: ImuSamples) -> list[Explanation]:
     site = known.site
-    fixes = fix_epochs(samples, known.calibration, survey_error=False)
-    motion = compared(fixes, imu, site)
+    every = surveyed(samples, known.calibration)
+    motion = compared(every, imu, site)
     if motion is None:
         return []
     before, _ = motion.explained(EYE, EYE)
     return [
         *motion_causes(motion, site),
-        *gyro_unit_causes(fixes, imu, site, before, motion.freedom),
-        *timing_causes(fixes, imu, site, before, motion.freedom),
+        *gyro_unit_causes(every, imu, site, before, motion.freedom),
+        *timing_causes(every, imu, site, before, motion.freedom),
     ]
 
 

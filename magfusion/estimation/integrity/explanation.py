@@ -9,6 +9,7 @@ SIGNIFICANT = 60.0  # fall for each parameter found, in units of the mean square
 PENALTY = 6.0  # of chi square, for each parameter that is found
 ENOUGH = 1.5  # of the degrees of freedom: what is left when all is explained
 LITTLE = 0.04  # of chi square before: or so much, where survey errors are more than noise
+ALIKE = 1.5  # times the chi square of another, that explains as well
 MARGIN = 20.0  # of chi square, over any other cause
 
 
@@ -28,6 +29,11 @@ class Explanation:
         Degrees of freedom.
     found : int
         Parameters that were found to explain it.
+    beacon : str
+        The one beacon in which the mistake is; empty of any other mistake.
+    catch_all : bool
+        Whether it says what contradicts the rest, and not why: so it explains whatever is wrong
+        there, and is no rival of what does say why.
     """
 
     code: str
@@ -37,6 +43,8 @@ class Explanation:
     after: float
     expected: float
     found: int = 0
+    beacon: str = ""
+    catch_all: bool = False
 
     @property
     def score(self) -> float:
@@ -54,6 +62,16 @@ class Explanation:
         clearly = self.before > CLEARLY * self.after or significant
         return enough and fall > LEAST_FALL and clearly
 
+    def as_well_as(self, other: "Explanation") -> bool:
+        """Return whether it leaves hardly more than another."""
+        return self.after < ALIKE * other.after + LEAST_FALL / 2.0
+
+    def rivalled_by(self, other: "Explanation") -> bool:
+        """Return whether another would be another answer."""
+        if other.catch_all and not self.catch_all:
+            return self.beacon not in ("", other.beacon)
+        return other.code != self.code
+
     def text(self, of: str) -> str:
         """Return the sentences that say it, with the evidence."""
         return (
@@ -64,12 +82,21 @@ class Explanation:
 
 
 def clearly_best(tried: Iterable[Explanation]) -> Explanation | None:
-    """Return the explanation that is better than those of any other code, if there is one."""
+    """Return the explanation that is better than those of any other code, if there is one.
+
+    What leaves out all that is wrong has the smallest chi square there can be: a mistake that
+    explains as much, and says what it is, is the better explanation.
+    """
     ranked = sorted(tried, key=lambda one: one.score)
-    if not ranked or not ranked[0].clear:
+    if not ranked:
         return None
     best = ranked[0]
-    rival = next((one for one in ranked if one.code != best.code), None)
+    if best.catch_all:
+        named = (one for one in ranked if not one.catch_all and one.clear and one.as_well_as(best))
+        best = next(named, best)
+    if not best.clear:
+        return None
+    rival = next((one for one in ranked if best.rivalled_by(one)), None)
     if rival is None or rival.score - best.score > max(MARGIN, 0.2 * best.score):
         return best
     return None

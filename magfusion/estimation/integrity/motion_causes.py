@@ -7,7 +7,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.explanation import Explanation
-from magfusion.estimation.integrity.motion_comparison import SHARED, Compared, compared
+from magfusion.estimation.integrity.motion_comparison import (
+    SHARED,
+    Compared,
+    Surveyed,
+    compared,
+)
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
@@ -201,12 +206,12 @@ def _named(axes: Array) -> str:
 
 
 def gyro_unit_causes(
-    fixes: Fixes, imu: ImuSamples, site: Site, before: float, freedom: float
+    known: Surveyed, imu: ImuSamples, site: Site, before: float, freedom: float
 ) -> Iterator[Explanation]:
     """Yield what another unit of the angular rates would explain."""
     for words, unit in GYRO_UNITS.items():
         converted = ImuSamples(imu.time, unit * imu.gyro_body, imu.accel_body)
-        tried = compared(fixes, converted, site)
+        tried = compared(known, converted, site)
         if tried is not None:
             yield Explanation(
                 "gyro_units",
@@ -219,22 +224,23 @@ def gyro_unit_causes(
 
 
 def timing_causes(
-    fixes: Fixes, imu: ImuSamples, site: Site, before: float, freedom: float
+    known: Surveyed, imu: ImuSamples, site: Site, before: float, freedom: float
 ) -> Iterator[Explanation]:
     """Yield what another time, or another rate, of the inertial stamps would explain."""
-    whole = compared(fixes, imu, site)
+    whole = compared(known, imu, site)
     if whole is None or not np.any(
         np.std(whole.gyro_turned, axis=0) > 3.0 * np.median(whole.turn_sigma)
     ):
         return  # what does not turn tells no time
+    fixes = known.fixes
     edges = np.linspace(0, len(fixes), PARTS + 1).astype(np.int64).tolist()
     late = [_delay(fixes, imu, site, slice(*part)) for part in pairwise(edges)]
-    known = [(at, value) for at, value in late if np.isfinite(value)]
-    if len(known) < 2:
+    told = [(at, value) for at, value in late if np.isfinite(value)]
+    if len(told) < 2:
         return
-    at, value = np.array(known).T
+    at, value = np.array(told).T
     middle = float(np.median(value))
-    steady = compared(fixes, imu, site, late=middle)
+    steady = compared(known, imu, site, late=middle)
     offset = np.inf
     if steady is not None:
         after, _ = steady.explained(EYE, EYE)
@@ -248,13 +254,13 @@ def timing_causes(
             freedom,
             1,
         )
-    if len(known) < 3:
+    if len(told) < 3:
         return
     rate, start = np.polyfit(at, value, 1)
     if abs(rate) < 1e-4:
         return
     stamps = (imu.time - start) / (1.0 + rate)
-    again = compared(fixes, ImuSamples(stamps, imu.gyro_body, imu.accel_body), site)
+    again = compared(known, ImuSamples(stamps, imu.gyro_body, imu.accel_body), site)
     if again is not None:
         after, _ = again.explained(EYE, EYE)
         if after > 0.7 * offset:

@@ -3,7 +3,8 @@
 Fixes give how the platform turned from one epoch to a later one, and by second differences how it
 accelerated; gyro and accelerometer say the same in their own axes, units and time.  What relates
 them is linear in the axes of either, in biases, lever arm and gravity, so that a mistake in any is
-tried at the price of a small least-squares problem.
+tried at the price of a small least-squares problem.  So is what errors of the survey do to fixes,
+which bend a path as much as a wrong axis does, and would be taken for one.
 """
 
 from dataclasses import dataclass
@@ -13,8 +14,20 @@ from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation, Slerp
 
 from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.estimation.snapshot.survey_error import whitened
 from magfusion.model.field import skew
-from magfusion.model.samples import ImuSamples
+from magfusion.model.noise import measurement_cov, whitening
+from magfusion.model.parameters import (
+    SENSOR_POSITION,
+    SENSOR_ROTATION,
+    Calibration,
+    choose_blocks,
+    linearize_channels,
+    placed,
+)
+from magfusion.model.prior import prior_sqrt_covariance
+from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site
 from magfusion.model.strapdown import attitude_at, attitude_from_gyro
 from magfusion.units import Array, BoolArray, IntArray
@@ -23,9 +36,11 @@ TURN_SPAN = 0.4  # s, over which turns are compared
 CURVE_SPAN = 0.6  # s, of each half of a second difference
 GRID = 0.01  # s, of the specific force
 EVEN = 0.25  # of a span, by which epochs may miss it
-NEAREST = 2.0  # m; usual distance of a beacon, over which its survey's error tilts a fix
 LOCAL_ROTATION = 3e-3  # rad, what fixes err by that no noise tells of
 LOCAL_POSITION = 1e-3  # m
+LOCAL_TILT = 2e-3  # rad
+OF_SURVEY = ("beacons", "moments", "magnetometer")
+MOUNTED = (SENSOR_ROTATION, SENSOR_POSITION)  # which are found by themselves
 
 SHARED = {"gyro": slice(0, 3), "accel": slice(3, 6), "tilt": slice(6, 8)}
 SHARED |= {"mounting": slice(8, 11), "lever": slice(11, 14)}
@@ -59,6 +74,8 @@ class Compared:
         (m/s^2)
     prior : ndarray, shape (14,)
         Sigmas of `SHARED`.
+    turned_by_survey, curve_by_survey : ndarray, shape (m, 3, k), (n, 3, k)
+        What one sigma of each of the survey's errors does to the first of each.
     """
 
     turned: Array
@@ -72,6 +89,8 @@ class Compared:
     curve_sigma: Array
     gravity: float
     prior: Array
+    turned_by_survey: Array
+    curve_by_survey: Array
 
     @property
     def freedom(self) -> float:
@@ -112,12 +131,14 @@ class Compared:
             turned = np.einsum("nijk,jk->ni", body_force, skew(np.eye(3)[axis]))
             curves[..., SHARED["mounting"].start + axis] = turned
         curves[..., SHARED["lever"]] = -self.bent
+        turns = np.concatenate([turns, self.turned_by_survey], axis=2)
+        curves = np.concatenate([curves, self.curve_by_survey], axis=2)
         up = np.array([0.0, 0.0, gravity * self.gravity])
         curve_error = self.curve_world + up - force
         rows = np.concatenate(
             [
-                (turns / self.turn_sigma[:, None, None]).reshape(-1, WIDTH),
-                (curves / self.curve_sigma[:, None, None]).reshape(-1, WIDTH),
+                (turns / self.turn_sigma[:, None, None]).reshape(-1, turns.shape[2]),
+                (curves / self.curve_sigma[:, None, None]).reshape(-1, turns.shape[2]),
             ]
         )
         error = np.concatenate(
@@ -126,26 +147,53 @@ class Compared:
                 (curve_error / self.curve_sigma[:, None]).ravel(),
             ]
         )
-        prior = self.prior.copy()
+        prior = np.concatenate([self.prior, np.ones(self.curve_by_survey.shape[2])])
         if free is not None:
             prior[SHARED[free]] = WIDE[free]
         information = rows.T @ rows + np.diag(1.0 / prior**2)
         found = np.linalg.solve(information, rows.T @ error)
         left = error - rows @ found
-        return float(left @ left + np.sum((found / prior) ** 2)), found
+        return float(left @ left + np.sum((found / prior) ** 2)), found[:WIDTH]
 
 
-def compared(fixes: Fixes, imu: ImuSamples, site: Site, late: float = 0.0) -> Compared | None:
-    """Return what there is to compare; None where the log is too short.
+@dataclass(frozen=True, eq=False)
+class Surveyed:
+    """Fixes, and what the errors of the survey do to all of them.
 
     Parameters
     ----------
     fixes : Fixes
         Of all epochs, with the site's mounting and lever arm.
+    by_survey : ndarray, shape (n, 6, k)
+        Rotation (rad) and translation (m) in body axes, of one sigma each.
+    """
+
+    fixes: Fixes
+    by_survey: Array
+
+
+def surveyed(samples: FieldSamples, calibration: Calibration) -> Surveyed:
+    """Return the fixes of all epochs, each alone, and what moves all of them."""
+    site, fixes = calibration.site, fix_epochs(samples, calibration, survey_error=False)
+    at, place = fixes.world_from_body[:, 0], fixes.position_world[:, 0]
+    blocks = choose_blocks(site, OF_SURVEY)
+    blocks = placed(block for block in blocks if block.parameter not in MOUNTED)
+    _, by_pose, by_blocks = linearize_channels(calibration, blocks, samples.time, at, place)
+    weights = whitening(measurement_cov(site, samples, survey_error=False), samples.valid)
+    by_sigma = by_blocks @ prior_sqrt_covariance(site, blocks)
+    found = np.linalg.pinv(whitened(weights, by_pose)) @ whitened(weights, by_sigma)
+    return Surveyed(fixes, np.where(np.isfinite(found), found, 0.0))
+
+
+def compared(known: Surveyed, imu: ImuSamples, site: Site, late: float = 0.0) -> Compared | None:
+    """Return what there is to compare; None where the log is too short.
+
+    Parameters
+    ----------
     late : float
         What the inertial stamps are late by, beyond the declared offset (s).
     """
-    time = fixes.time
+    fixes, time = known.fixes, known.fixes.time
     stamps = imu.time + site.platform.imu.time_offset - late
     turn, place, cov = (
         fixes.world_from_body[:, 0],
@@ -165,8 +213,14 @@ def compared(fixes: Fixes, imu: ImuSamples, site: Site, late: float = 0.0) -> Co
     by_gyro = attitude_at(attitude, stamps, imu.gyro_body, time)
     half = 0.5 * (time[after] - time[before])[:, None]
     force, carried = _forces(fixes, stamps, imu, time[at])
+    turned = Rotation.from_matrix(relative).as_rotvec()
+    by_turn, by_place = known.by_survey[:, :3], turn @ known.by_survey[:, 3:]
+    tilted = turn @ by_turn
+    mean_tilt = 0.25 * (tilted[before] + 2.0 * tilted[at] + tilted[after])
+    upright = skew(np.array([0.0, 0.0, site.gravity]))
+    bent_by_survey = by_place[after] - 2.0 * by_place[at] + by_place[before]
     return Compared(
-        turned=Rotation.from_matrix(relative).as_rotvec(),
+        turned=turned,
         gyro_turned=(by_gyro[i].inv() * by_gyro[j]).as_rotvec(),
         span=time[j] - time[i],
         turn_sigma=np.sqrt(rotation_sigma[i] ** 2 + rotation_sigma[j] ** 2 + LOCAL_ROTATION**2),
@@ -177,22 +231,25 @@ def compared(fixes: Fixes, imu: ImuSamples, site: Site, late: float = 0.0) -> Co
         curve_sigma=np.sqrt(6.0 * (place_sigma[at] ** 2 + LOCAL_POSITION**2)) / half[:, 0] ** 2,
         gravity=site.gravity,
         prior=_prior(site),
+        turned_by_survey=_of_turns(turned, by_turn[j] - np.swapaxes(relative, 1, 2) @ by_turn[i]),
+        curve_by_survey=bent_by_survey / half[..., None] ** 2 + upright @ mean_tilt,
     )
+
+
+def _of_turns(turned: Array, last: Array) -> Array:
+    """Return what turns after rotation vectors (m, 3) do to those, up to their square."""
+    around = skew(turned)
+    return np.asarray(last + 0.5 * around @ last + around @ (around @ last) / 12.0)
 
 
 def _prior(site: Site) -> Array:
     imu, sigma = site.platform.imu, site.platform.magnetometer.sigma
-    tilts = [
-        np.hypot(np.max(b.sigma.rotation_beacon), np.max(b.sigma.position_world) / NEAREST)
-        for b in site.beacons
-    ]
-    tilt = 2e-3 + float(np.mean(tilts))
     return np.concatenate(
         [
             np.full(3, imu.gyro_bias_sigma),
             np.full(3, imu.accel_bias_sigma),
-            np.full(2, tilt),
-            np.maximum(sigma.rotation_sensor, 2e-3) + 0.5 * tilt,
+            np.full(2, LOCAL_TILT),
+            np.maximum(sigma.rotation_sensor, LOCAL_TILT),
             np.maximum(sigma.position_body, 2e-3),
         ]
     )

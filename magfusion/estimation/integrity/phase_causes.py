@@ -62,7 +62,7 @@ def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]
     )
     if np.all(np.abs(np.abs(mean) - np.pi) < REVERSED):
         yield _said(known, _turned(known, np.full(len(mean), np.pi)), 0, *left_handed())
-    elif constant.chi_square < ALIKE * shifted.chi_square - LEAST_FALL:
+    elif not _wired(known, mean) and constant.chi_square < ALIKE * shifted.chi_square - LEAST_FALL:
         yield _said(
             known,
             constant,
@@ -72,6 +72,13 @@ def phase_causes(known: Snapshots, every: FieldSamples) -> Iterator[Explanation]
             " the declared",
             "Check phase_deg, or declare synchronised: false for the beacons.",
         )
+
+
+def _wired(known: Snapshots, phase: Array) -> bool:
+    """Tell whether phases are those of one beacon's wires, which are tried for themselves."""
+    over = np.abs(np.abs(phase) - np.pi) < REVERSED
+    names = {known.samples.channels[k][0] for k in np.flatnonzero(over).tolist()}
+    return len(names) == 1 and bool(np.all(over | (np.abs(phase) < REVERSED)))
 
 
 def _said(
@@ -125,20 +132,22 @@ def _of_clocks(
     names = [name for name, _ in known.samples.channels]
     usual = max(float(np.median(np.abs(rate))), STILL)
     strays = [n for n, r in zip(names, rate, strict=True) if abs(r) > 10.0 * usual]
+    beacon = ""
     if np.all(alike):
         code, found = "sample_rate", 2
         cause = f"the magnetometer's stamps run {1e6 * -common:.4g} ppm fast against the drives"
         remedy = "Check the sample rate with which the stamps were made."
     elif len(set(strays)) == 1:
         code, found = "beacon_clock", 2
-        k = names.index(strays[0])
+        beacon, k = strays[0], names.index(strays[0])
         cause = f"beacon {strays[0]} runs at {tones_hz[k] * (1.0 + rate[k]):.6g} Hz"
         remedy = "Correct its frequency_hz, or declare synchronised: false."
     else:
         code, found = "beacon_clock", 2 * len(rate)
         cause = "the drives run on clocks of their own"
         remedy = "Declare synchronised: false for the beacons."
-    yield Explanation(code, cause, remedy, known.chi_square, tried.chi_square, known.freedom, found)
+    explained = known.chi_square, tried.chi_square, known.freedom
+    yield Explanation(code, cause, remedy, *explained, found, beacon)
 
 
 def _shift(phase: Array, tones_hz: Array) -> float:
