@@ -67,7 +67,8 @@ def test_the_dipole_model_is_found_to_be_better_than_declared(log: Log, plain: S
     assert untuned.noise == ()
     assert log.truth is not None
     better, before = (trajectory_errors(r.states, log.truth).ate for r in (plain, untuned))
-    assert better < 0.8 * before
+    # Half a per cent costs less than it would if epochs forgot what they know of each other.
+    assert better < 0.9 * before
 
 
 def test_densities_declared_too_small_are_found(log: Log) -> None:

@@ -16,15 +16,16 @@ from magfusion.estimation.integrity.detection import detected, only
 from magfusion.estimation.integrity.mending import mended
 from magfusion.estimation.log_graph import PreparedLog, graph_of
 from magfusion.estimation.measurements.earth import EarthField, check_earth, disturbed
+from magfusion.estimation.measurements.field_error import field_errors
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors, alone
 from magfusion.estimation.measurements.pose_fix import survey_response
 from magfusion.estimation.measurements.zero_velocity import may_stand, quiet_before
-from magfusion.estimation.noise_tuning import Tuned, noise_of, with_noise
+from magfusion.estimation.noise_tuning import Tuned, as_declared, noise_of, plausible, with_noise
 from magfusion.estimation.noise_tuning import settled as same_noise
 from magfusion.estimation.settings import EstimatorSettings
 from magfusion.estimation.solve.bordered import Optimised, eliminate, marginal, optimise
-from magfusion.model.parameters import Block, Calibration, initial_calibration
+from magfusion.model.parameters import Block, Calibration, initial_calibration, placed
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import FieldSamples, ImuSamples, Log
 from magfusion.model.site import MotionModel, Site
@@ -93,6 +94,8 @@ class Smoothed:
         What was estimated.
     considered : tuple of Block
         What else is uncertain, and in the covariance.
+    field_errors : tuple of Block
+        Errors of the beacons' fields that are constant in place, likewise.
     calibration_cov : ndarray, shape (dimension, dimension)
     residual : ndarray, shape (n, channels, 6)
         Whitened; NaN where a channel is missing, or with loose coupling.
@@ -150,6 +153,12 @@ class Smoothed:
     earth_disturbed: BoolArray | None = None
     fix_response: Array | None = None
     noise: tuple[Tuned, ...] = ()
+    field_errors: tuple[Block, ...] = ()
+
+    @property
+    def uncertain(self) -> tuple[Block, ...]:
+        """All that is in the covariance without being estimated."""
+        return placed((*self.considered, *self.field_errors))
 
 
 def smooth(
@@ -261,7 +270,7 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
     states, calibration, wave = log.states, log.declared, None
     segments: tuple[Calibration, ...] = ()
     declared = log.declared.site
-    log = replace(log, apart=settings.tune and log.fixes is None)
+    tuning = settings.tune and log.fixes is None
     time, motion = states.time, log.declared.site.platform.motion
     calm = quiet_before(log.imu, time - calibration.time_offset, motion)
     standing = np.zeros(len(time), dtype=bool)
@@ -289,10 +298,10 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
         before, states = states, after
         calibration, standing = found.estimate.calibration, standing | stood
         segments = found.estimate.segments
-        if log.apart and (wave is not None or not by_waveform):
+        if tuning and (wave is not None or not by_waveform):
             latest = noise_of(log, graph, found.estimate, states, wave, declared)
-            log = replace(log, apart=done < TUNINGS and not same_noise(tuned, latest))
-            tuned, settled = latest, False
+            tuning = done < TUNINGS and plausible(latest) and not same_noise(tuned, latest)
+            tuned, settled = latest if plausible(latest) else as_declared(latest), False
             log = replace(log, declared=with_noise(log.declared, tuned))
             calibration = with_noise(calibration, tuned)
             segments = tuple(with_noise(segment, tuned) for segment in segments)
@@ -323,7 +332,7 @@ def solved_again(result: Smoothed, measurements: tuple[Measurement, ...]) -> Smo
     """
     graph = replace(result.graph, measurements=measurements)
     found = optimise(graph, result.estimate)
-    pose_cov, calibration_cov = marginals(graph, found.estimate, result.considered)
+    pose_cov, calibration_cov = marginals(graph, found.estimate, result.uncertain)
     states = read_states(found.estimate.values, result.states.time)
     phasors = next(m for m in measurements if isinstance(m, FieldPhasors))
     heard = np.any(phasors.sqrt_information != 0.0, axis=(2, 3))
@@ -359,18 +368,22 @@ def _posterior(
     log: PreparedLog, graph: Graph, found: Optimised[Estimate], samples: FieldSamples, bridged: int
 ) -> Smoothed:
     estimate = found.estimate
-    pose_cov, calibration_cov = marginals(graph, estimate, log.considered)
     states, response = read_states(estimate.values, log.states.time), None
+    errors: tuple[Block, ...] = ()
+    if log.fixes is None:
+        errors = field_errors(estimate.calibration.site, samples.time, log.at_fields(states))
+    uncertain = placed((*log.considered, *errors))
+    pose_cov, calibration_cov = marginals(graph, estimate, uncertain)
     if log.fixes is not None:
         here = survey_response(log.declared, log.samples, log.at_fields(states))
         later = np.searchsorted(log.epoch, np.arange(len(states)))
         response = here[np.minimum(later, len(here) - 1)]
         pose_cov = pose_cov + response @ np.swapaxes(response, 1, 2)
-    errors = {type(m): graph.residual(m, estimate) for m in map(alone, graph.measurements)}
-    error = errors.get(FieldPhasors, np.nan)
+    left = {type(m): graph.residual(m, estimate) for m in map(alone, graph.measurements)}
+    error = left.get(FieldPhasors, np.nan)
     residual = np.where(samples.valid[..., None], error, np.full(6, np.nan))
     field = next((m for m in graph.measurements if isinstance(m, EarthField)), None)
-    earth = None if field is None else errors[EarthField][:, 0]
+    earth = None if field is None else left[EarthField][:, 0]
     return Smoothed(
         states=replace(states, pose_cov=pose_cov),
         epoch=log.epoch,
@@ -395,4 +408,5 @@ def _posterior(
         earth_residual=earth,
         earth_disturbed=None if earth is None or field is None else disturbed(earth, field.repeats),
         fix_response=response,
+        field_errors=errors,
     )

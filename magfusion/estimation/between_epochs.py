@@ -144,7 +144,7 @@ def _joint_cov(result: Smoothed) -> Array:
         response = np.zeros((len(keys), MOTION, result.fix_response.shape[2]))
         response[:, :6] = result.fix_response
     else:
-        steps = result.graph.responses(estimate, result.considered)
+        steps = result.graph.responses(estimate, result.uncertain)
         flat = [key for own in keys for key in own]
         parts = [step.vector(flat).reshape(-1, MOTION) for step in steps]
         response = np.stack(parts, axis=2) if parts else np.zeros((len(keys), MOTION, 0))

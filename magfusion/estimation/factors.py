@@ -19,6 +19,7 @@ from magfusion.units import Array, IntArray
 
 CALIBRATION_KEY = gtsam.symbol("c", 0)
 CONSIDERED_KEY = gtsam.symbol("h", 0)
+NUISANCE_KEY = gtsam.symbol("n", 0)
 Key = Callable[[int], int]  # of an epoch's variable
 
 
@@ -83,6 +84,7 @@ class Factors:
         spread: Array,
         *,
         explaining: bool = False,
+        nuisance: tuple[Block, ...] = (),
     ) -> gtsam.GaussianFactorGraph:
         """Return the factors with other parameters, and nothing to explain.
 
@@ -96,6 +98,8 @@ class Factors:
             What makes a step of them out of unit noise.
         explaining : bool
             With the residuals to explain after all.
+        nuisance : tuple of Block
+            More parameters, as a variable of their own.
         """
         graph = gtsam.GaussianFactorGraph()
         rows = self.rows(states, calibration, self.blocks)
@@ -103,6 +107,9 @@ class Factors:
         by_other = self.rows(states, calibration, others).by_calibration
         if by_other is not None:
             parts.append((_constant(CONSIDERED_KEY), _flat(by_other) @ spread))
+        by_nuisance = self.rows(states, calibration, nuisance).by_calibration if nuisance else None
+        if by_nuisance is not None:
+            parts.append((_constant(NUISANCE_KEY), _flat(by_nuisance)))
         for i, epoch in enumerate(self.measurement.epoch.tolist()):
             size = parts[0][1].shape[1]
             factor = empty_factor([(k(epoch), p.shape[-1]) for k, p in parts], size)

@@ -11,6 +11,7 @@ from magfusion.estimation.drift_segments import ONE_SEGMENT, Segments
 from magfusion.estimation.factors import (
     CALIBRATION_KEY,
     CONSIDERED_KEY,
+    NUISANCE_KEY,
     Factors,
     calibration_parts,
     empty_factor,
@@ -237,8 +238,10 @@ class Graph:
         if not self.links:
             return None
         size = dimension(self.blocks)
-        columns = [link.by_calibration for link in self.links]
-        return np.array([by[:, size:] @ spread for by in columns if by is not None])
+        every = [link.by_calibration for link in self.links]
+        known = [by[:, size:] for by in every if by is not None]
+        # What the fields alone tell of comes last, and does nothing here.
+        return np.array([by @ spread[: by.shape[1]] for by in known])
 
     def beside(
         self,
@@ -248,6 +251,7 @@ class Graph:
         by_others: Array | None = None,
         *,
         explaining: bool = False,
+        nuisance: tuple[Block, ...] = (),
     ) -> gtsam.GaussianFactorGraph:
         """Return the linear graph at an estimate with the columns of parameters that are held.
 
@@ -259,6 +263,8 @@ class Graph:
             What they do to the inertial factors, whitened.
         explaining : bool
             With the residuals to explain, which are zero otherwise.
+        nuisance : tuple of Block
+            What is uncertain besides, as the variable `NUISANCE_KEY` with its prior.
         """
         graph = self.inertial(estimate, by_others)
         for drift in self.segments.factors(self._calibrations(estimate), self.blocks):
@@ -270,10 +276,18 @@ class Graph:
                 factor = graph.at(i)
                 assert isinstance(factor, gtsam.JacobianFactor)
                 factor.getb()[...] = 0.0
+        if nuisance:
+            unit = gtsam.noiseModel.Unit.Create(dimension(nuisance))
+            size = np.diag(1.0 / prior_sigma(nuisance))
+            graph.push_back(gtsam.JacobianFactor(NUISANCE_KEY, size, np.zeros(len(size)), unit))
         states = states_in(estimate.values)
         for factors in self.factors:
             own = estimate.at(factors.segment)
-            graph.push_back(factors.considering(states, own, others, spread, explaining=explaining))
+            graph.push_back(
+                factors.considering(
+                    states, own, others, spread, explaining=explaining, nuisance=nuisance
+                )
+            )
         return graph
 
     def responses(

@@ -13,7 +13,6 @@ from magfusion.estimation.initialization.chain import Start
 from magfusion.estimation.integrity.detection import only
 from magfusion.estimation.measurements.earth import earth_measurement, unheld
 from magfusion.estimation.measurements.measurement import Measurement
-from magfusion.estimation.measurements.model_error import alike_in_batch
 from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.estimation.measurements.pose_fix import pose_fixes
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
@@ -51,8 +50,6 @@ class PreparedLog:
         Anything else that was measured, with the times of its rows (s).
     rival_chi_square, rival : float, Trajectory, optional
         As of `Smoothed`.
-    apart : bool
-        Whether every epoch's model error counts as one of its own: while it is tuned.
     """
 
     demodulation: Demodulation
@@ -69,7 +66,6 @@ class PreparedLog:
     others: tuple[tuple[Array, Measurement], ...]
     rival_chi_square: float | None = None
     rival: Trajectory | None = None
-    apart: bool = False
 
     @property
     def imu(self) -> ImuSamples:
@@ -178,10 +174,8 @@ def _fields(
     imu = corrected_imu(calibration, log.blocks, log.imu)
     rate_body = low_passed_rate_at(imu, offset, samples.time) - here.gyro_bias_body
     by_offset = None if wave is None else wave.by_time_offset
-    length = 0.0 if log.apart else site.model_error_length
-    alike = alike_in_batch(here.position_world, length)
     phasors = field_phasors(
-        site, samples, log.epoch, here, rate_body, offset, overlap(samples), by_offset, alike
+        site, samples, log.epoch, here, rate_body, offset, overlap(samples), by_offset
     )
     out: list[Measurement] = [replace(phasors, robust=log.loss)]
     if log.steady is not None:

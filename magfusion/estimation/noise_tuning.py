@@ -38,6 +38,7 @@ SCALES = 8  # epochs in a row that are compared, so far apart that they share no
 FAULT = 3.0  # of a declared model error; more is no error of that kind, and is not covered by it
 WEIGHINGS = 5  # times that the epochs are weighed by what is found, at first as if noise were all
 OF_IMU = ("gyro_noise", "accel_noise")  # a beacon may be called "imu", too
+PLAUSIBLE = 5.0  # by a factor of more, either way, white noise is a fault under another name
 LEFT = 1e-3  # of an error; of which less is left says nothing
 
 
@@ -80,6 +81,17 @@ def tuned_site(site: Site, tuned: Sequence[Tuned]) -> Site:
 def with_noise(calibration: Calibration, tuned: Sequence[Tuned]) -> Calibration:
     """Return a calibration whose site has the noise that was found."""
     return replace(calibration, site=tuned_site(calibration.site, tuned))
+
+
+def plausible(tuned: Sequence[Tuned]) -> bool:
+    """Tell whether what was found is noise: a fault is none, and must not be hidden by it."""
+    white = [t.factor for t in tuned if t.key != "model_error"]
+    return all(1.0 / PLAUSIBLE < factor < PLAUSIBLE for factor in white)
+
+
+def as_declared(tuned: Sequence[Tuned]) -> tuple[Tuned, ...]:
+    """Return the noise as it was declared."""
+    return tuple(replace(t, found=t.declared) for t in tuned)
 
 
 def settled(before: Sequence[Tuned], after: Sequence[Tuned]) -> bool:

@@ -9,7 +9,7 @@ from magfusion.estimation.factors import CALIBRATION_KEY
 from magfusion.estimation.graph import Estimate
 from magfusion.estimation.solve.bordered import eliminate_partial
 from magfusion.estimation.state import State
-from magfusion.model.parameters import Block
+from magfusion.model.parameters import Block, dimension, placed
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.units import Array
 
@@ -58,15 +58,19 @@ def _with_considered(
     cov: Array, result: Smoothed, estimate: Estimate, considered: tuple[Block, ...]
 ) -> Array:
     """Return the joint covariance with parameters that the estimate took for known."""
-    if not considered:
+    uncertain = placed((*considered, *result.field_errors))
+    if not uncertain:
         return cov
-    last = len(result.states) - 1
-    spread = prior_sqrt_covariance(result.declared.site, considered)
+    last, size = len(result.states) - 1, dimension(considered)
     columns = []
-    for step in result.graph.responses(estimate, considered):
+    for step in result.graph.responses(estimate, uncertain):
         own = [step.at(X(last)), step.at(V(last)), step.at(B(last))]
         own += [step.at(CALIBRATION_KEY)] if result.blocks else []
         columns.append(np.concatenate(own))
     response = np.stack(columns, axis=1)
+    cov = cov + response[:, size:] @ response[:, size:].T
+    if not considered:
+        return cov
+    response, spread = response[:, :size], prior_sqrt_covariance(result.declared.site, considered)
     across = response @ spread.T
     return np.block([[cov + response @ response.T, across], [across.T, spread @ spread.T]])

@@ -209,9 +209,7 @@ def _unverified(case: Case, score: Score) -> list[Unverified]:
         cov = declared @ declared.T
         root = np.linalg.cholesky(cov) if np.all(np.diagonal(cov) > 1e-12) else np.eye(len(rows))
         widest = np.where(np.diagonal(root) > 1.0, np.diagonal(root), 1.0)
-        value, vector = np.linalg.eigh(
-            widest[:, None] * information[np.ix_(rows, rows)] * widest
-        )
+        value, vector = np.linalg.eigh(widest[:, None] * information[np.ix_(rows, rows)] * widest)
         free = vector[:, value < UNCHECKED]
         if not free.shape[1]:
             continue

@@ -13,7 +13,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.estimation.batch import Smoothed
-from magfusion.estimation.factors import CALIBRATION_KEY, CONSIDERED_KEY
+from magfusion.estimation.factors import CALIBRATION_KEY, CONSIDERED_KEY, NUISANCE_KEY
 from magfusion.estimation.graph import Estimate, Graph, steps_of_others
 from magfusion.estimation.inertial import ROWS
 from magfusion.estimation.integrity.suspects import TOLERANCE, Inertial, Stream, held_blocks
@@ -113,6 +113,14 @@ def score_of(result: Smoothed, imu: ImuSamples) -> Score | None:
     by_others = _by_stream(result, held, imu) @ unit
     system = graph.beside(estimate, held, unit, by_others, explaining=True)
     conditional, rest = eliminate_partial(system, graph.ordering)
+    if result.field_errors:
+        # An error that is constant in place looks like some of them; what freeing them does to the
+        # estimate, which weighs epochs as if there were none, stays the same.
+        ordering = graph.ordering
+        ordering.push_back(NUISANCE_KEY)
+        errors = result.field_errors
+        system = graph.beside(estimate, held, unit, by_others, explaining=True, nuisance=errors)
+        _, rest = eliminate_partial(system, ordering)
     order = gtsam.Ordering()
     order.push_back(CONSIDERED_KEY)
     information, gradient = rest.hessian(order)

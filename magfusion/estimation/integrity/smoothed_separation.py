@@ -98,7 +98,7 @@ def separate_smoothed(result: Smoothed) -> Separation | None:
     names = [beacon.name for beacon in result.declared.site.beacons]
     owner = np.array([names.index(name) for name, _ in result.fields.channels])
     every = range(len(names))
-    rest, rows = _linear(graph, result.estimate, result.considered)
+    rest, rows = _linear(graph, result.estimate, result.uncertain)
     kept = np.array([owner >= 0, *(owner != j for j in every)])
     solved, cost = _without_each(rest, rows, kept)
     heard = np.any(rows.by_pose != 0.0, axis=(0, 2, 3))

@@ -1,0 +1,121 @@
+"""What iron makes of a beacon's field: an error that is constant in place, considered.
+
+A relative error of correlation exp(-d / length) is, over the places of a log, a sum of a few modes
+(Karhunen and Loeve), each with an amplitude of unit variance.  An estimate that weighs epochs by
+what is white of their errors keeps what they know of each other; what the amplitudes do to it is
+added to its covariance (a consider covariance), so that a hundred epochs at one place do not count
+as a hundred witnesses of where it is.
+"""
+
+import numpy as np
+
+from magfusion.estimation.measurements.model_error import cells
+from magfusion.model.noise import model_error, sensor_positions
+from magfusion.model.parameters import BeaconParameter, Block, placed
+from magfusion.model.parameters.parameter import PhasorView
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, ComplexArray
+
+SHARE = 0.97  # of the variance, which the modes have; the rest is in the white part
+COLUMNS = 96  # of all beacons
+AT_ONCE = 5e8  # bytes of their Jacobian, in a long log
+MOST_CELLS = 1000
+SAME_TIME = 1e-6  # s
+
+
+class FieldError(BeaconParameter):
+    """Amplitudes of the modes of one beacon's error: by tone, mode, quadrature and world axis.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Of the epochs that have it (s).
+    modes : ndarray, shape (n, m)
+        With unit variance in all.
+    relative : ndarray, shape (n, tones)
+        Size of the error, as a share of the field.
+    sensor_from_world : ndarray, shape (n, 3, 3)
+    """
+
+    group = kind = "field_error"
+
+    def __init__(
+        self, time: Array, modes: Array, relative: Array, sensor_from_world: Array
+    ) -> None:
+        self._time, self._relative = time, relative
+        every = np.einsum("nm,nai->nami", modes, sensor_from_world)
+        both = np.stack([every, 1j * every], axis=3)
+        self._shapes = both.reshape(len(time), 3, -1)
+
+    @property
+    def columns(self) -> int:
+        """How many amplitudes there are."""
+        return int(self._relative.shape[1] * self._shapes.shape[2])
+
+    def own_jacobian(self, view: PhasorView) -> ComplexArray:
+        """Return the columns of the owner's phasors."""
+        time = view.calibration.reference_time + view.elapsed
+        rows = np.searchsorted(self._time, time - SAME_TIME)
+        power = 0.5 * np.sum(np.abs(view.phasor) ** 2, axis=-1) / 3.0
+        size = self._relative[rows] * np.sqrt(power)
+        shapes, (count, tones) = self._shapes[rows], size.shape
+        out = np.zeros((count, tones, 3, tones, shapes.shape[2]), dtype=complex)
+        for tone in range(tones):
+            out[:, tone, :, tone] = size[:, tone, None, None] * shapes
+        return out.reshape(count, tones, 3, -1)
+
+
+def field_errors(site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...]:
+    """Return the errors of the beacons' fields at some epochs, to be considered.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Of the fields (s).
+    poses : Trajectory
+        There.
+    """
+    length, channels = site.model_error_length, len(site.channels)
+    if length <= 0.0 or not len(time):
+        return ()
+    place = sensor_positions(site, poses)
+    relative = model_error(site, place) + np.zeros((len(time), channels))
+    most = min(COLUMNS, int(AT_ONCE / (48.0 * channels * len(time)))) // (6 * channels)
+    modes = modes_in_place(place, length, max(most, 1))
+    body_from_sensor = site.platform.magnetometer.body_from_sensor
+    sensor_from_world = np.swapaxes(poses.world_from_body @ body_from_sensor, 1, 2)
+    out, start = [], 0
+    for beacon in site.beacons:
+        own = relative[:, start : start + len(beacon.tones)]
+        start += len(beacon.tones)
+        if np.any(own > 0.0):
+            error = FieldError(time, modes, own, sensor_from_world)
+            out.append(Block(error, beacon.name, slice(0), np.ones(error.columns)))
+    return placed(out)
+
+
+def modes_in_place(position_world: Array, length: float, most: int) -> Array:
+    """Return the modes of an error of correlation exp(-d / length) at some places, shape (n, m).
+
+    Parameters
+    ----------
+    position_world : ndarray, shape (n, 3)
+        (m)
+    length : float
+        (m)
+    most : int
+        Of them.
+    """
+    size, (owner, members, centre) = 1.0, cells(position_world, length)
+    while len(centre) > MOST_CELLS:
+        size *= 2.0
+        owner, members, centre = cells(position_world, size * length)
+    apart = np.linalg.norm(centre[:, None] - centre, axis=2)
+    weight = np.sqrt(members)
+    value, vector = np.linalg.eigh(weight[:, None] * np.exp(-apart / length) * weight)
+    value, vector = value[::-1], vector[:, ::-1]
+    enough = int(np.searchsorted(np.cumsum(value), SHARE * np.sum(value))) + 1
+    kept = min(enough, most)
+    shape = vector[:, :kept] * np.sqrt(np.maximum(value[:kept], 0.0)) / weight[:, None]
+    return np.asarray(shape[owner])
