@@ -62,6 +62,18 @@ BEACONS = {
         beacon((Coil(np.array([220.0, 3.0, -2.0])), Coil(np.array([-4.0, 180.0, 5.0]), -1.5))),
         field_map=FIELD_MAP,
     ),
+    "coils of true size": beacon(
+        (
+            Coil(np.array([220.0, 3.0, -2.0]), radius=0.6),
+            Coil(np.array([-4.0, 180.0, 5.0]), -1.5, np.array([0.05, 0.0, 0.1]), 0.4, length=0.8),
+            Coil(np.array([3.0, -4.0, 90.0]), 0.3, length=0.5),
+            Coil(np.array([3.0, -4.0, 70.0]), 0.8),
+        )
+    ),
+    "loops with a field map": replace(
+        beacon((Coil(np.array([220.0, 3.0, -2.0]), radius=0.7), Coil(np.array([0.0, 9.0, 5.0])))),
+        field_map=FIELD_MAP,
+    ),
     "one coil": beacon((Coil(np.array([10.0, -20.0, 150.0]), phase=0.4),)),
 }
 
@@ -214,6 +226,30 @@ def test_without_a_twist_there_is_no_time_offset_block(source):
     assert seen_from(source, ATTITUDES["generic"]).time_offset is None
 
 
+def magpylibs_coil(coil):
+    """Return a dipole, a circle, a cylinder magnetised along its axis, or a line of dipoles."""
+    size = np.linalg.norm(coil.moment_beacon)
+    if coil.radius is None and coil.length is None:
+        return magpylib.misc.Dipole(moment=coil.moment_beacon)
+    if coil.radius is None:
+        nodes, weights = np.polynomial.legendre.leggauss(40)
+        ways = 0.5 * coil.length * nodes[:, None] * coil.moment_beacon / size
+        dipoles = zip(ways, 0.5 * weights, strict=True)
+        return magpylib.Collection(
+            *(magpylib.misc.Dipole(moment=w * coil.moment_beacon, position=x) for x, w in dipoles),
+            override_parent=True,
+        )
+    area = np.pi * coil.radius**2
+    if coil.length is None:
+        made = magpylib.current.Circle(diameter=2.0 * coil.radius, current=size / area)
+    else:
+        magnetisation = (0.0, 0.0, size / (area * coil.length))
+        made = magpylib.magnet.Cylinder(
+            dimension=(2.0 * coil.radius, coil.length), magnetization=magnetisation
+        )
+    return made.rotate(Rotation.align_vectors(coil.moment_beacon, [0.0, 0.0, 1.0])[0])
+
+
 @every_attitude
 @every_beacon
 def test_the_value_is_what_a_magnetometer_sees_of_magpylibs_sources(source, rotvec):
@@ -222,9 +258,9 @@ def test_the_value_is_what_a_magnetometer_sees_of_magpylibs_sources(source, rotv
     measured_from_world = MAGNETOMETER.matrix @ (rotation @ MAGNETOMETER.body_from_sensor).T
     sources = []
     for coil in source.coils:
-        dipole = magpylib.misc.Dipole(moment=coil.moment_beacon, position=coil.centre_beacon)
-        dipole.rotate(Rotation.from_matrix(source.world_from_beacon), anchor=0)
-        sources.append(dipole.move(source.position_world))
+        own = magpylibs_coil(coil).move(coil.centre_beacon)
+        own.rotate(Rotation.from_matrix(source.world_from_beacon), anchor=0)
+        sources.append(own.move(source.position_world))
     fields_world = np.array([s.getB(sensor_world) for s in sources])
     value = seen_from(replace(source, field_map=None), rotvec).phasor_sensor
     # The currents and the field are followed as functions of time over a cycle.

@@ -8,7 +8,7 @@ from typing import NamedTuple, overload
 
 import numpy as np
 
-from magfusion.model.physics.dipole import dipole_field, dipole_gradient
+from magfusion.model.coil_field import coil_fields, coil_fields_and_gradients
 from magfusion.model.site import Beacon, Magnetometer
 from magfusion.units import Array, ComplexArray
 
@@ -86,12 +86,6 @@ def _turned(excitation: ComplexArray, phase: Array | None) -> ComplexArray:
     return excitation if phase is None else excitation * np.exp(1j * phase)[..., None, :]
 
 
-def _coil_fields(beacon: Beacon, offset_beacon: Array) -> tuple[Array, Array]:
-    """Offset from, and field of, each coil; shape (..., coils, 3), beacon axes."""
-    offset = offset_beacon[..., None, :] - beacon.centres_beacon
-    return offset, dipole_field(offset, beacon.moments_beacon)
-
-
 class _Mapped(NamedTuple):
     """What a field map makes of the model, beacon axes."""
 
@@ -133,7 +127,7 @@ def predict(
         ]
         return np.stack(apart, axis=-1)
     offset = _offset_beacon(beacon, magnetometer, world_from_body, position_world)
-    _, coils = _coil_fields(beacon, offset)
+    coils = coil_fields(beacon, offset)
     mapped = _mapped(beacon, offset, coils)
     if mapped is not None:
         coils = (mapped.correction @ coils[..., None])[..., 0]
@@ -155,10 +149,11 @@ def observe(
 
     ::
 
-        Y = S sensor_from_body body_from_world C world_from_beacon [G(r_j) m_j]_j X
+        Y = S sensor_from_body body_from_world C world_from_beacon [B_j(r_j)]_j X
             diag(exp(i phase))
 
-    C is the beacon's field map at the sensor, the identity where it has none.
+    B_j is the field of a coil as it is declared (`magfusion.model.coil_field`), and C the
+    beacon's field map at the sensor, the identity where it has none.
 
     Parameters
     ----------
@@ -289,14 +284,13 @@ def _seen(
     phase: Array | None,
 ) -> _Seen:
     offset_beacon = _offset_beacon(beacon, magnetometer, world_from_body, position_world)
-    offset, coils = _coil_fields(beacon, offset_beacon)
+    coils, gradients = coil_fields_and_gradients(beacon, offset_beacon)
     tones_from_coils = np.swapaxes(_turned(beacon.excitation, phase), -1, -2)
     body_from_beacon = _times(np.swapaxes(world_from_body, -1, -2), beacon.world_from_beacon)
     beacon_from_body = np.swapaxes(body_from_beacon, -1, -2)
     body_from_sensor = magnetometer.body_from_sensor @ magnetometer.matrix.T  # not a rotation
     measured_from_beacon = np.swapaxes(_times(beacon_from_body, body_from_sensor), -1, -2)
     # Coil by coil all is real; only their sum in a tone is complex.
-    gradients = dipole_gradient(offset, beacon.moments_beacon)
     mapped = _mapped(beacon, offset_beacon, coils)
     if mapped is not None:
         coils = (mapped.correction @ coils[..., None])[..., 0]

@@ -27,7 +27,7 @@ class Coil:
     centre_beacon : ndarray, shape (3,)
         Magnetic centre relative to the beacon's origin (m).
     radius, length : float, optional
-        Finite size (m); the simulator uses it, the dipole model does not.
+        Finite size (m), of which `magfusion.model.coil_field` makes the field; None for a dipole.
     frequency_hz : float, optional
         Drive frequency where it differs from the beacon's (frequency division).
     slot : int, optional

@@ -1,0 +1,101 @@
+"""The fields of a beacon's coils as they are declared: dipoles, loops, current sheets.
+
+A coil without a size is a dipole.  One with a radius is a thin loop, one with a length as well a
+uniform current sheet, one with a length alone a line of dipoles (paper 002, Eq 2-3): those with a
+length are as many loops, or dipoles, as Gauss and Legendre's rule has nodes.  The relative error
+is below 1e-9 from half a length off the axis, and below 1e-6 from three tenths of it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.model.physics.dipole import dipole_field, dipole_gradient
+from magfusion.model.physics.loop import loop_field, loop_field_and_gradient
+from magfusion.model.site import Beacon, Coil
+from magfusion.units import Array, IntArray
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
+
+
+class _Loops(NamedTuple):
+    """What stands for the coils of a beacon."""
+
+    centre: Array  # (loops, 3), beacon axes (m)
+    moment: Array  # (loops, 3), beacon axes (A m^2)
+    radius: Array  # (loops,), zero for a dipole (m)
+    first: IntArray  # (coils,), the first loop of each
+
+
+def _sized(beacon: Beacon) -> bool:
+    return any(coil.radius is not None or coil.length is not None for coil in beacon.coils)
+
+
+def _loops(coils: tuple[Coil, ...]) -> _Loops:
+    nodes, weights = zip(*(_slices(coil) for coil in coils), strict=True)
+    count = [len(weight) for weight in weights]
+    moment = np.repeat([coil.moment_beacon for coil in coils], count, axis=0)
+    axis = moment / np.linalg.norm(moment, axis=1, keepdims=True)
+    centre = np.repeat([coil.centre_beacon for coil in coils], count, axis=0)
+    return _Loops(
+        centre=centre + np.concatenate(nodes)[:, None] * axis,
+        moment=np.concatenate(weights)[:, None] * moment,
+        radius=np.repeat([coil.radius or 0.0 for coil in coils], count),
+        first=np.concatenate([[0], np.cumsum(count[:-1])]).astype(np.int64),
+    )
+
+
+def _slices(coil: Coil) -> tuple[Array, Array]:
+    """Return positions along the axis (m) and weights that sum to one."""
+    if coil.length is None:
+        return np.zeros(1), np.ones(1)
+    return 0.5 * coil.length * _NODES, 0.5 * _WEIGHTS
+
+
+def coil_fields(beacon: Beacon, offset_beacon: Array) -> Array:
+    """Return the field of each coil at its peak current.
+
+    Parameters
+    ----------
+    offset_beacon : ndarray, shape (..., 3)
+        From the beacon's origin, beacon axes (m).
+
+    Returns
+    -------
+    ndarray, shape (..., coils, 3)
+        Beacon axes (T).
+    """
+    if not _sized(beacon):
+        offset = offset_beacon[..., None, :] - beacon.centres_beacon
+        return dipole_field(offset, beacon.moments_beacon)
+    loops = _loops(beacon.coils)
+    field = loop_field(offset_beacon[..., None, :] - loops.centre, loops.moment, loops.radius)
+    return np.asarray(np.add.reduceat(field, loops.first, axis=-2))
+
+
+def coil_fields_and_gradients(beacon: Beacon, offset_beacon: Array) -> tuple[Array, Array]:
+    """Return the field of each coil at its peak current, with its gradient.
+
+    Parameters
+    ----------
+    offset_beacon : ndarray, shape (..., 3)
+        From the beacon's origin, beacon axes (m).
+
+    Returns
+    -------
+    field : ndarray, shape (..., coils, 3)
+        Beacon axes (T).
+    gradient : ndarray, shape (..., coils, 3, 3)
+        ``[i, j] = d field_i / d offset_j`` (T/m).
+    """
+    if not _sized(beacon):
+        offset, moments = offset_beacon[..., None, :] - beacon.centres_beacon, beacon.moments_beacon
+        return dipole_field(offset, moments), dipole_gradient(offset, moments)
+    loops = _loops(beacon.coils)
+    field, gradient = loop_field_and_gradient(
+        offset_beacon[..., None, :] - loops.centre, loops.moment, loops.radius
+    )
+    return (
+        np.asarray(np.add.reduceat(field, loops.first, axis=-2)),
+        np.asarray(np.add.reduceat(gradient, loops.first, axis=-3)),
+    )
