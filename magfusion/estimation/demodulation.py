@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.integrity.detection import without_silence
+from magfusion.estimation.integrity.detection import drowned, without_silence
 from magfusion.estimation.motion_compensation import MotionCompensated, demodulate_about
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.likelihood import fix_epochs
@@ -22,7 +22,7 @@ from magfusion.receiver.receiver import LockinReceiver, Receiver
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.turn import on_clock
 from magfusion.receiver.windows import LockinSettings
-from magfusion.units import Array
+from magfusion.units import Array, BoolArray
 
 REST_EPOCH = 0.5  # s; over which the specific force at rest is averaged
 
@@ -41,6 +41,9 @@ class Demodulation:
         Of the waveform; None where the log holds phasors.
     windows : Windows, optional
         That it admitted.
+    drowned : bool ndarray, shape (n, channels), optional
+        Phasors left out of ``fields`` in which the motion may hide a beacon; None where the log
+        holds phasors.
     """
 
     log: Log
@@ -48,6 +51,7 @@ class Demodulation:
     dropped: Mapping[str, int]
     receiver: Receiver | None = None
     windows: Windows | None = None
+    drowned: BoolArray | None = None
 
     def steady(self, calibration: Calibration) -> SteadyFields:
         """Return the Earth field and the offset before anything is known of the motion.
@@ -113,7 +117,8 @@ def demodulated(log: Log, site: Site, settings: LockinSettings | None = None) ->
         return Demodulation(log, without_silence(log.fields), {})
     receiver = Receiver.of(site, settings)
     windows, fields = receiver.whole(log.waveform, log.imu)
-    return Demodulation(log, without_silence(fields), receiver.dropped, receiver, windows)
+    heard, hidden = without_silence(fields), drowned(fields)
+    return Demodulation(log, heard, receiver.dropped, receiver, windows, hidden)
 
 
 def phasors(

@@ -10,7 +10,11 @@ from magfusion.estimation.graph import Graph, initial_estimate
 from magfusion.estimation.imu_decimation import preintegrate_stream
 from magfusion.estimation.inertial import Link, Preintegrated, inertial_graph, links_between
 from magfusion.estimation.initialization.chain import Start
-from magfusion.estimation.integrity.detection import only
+from magfusion.estimation.integrity.detection import (
+    DETECTION_CHI_SQUARE_ONLINE,
+    detected,
+    only,
+)
 from magfusion.estimation.measurements.earth import earth_measurement, unheld
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import field_phasors
@@ -80,6 +84,8 @@ class PreparedLog:
     def compensated(self, calibration: Calibration, states: Trajectory) -> MotionCompensated:
         """Return the phasors with the motion taken off, by the stream that a calibration corrects.
 
+        With those of the beacons that the motion hid.
+
         Parameters
         ----------
         states : Trajectory
@@ -88,7 +94,10 @@ class PreparedLog:
         imu, log = corrected_imu(calibration, self.blocks, self.imu), self.demodulation.log
         known = replace(self.demodulation, log=log if imu is log.imu else replace(log, imu=imu))
         wave = known.compensated(calibration, self.at_fields(states))
-        return replace(wave, fields=only(wave.fields, self.samples.valid))
+        heard, hidden = self.samples.valid, self.demodulation.drowned
+        if hidden is not None and np.any(hidden):
+            heard = heard | hidden & detected(wave.fields, DETECTION_CHI_SQUARE_ONLINE)
+        return replace(wave, fields=only(wave.fields, heard))
 
     def rests(self, standing: BoolArray) -> Measurement:
         """Return the zero velocities of some epochs."""

@@ -63,7 +63,8 @@ def begin(
         return [
             OfflineStart(_by_earth(samples, steady, log.imu, calibration.site), calibration, None)
         ]
-    some = samples if steady is None else samples.rows(detected)
+    # An epoch that hears nothing has no fix at all, and would end the chain somewhere.
+    some = samples.rows(detected) if np.sum(detected) >= LEAST_DETECTED else samples
     epochs, gravity = fix_inputs(some, log, calibration.site)
     fixes = fix_epochs(epochs, calibration, gravity=gravity)
     # A beacon that fell silent, or is false, would lead the chain astray.

@@ -32,6 +32,19 @@ def without_silence(samples: FieldSamples) -> FieldSamples:
     return only(samples, ~silent) if np.any(silent) else samples
 
 
+def drowned(samples: FieldSamples) -> BoolArray:
+    """Tell which phasors no beacon would be told from noise in, shape (n, channels).
+
+    Among those that `without_silence` leaves out: were the beacon as loud as usual there, the noise
+    would hide it, as fast motion beside another coil does before it is compensated.
+    """
+    heard = detected(samples, DETECTION_CHI_SQUARE_ONLINE)
+    power = np.where(heard, np.sum(np.abs(samples.phasor_sensor) ** 2, axis=-1), np.nan)
+    usual = np.nanmedian(np.where(heard.any(axis=0), power, 0.0), axis=0)
+    share = np.sum(whitening(samples.phasor_cov, samples.valid) ** 2, axis=(-1, -2)) / 3.0
+    return np.asarray(samples.valid & ~heard & (usual * share <= DETECTION_CHI_SQUARE_ONLINE))
+
+
 def detected(samples: FieldSamples, least: float = DETECTION_CHI_SQUARE) -> BoolArray:
     """Tell which phasors are of a beacon, shape (n, channels): more than noise, and for longer.
 
