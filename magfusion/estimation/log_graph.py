@@ -12,7 +12,7 @@ from magfusion.estimation.inertial import Link, Preintegrated, inertial_graph, l
 from magfusion.estimation.initialization.chain import Start
 from magfusion.estimation.integrity.detection import (
     DETECTION_CHI_SQUARE_ONLINE,
-    detected,
+    above_noise,
     only,
 )
 from magfusion.estimation.measurements.earth import earth_measurement, unheld
@@ -96,7 +96,7 @@ class PreparedLog:
         wave = known.compensated(calibration, self.at_fields(states))
         heard, hidden = self.samples.valid, self.demodulation.drowned
         if hidden is not None and np.any(hidden):
-            heard = heard | hidden & detected(wave.fields, DETECTION_CHI_SQUARE_ONLINE)
+            heard = heard | hidden & above_noise(wave.fields, DETECTION_CHI_SQUARE_ONLINE)
         return replace(wave, fields=only(wave.fields, heard))
 
     def rests(self, standing: BoolArray) -> Measurement:

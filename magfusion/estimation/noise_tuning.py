@@ -28,7 +28,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
 PRIOR = float(np.log(2.0))  # of the logarithm of a declared sigma
-LEAST, MOST = 1e-3, 1e3  # of a factor
+LEAST, MOST = 0.1, 1e3  # of a factor; that a noise is smaller yet, no log tells for sure
 STUDENT = 4.0  # degrees of freedom: what is false says little
 # Gain, by components, with which that distribution finds the variance of normal residuals.
 NORMAL = {3: 1.322946, 6: 1.224631}

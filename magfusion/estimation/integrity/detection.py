@@ -45,6 +45,16 @@ def drowned(samples: FieldSamples) -> BoolArray:
     return np.asarray(samples.valid & ~heard & (usual * share <= DETECTION_CHI_SQUARE_ONLINE))
 
 
+def above_noise(samples: FieldSamples, least: float) -> BoolArray:
+    """Tell which phasors have more than so much of chi square against nothing, (n, channels)."""
+    sqrt_information = whitening(samples.phasor_cov, samples.valid)
+    phasor = np.nan_to_num(samples.phasor_sensor)[..., None]
+    square = (
+        np.abs(sqrt_information @ phasor.real) ** 2 + np.abs(sqrt_information @ phasor.imag) ** 2
+    )
+    return np.asarray(samples.valid & (np.sum(square, axis=(-1, -2)) > least))
+
+
 def detected(samples: FieldSamples, least: float = DETECTION_CHI_SQUARE) -> BoolArray:
     """Tell which phasors are of a beacon, shape (n, channels): more than noise, and for longer.
 
@@ -56,14 +66,9 @@ def detected(samples: FieldSamples, least: float = DETECTION_CHI_SQUARE) -> Bool
     least : float
         Chi square of a phasor's six components against nothing.
     """
-    sqrt_information = whitening(samples.phasor_cov, samples.valid)
-    phasor = np.nan_to_num(samples.phasor_sensor)[..., None]
-    square = (
-        np.abs(sqrt_information @ phasor.real) ** 2 + np.abs(sqrt_information @ phasor.imag) ** 2
-    )
-    loud = samples.valid & (np.sum(square, axis=(-1, -2)) > least)
+    loud = above_noise(samples, least)
     if len(samples) < 2:
-        return np.asarray(loud)
+        return loud
     step = float(np.median(np.diff(samples.time)))
     reach = int(np.ceil(np.median(samples.window) / step - 1e-6))
     whole = np.ones((2 * reach + 1, 1), dtype=bool)
