@@ -232,6 +232,24 @@ def test_coils_with_centres_of_their_own_turn_with_the_beacon(synchronised: bool
     )
 
 
+@pytest.mark.parametrize("kind", ["rotating", "three tones"])
+def test_coils_of_true_size_are_fitted_as_such(kind: str) -> None:
+    """To a micrometre where points would be wrong by millimetres."""
+    points = any_beacon(kind, synchronised=True)
+    coils = tuple(replace(coil, radius=0.3) for coil in points.coils)
+    declared = replace(points, coils=coils)
+    true = truth_of(declared)
+    measured = measured_of(declared, true, 1, 1e-15)
+    fits, refined = calibrate_one(measured, 1.5)
+    np.testing.assert_allclose(fits.centre_world[0], true.position_world, rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(
+        refined.beacon.world_from_beacon, true.world_from_beacon, rtol=0.0, atol=1e-6
+    )
+    np.testing.assert_allclose(refined.beacon.moments_beacon, true.moments_beacon, atol=1e-3)
+    plain, _ = calibrate_one(replace(measured, beacon=points), 1.5)
+    assert np.linalg.norm(plain.centre_world[0] - true.position_world) > 1e-3
+
+
 def misalignment(found: Array, true: Array) -> Array:
     return np.asarray(Rotation.from_matrix(np.swapaxes(found, -1, -2) @ true).as_rotvec())
 

@@ -109,6 +109,9 @@ class BeaconFits:
 def calibrate_beacon(measured: BeaconMeasurements, reach: float = REACH) -> BeaconFits:
     """Find centre and moments of a beacon by variable projection, seeded on a grid.
 
+    Its coils are points: the field of a coil of true size is linear in its current alone, not in
+    its axis; `magfusion.calibration.beacon_refined.calibrate_one` knows the size.
+
     Parameters
     ----------
     reach : float
@@ -198,7 +201,7 @@ def _columns(measured: BeaconMeasurements, centre: Array) -> tuple[Array, Array]
         coil = beacon.coils[int(np.flatnonzero(beacon.excitation[:, tone])[0])]
         # The field of a moment along each axis of the world, as if in slots of their own.
         axes = tuple(
-            replace(coil, moment_beacon=axis, phase=0.0, slot=slot)
+            replace(coil, moment_beacon=axis, phase=0.0, slot=slot, radius=None, length=None)
             for slot, axis in enumerate(beacon.world_from_beacon)
         )
         alone = replace(beacon, position_world=np.zeros(3), coils=axes, field_map=None)

@@ -13,7 +13,8 @@ from magfusion.calibration.beacon import (
 )
 from magfusion.estimation.snapshot.candidates import wahba
 from magfusion.estimation.solve.batched import Normal, minimise, moved_poses, normal_equations
-from magfusion.model.field import observe
+from magfusion.model.coil_field import as_points, is_sized
+from magfusion.model.field import observe, predict
 from magfusion.model.site import Beacon, BeaconSigma
 from magfusion.units import Array, ComplexArray, IntArray
 
@@ -113,9 +114,10 @@ def _parts(columns: ComplexArray) -> Array:
 
 
 def calibrate_one(measured: BeaconMeasurements, reach: float) -> tuple[BeaconFits, RefinedBeacon]:
-    """Calibrate a beacon whose coils may have centres of their own, from one run.
+    """Calibrate a beacon whose coils may have centres and sizes of their own, from one run.
 
-    Their offsets turn with the attitude that is to be found: the fit is repeated with what it
+    Their offsets turn with the attitude that is to be found, and so does what their size adds to
+    the field of points, which is taken off the measurements: the fit is repeated with what it
     found until that stays.
 
     Parameters
@@ -123,13 +125,22 @@ def calibrate_one(measured: BeaconMeasurements, reach: float) -> tuple[BeaconFit
     reach : float
         As in `magfusion.calibration.beacon.calibrate_beacon` (m).
     """
-    declared = measured.beacon
-    for _ in range(TURNS if declared.centres_beacon.any() else 1):
+    declared, seen, sized = measured.beacon, measured.phasor_sensor, is_sized(measured.beacon)
+    for _ in range(TURNS if sized or declared.centres_beacon.any() else 1):
         fits = calibrate_beacon(measured, reach)
         found, _ = attitudes(measured.beacon, fits.moments_world)
         used = measured
-        measured = replace(measured, beacon=replace(declared, world_from_beacon=found[0]))
+        turned = replace(declared, world_from_beacon=found[0])
+        of_size = _of_size(measured, refine(measured, fits)) if sized else 0.0
+        measured = replace(measured, beacon=turned, phasor_sensor=seen - of_size)
     return fits, refine(used, fits)
+
+
+def _of_size(measured: BeaconMeasurements, found: RefinedBeacon) -> ComplexArray:
+    """Return what the coils' size adds to the phasors of points, shape (points, tones, 3)."""
+    place = (measured.magnetometer, measured.world_from_body, measured.position_world)
+    phase = np.broadcast_to(found.phase, (len(measured.position_world), len(found.phase)))
+    return predict(found.beacon, *place, phase) - predict(as_points(found.beacon), *place, phase)
 
 
 def refine(measured: BeaconMeasurements, fits: BeaconFits, run: int = 0) -> RefinedBeacon:

@@ -6,6 +6,7 @@ length are as many loops, or dipoles, as Gauss and Legendre's rule has nodes.  T
 is below 1e-9 from half a length off the axis, and below 1e-6 from three tenths of it.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -27,8 +28,15 @@ class _Loops(NamedTuple):
     first: IntArray  # (coils,), the first loop of each
 
 
-def _sized(beacon: Beacon) -> bool:
+def is_sized(beacon: Beacon) -> bool:
+    """Tell whether a coil of the beacon is declared with a size."""
     return any(coil.radius is not None or coil.length is not None for coil in beacon.coils)
+
+
+def as_points(beacon: Beacon) -> Beacon:
+    """Return the beacon with a dipole in place of each coil."""
+    points = tuple(replace(coil, radius=None, length=None) for coil in beacon.coils)
+    return replace(beacon, coils=points)
 
 
 def _loops(coils: tuple[Coil, ...]) -> _Loops:
@@ -65,7 +73,7 @@ def coil_fields(beacon: Beacon, offset_beacon: Array) -> Array:
     ndarray, shape (..., coils, 3)
         Beacon axes (T).
     """
-    if not _sized(beacon):
+    if not is_sized(beacon):
         offset = offset_beacon[..., None, :] - beacon.centres_beacon
         return dipole_field(offset, beacon.moments_beacon)
     loops = _loops(beacon.coils)
@@ -88,7 +96,7 @@ def coil_fields_and_gradients(beacon: Beacon, offset_beacon: Array) -> tuple[Arr
     gradient : ndarray, shape (..., coils, 3, 3)
         ``[i, j] = d field_i / d offset_j`` (T/m).
     """
-    if not _sized(beacon):
+    if not is_sized(beacon):
         offset, moments = offset_beacon[..., None, :] - beacon.centres_beacon, beacon.moments_beacon
         return dipole_field(offset, moments), dipole_gradient(offset, moments)
     loops = _loops(beacon.coils)
