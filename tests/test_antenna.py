@@ -37,8 +37,10 @@ from magfusion.model.antenna import (
     antenna_of,
     observe_antenna,
 )
-from magfusion.model.field import Observation, observe, observe_from, predict
+from magfusion.model.field import observe, observe_from, predict
 from magfusion.model.physics.dipole import dipole_field
+from magfusion.model.physics.finite_size import coil_kappa, coil_shape
+from magfusion.model.receive_coils import Observation
 from magfusion.model.site import Magnetometer
 from magfusion.papers.p000_tracker.bench import bench_points, helmert, measure
 from magfusion.papers.p000_tracker.equations import (
@@ -128,6 +130,55 @@ def _observe(sensor: Magnetometer) -> tuple[Observation, np.ndarray, np.ndarray]
     return observe(site.beacons[0], sensor, attitude, place, None, twist), attitude, place
 
 
+@pytest.mark.parametrize(("radius", "length"), [(0.04, None), (None, 0.12), (0.03, 0.1)])
+def test_a_receiving_coil_measures_its_mean_flux(
+    radius: float | None, length: float | None
+) -> None:
+    """Against the mean over the coil, by many points; and the antenna's own model of it."""
+    rng = np.random.default_rng(5)
+    site = tracker_site(rng, centre=0.0)
+    beacon, kappa = site.beacons[0], coil_kappa(radius, length)
+    sensor = replace(site.platform.magnetometer, coil_kappa=kappa, coil_centres_sensor=None)
+    point = replace(sensor, coil_kappa=0.0)
+    attitude, place = body_poses(site, 4, rng)
+    found = predict(beacon, sensor, attitude, place)
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    turn = np.arange(8) * np.pi / 4.0
+    for i, axis in enumerate(sensor.matrix / np.linalg.norm(sensor.matrix, axis=1)[:, None]):
+        across = np.linalg.svd(axis[None])[2][1:]
+        circle = np.cos(turn)[:, None] * across[0] + np.sin(turn)[:, None] * across[1]
+        mean = np.zeros(found.shape[:-1], dtype=complex)
+        for z, share in zip(nodes, weights, strict=True):
+            for s, part in zip(nodes, weights, strict=True):
+                ring = (radius or 0.0) * np.sqrt(0.5 * (s + 1.0)) * circle
+                for spot in ring + 0.5 * (length or 0.0) * z * axis:
+                    arm = sensor.position_body + sensor.body_from_sensor @ spot
+                    at = replace(point, position_body=arm)
+                    mean += share * part / 32.0 * predict(beacon, at, attitude, place)[..., i]
+        plain = predict(beacon, point, attitude, place)[..., i]
+        assert np.max(np.abs(found[..., i] - mean)) < 0.1 * np.max(np.abs(plain - mean))
+    seen = observe_antenna(antenna_of(beacon, sensor), *in_beacon(site, attitude, place))
+    turned_back = np.exp(-0.3j * np.arange(3))[:, None]
+    apart = np.swapaxes(found * turned_back, 1, 2) - seen.value
+    far = np.swapaxes(predict(beacon, point, attitude, place) * turned_back, 1, 2) - seen.value
+    assert np.max(np.abs(apart)) < 0.1 * np.max(np.abs(far))
+
+
+def test_shape_and_constant_of_a_coil() -> None:
+    assert coil_kappa(0.2, None) == pytest.approx(0.005)
+    assert coil_kappa(0.1, 0.1 * np.sqrt(3.0)) == pytest.approx(0.0, abs=1e-18)
+    for kappa, length in ((3e-3, None), (-2e-3, None), (1e-3, 0.2), (-1e-3, 0.2), (-1e-2, 0.2)):
+        assert coil_kappa(*coil_shape(kappa, length)) == pytest.approx(kappa, rel=1e-12)
+
+
+def test_coils_of_different_size_are_no_antenna() -> None:
+    site = tracker_site(np.random.default_rng(0))
+    first, *others = site.beacons[0].coils
+    mixed = replace(site.beacons[0], coils=(replace(first, radius=0.1), *others))
+    with pytest.raises(InputError, match="coils of different size"):
+        antenna_of(mixed, site.platform.magnetometer)
+
+
 def test_coils_at_one_place_change_nothing() -> None:
     sensor = tracker_site(np.random.default_rng(5), centre=0.0).platform.magnetometer
     plain, _, _ = _observe(sensor)
@@ -143,10 +194,11 @@ def test_coils_at_one_place_change_nothing() -> None:
         np.testing.assert_allclose(getattr(moved, name), getattr(lever, name), rtol=1e-9)
 
 
-def test_derivatives_with_coils_apart() -> None:
+@pytest.mark.parametrize("kappa", [0.0, 2e-3, -3e-3])
+def test_derivatives_with_coils_apart(kappa: float) -> None:
     rng = np.random.default_rng(5)
     site = tracker_site(rng, centre=0.01)
-    beacon, sensor = site.beacons[0], site.platform.magnetometer
+    beacon, sensor = site.beacons[0], replace(site.platform.magnetometer, coil_kappa=kappa)
     seen, attitude, place = _observe(sensor)
 
     def turn(matrix: np.ndarray, step: np.ndarray) -> np.ndarray:

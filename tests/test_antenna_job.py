@@ -13,6 +13,7 @@ from tracker_site import body_poses, in_beacon, tracker_site
 
 from magfusion.files.site import load_site, save_site
 from magfusion.files.survey import Survey, write_survey
+from magfusion.model.coil_field import as_points
 from magfusion.model.field import predict
 from magfusion.model.site import Site
 from magfusion.units import DEGREE, MU0_OVER_4PI
@@ -128,6 +129,32 @@ def test_exact_poses_are_exact(true_site: Site, given: Callable[[Survey], list[s
     assert sized["parameters"] == 38
     kappa, sigma = (float(str(sized[f"receiver_kappa_m2{s}"])) for s in ("", "_sigma"))
     assert abs(kappa) < 4.0 * sigma  # the coils are points
+
+
+def test_sizes_are_written_for_every_estimator(
+    tmp_path: Path, true_site: Site, given: Callable[[Survey], list[str]]
+) -> None:
+    """The refined site predicts what coils of 4 cm measure; one of points cannot."""
+    beacon, sensor = true_site.beacons[0], true_site.platform.magnetometer
+    coils = tuple(replace(coil, radius=0.04) for coil in beacon.coils)
+    sized = replace(
+        true_site,
+        beacons=(replace(beacon, coils=coils),),
+        platform=replace(true_site.platform, magnetometer=replace(sensor, coil_kappa=1e-4)),
+    )
+    exact = ["--pose-rotation-deg", "0", "--pose-position-m", "0"]
+    arguments = [*given(make_survey(sized, 60, 6, exact=True)), *exact]
+    poses = body_poses(true_site, 20, np.random.default_rng(8))
+    truth = predict(sized.beacons[0], sized.platform.magnetometer, *poses)
+    run([*arguments, "--sizes"])
+    found = load_site(tmp_path / "out" / "site.yaml")
+    seen = predict(found.beacons[0], found.platform.magnetometer, *poses)
+    points = replace(found.platform.magnetometer, coil_kappa=0.0)
+    without = predict(as_points(found.beacons[0]), points, *poses)
+    errors = [np.linalg.norm(phasor - truth) for phasor in (without, seen)]
+    assert found.beacons[0].coils[0].radius == pytest.approx(0.04, rel=0.1)
+    assert found.platform.magnetometer.coil_kappa == pytest.approx(1e-4, rel=0.3)
+    assert errors[1] < 0.3 * errors[0]
 
 
 def test_a_lost_tone_costs_its_pose(true_site: Site, given: Callable[[Survey], list[str]]) -> None:

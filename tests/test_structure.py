@@ -95,6 +95,14 @@ def test_the_line_of_commands_knows_no_job() -> None:
     assert {name.split(".")[2] for name in seen} <= {"JOBS", "GROUPS", "failure", "settings"}
 
 
+def test_the_simulator_has_its_own_physics_of_coils() -> None:
+    """Biot and Savart's sum contradicts the estimators' closed form, if that is wrong."""
+    seen: set[str] = set()
+    for place in ("simulation/field.py", "model/physics/solenoid.py"):
+        seen |= set(_imports(ast.parse((PACKAGE / place).read_text())))
+    assert not any("loop.loop_" in name or "coil_field" in name for name in seen)
+
+
 def test_only_the_view_imports_rerun() -> None:
     assert all(name.startswith("magfusion/results/recording") for name in _importers("rerun"))
 

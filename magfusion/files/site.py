@@ -210,6 +210,7 @@ def _magnetometer(entry: MagnetometerEntry) -> Magnetometer:
         sigma=_model(MagnetometerSigma, entry.sigma),
         coil_centres_sensor=entry.coil_centres_m,
         offset_walk=entry.offset_walk_t,
+        coil_kappa=entry.coil_kappa_m2,
     )
 
 
@@ -347,6 +348,8 @@ def _imu_entry(imu: ImuModel) -> dict[str, Any]:
 def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
     sigma, centres = magnetometer.sigma, magnetometer.coil_centres_sensor
     own = {} if centres is None else {"coil_centres_m": _plain(centres)}
+    if magnetometer.coil_kappa != Magnetometer.coil_kappa:
+        own["coil_kappa_m2"] = float(magnetometer.coil_kappa)
     if magnetometer.offset_walk != Magnetometer.offset_walk:
         own["offset_walk_t"] = float(magnetometer.offset_walk)
     return own | {

@@ -36,7 +36,7 @@ from magfusion.files.site_values import (
     tesla,
 )
 from magfusion.files.yaml_files import StrictModel
-from magfusion.model.site import Beacon, ClockModel, EarthModel, MotionModel, Site
+from magfusion.model.site import Beacon, ClockModel, EarthModel, Magnetometer, MotionModel, Site
 from magfusion.units import DEGREE, Array
 
 
@@ -259,6 +259,7 @@ class MagnetometerEntry(StrictModel):
     )
     offset_t: Annotated[Array, array(3), tesla(LARGEST_OFFSET)] = Field(default_factory=_zeros)
     coil_centres_m: Annotated[Array, array(3, 3, largest=10.0, unit="m")] | None = None
+    coil_kappa_m2: Annotated[float, between(-1.0, 1.0)] = Magnetometer.coil_kappa
     offset_walk_t: Annotated[_NotNegative, tesla(LARGEST_OFFSET)] = 2e-8  # gained in an hour
     sigma: MagnetometerSigmaEntry = Field(default_factory=MagnetometerSigmaEntry)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.jobs.settings import Command, Settings, argument, option, required
-from magfusion.model.site import Beacon, Site
+from magfusion.model.site import Beacon, Coil, Site
 from magfusion.units import DEGREE, Array
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ FEWEST_POSES = 5  # four determine the antenna; with less than one to spare noth
 FOLDS = 5  # each pose is judged by an antenna that was fitted without it
 # What a nominal antenna may be off by; wide, since the couplings say more.
 GAIN_SIGMA, TILT_SIGMA, CENTRE_SIGMA, KAPPA_SIGMA = 0.05, 0.05, 0.01, 1e-3
+KAPPA_KEPT = 1e-12  # m^2; a micrometre squared
 _AXES = "xyz"
 
 
@@ -42,7 +43,7 @@ class AntennaSettings(Settings):
     pose_position_m: float = option(
         0.0005, "Error of the survey's positions, one sigma an axis", least=0.0, note="0: exact"
     )
-    sizes: bool = option(False, "Estimate the coils' size too (for the report alone)")
+    sizes: bool = option(False, "Estimate the coils' size too")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -51,6 +52,11 @@ class AntennaSettings(Settings):
                 "--pose-rotation-deg and --pose-position-m must both be 0 (poses exact) or both"
                 " above"
             )
+
+    @property
+    def kappa_sigma(self) -> float:
+        """Prior of the coils' size (m^2): where it is not asked for, that declared is kept."""
+        return KAPPA_SIGMA if self.sizes else KAPPA_KEPT
 
     @property
     def exact(self) -> bool:
@@ -95,12 +101,12 @@ def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
     with named(survey_path):
         survey, dropped = _couplings(read_survey(survey_path), site, beacon)
         before = _pose_errors(start, survey)
-    if settings.sizes:
+    if settings.sizes and start.kappa_beacon is None:
         start = antenna_from_vector(np.concatenate([start.vector(), np.zeros(2)]))
     fit = with_receiver_gain(_fit(survey, start, settings), start)
     observed = observability(survey, fit.antenna)
     after = _left_out(survey, start, settings)
-    fit, trust = judged(fit, _estimates(fit, start), observed.null_space, before, after)
+    fit, trust = judged(fit, _estimates(fit, start, settings), observed.null_space, before, after)
     figures = (
         heading(JOB, survey_path.stem)
         | trust_figures(trust)
@@ -110,7 +116,7 @@ def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
             Figure("poses_dropped", dropped),
         )
     )
-    estimates = _estimates(fit, start)
+    estimates = _estimates(fit, start, settings)
     record = calibration_record(survey_path.stem, estimates)
     figures |= _error_figures(before, after) | _figures(fit, observed, start, settings)
     figures |= determined_figures(estimates)
@@ -205,7 +211,7 @@ def _fit(survey: AntennaSurvey, start: Antenna, settings: AntennaSettings) -> An
     from magfusion.calibration.antenna import fit_at_known_poses, prior_sigma
     from magfusion.calibration.antenna_graph import fit_at_uncertain_poses
 
-    sigma = prior_sigma(start, GAIN_SIGMA, TILT_SIGMA, CENTRE_SIGMA, KAPPA_SIGMA)
+    sigma = prior_sigma(start, GAIN_SIGMA, TILT_SIGMA, CENTRE_SIGMA, settings.kappa_sigma)
     if settings.exact:
         return fit_at_known_poses(survey, start, sigma)
     return fit_at_uncertain_poses(
@@ -265,16 +271,17 @@ def _error_figures(before: tuple[Array, Array], after: tuple[Array, Array]) -> F
     return Figures(*figures)
 
 
-def _estimates(fit: AntennaFit, start: Antenna) -> list[Estimate]:
+def _estimates(fit: AntennaFit, start: Antenna, settings: AntennaSettings) -> list[Estimate]:
     from magfusion.calibration.antenna import prior_sigma
     from magfusion.results.figures import Estimate
 
     blocks = ("transmitter.moment", "transmitter.centre", "receiver.matrix", "receiver.centre")
     names = [f"{block}_{coil}{axis}" for block in blocks for coil in _AXES for axis in _AXES]
     found = fit.antenna.vector()
-    names = [*names, "transmitter.kappa", "receiver.kappa"][: len(found)]
+    names += ["transmitter.kappa", "receiver.kappa"] if settings.sizes else []
     prior = prior_sigma(start, GAIN_SIGMA, TILT_SIGMA, CENTRE_SIGMA, KAPPA_SIGMA)
-    rows = zip(names, found - start.vector(), np.diagonal(fit.cov), prior, strict=True)
+    columns = (found - start.vector(), np.diagonal(fit.cov), prior)
+    rows = zip(names, *(column[: len(names)] for column in columns), strict=True)
     return [
         Estimate(name, float(change), sigma=float(np.sqrt(variance)), prior_sigma=float(before))
         for name, change, variance, before in rows
@@ -330,7 +337,7 @@ def _refined(site: Site, beacon: Beacon, fit: AntennaFit, record: dict[str, obje
     blocks = [fit.cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(3)]
     log_moment = np.sqrt([a @ c @ a for a, c in zip(along, blocks, strict=True)]) / size
     coils = tuple(
-        replace(coil, moment_beacon=moment, centre_beacon=centre)
+        _of_size(replace(coil, moment_beacon=moment, centre_beacon=centre), antenna.kappa_beacon)
         for coil, moment, centre in zip(
             beacon.coils, antenna.moments_beacon, antenna.centres_beacon, strict=True
         )
@@ -340,6 +347,7 @@ def _refined(site: Site, beacon: Beacon, fit: AntennaFit, record: dict[str, obje
         sensor,
         matrix=antenna.sensitivities_sensor,
         coil_centres_sensor=antenna.centres_sensor,
+        coil_kappa=0.0 if antenna.kappa_sensor is None else float(antenna.kappa_sensor),
         sigma=replace(sensor.sigma, matrix=sigma[SENSITIVITIES].reshape(3, 3)),
     )
     known, owners = site.correlation, (beacon.name, "magnetometer")
@@ -350,6 +358,16 @@ def _refined(site: Site, beacon: Beacon, fit: AntennaFit, record: dict[str, obje
         calibration=record,
         correlation=known and known.without(("moments", "magnetometer"), owners),
     )
+
+
+def _of_size(coil: Coil, kappa: Array | None) -> Coil:
+    """Return the coil as the circular, or long, one of this size."""
+    from magfusion.model.physics.finite_size import coil_shape
+
+    if kappa is None:
+        return coil
+    radius, length = coil_shape(float(kappa), coil.length)
+    return replace(coil, radius=radius, length=length)
 
 
 COMMAND = Command(AntennaSettings, run_calibrate_antenna, output="antenna")

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.model.physics.finite_size import coil_coupling
+from magfusion.model.physics.finite_size import coil_coupling, coil_kappa
 from magfusion.model.site import Beacon, Magnetometer
 from magfusion.units import Array
 
@@ -83,24 +83,33 @@ def antenna_from_vector(vector: Array) -> Antenna:
 
 
 def antenna_of(beacon: Beacon, magnetometer: Magnetometer) -> Antenna:
-    """Return the antenna that a site declares, its coils as points.
+    """Return the antenna that a site declares; without sizes where no coil has one.
 
     Raises
     ------
     InputError
-        Where the beacon has not three coils, each alone in its tone or time slot.
+        Where the beacon has not three coils, each alone in its tone or time slot, or where these
+        are of different size.
     """
     if len(beacon.coils) != 3 or len(beacon.tones) != 3:
         raise InputError(
             f"beacon {beacon.name} has {len(beacon.coils)} coils in {len(beacon.tones)} tones or"
             " slots; a tracker needs three coils, each with a frequency or slot of its own"
         )
+    kappas = np.array([coil_kappa(coil.radius, coil.length) for coil in beacon.coils])
+    if np.ptp(kappas) > 1e-6 * np.max(np.abs(kappas)):
+        raise InputError(
+            f"beacon {beacon.name} has coils of different size, and an antenna is calibrated with"
+            " one; give all three the same radius_m and length_m"
+        )
+    sizes = (kappas[0], np.array(magnetometer.coil_kappa))
     centres = magnetometer.coil_centres_sensor
     return Antenna(
         moments_beacon=beacon.moments_beacon,
         centres_beacon=beacon.centres_beacon,
         sensitivities_sensor=magnetometer.matrix,
         centres_sensor=np.zeros((3, 3)) if centres is None else centres,
+        **dict(zip(("kappa_beacon", "kappa_sensor"), sizes, strict=True) if any(sizes) else ()),
     )
 
 

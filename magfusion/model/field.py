@@ -3,50 +3,21 @@
 Every solver predicts through `observe`; the simulator does not.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, overload
 
 import numpy as np
 
 from magfusion.model.coil_field import coil_fields, coil_fields_and_gradients
+from magfusion.model.receive_coils import (
+    Observation,
+    is_apart,
+    joined,
+    joined_phasors,
+    points_apart,
+)
 from magfusion.model.site import Beacon, Magnetometer
 from magfusion.units import Array, ComplexArray
-
-
-@dataclass(frozen=True, eq=False)
-class Observation:
-    """Predicted phasors of one beacon with their Jacobian blocks.
-
-    Every block has the shape of ``phasor_sensor`` with one axis more, of the length given.
-
-    Parameters
-    ----------
-    phasor_sensor : complex ndarray, shape (..., tones, 3)
-        (T), measured axes.
-    platform_pose : complex ndarray, 6
-        Right perturbation of world_from_body: rotation, translation, body axes (T/rad, T/m).
-    beacon_pose : complex ndarray, 6
-        Right perturbation of world_from_beacon: rotation, translation, beacon axes.
-    log_moments : complex ndarray, coils
-        Logarithm of each coil's moment (T).
-    phase : complex ndarray
-        Drive phase of the phasor's own tone; no further axis (T/rad).
-    matrix : complex ndarray, 9
-        Magnetometer matrix, row by row (T).
-    body_from_sensor : complex ndarray, 6
-        Right perturbation of the sensor's pose in the body: rotation, translation, sensor axes.
-    time_offset : complex ndarray, optional
-        IMU time offset; no further axis (T/s).  None where no twist was given.
-    """
-
-    phasor_sensor: ComplexArray
-    platform_pose: ComplexArray
-    beacon_pose: ComplexArray
-    log_moments: ComplexArray
-    phase: ComplexArray
-    matrix: ComplexArray
-    body_from_sensor: ComplexArray
-    time_offset: ComplexArray | None
 
 
 @overload
@@ -120,12 +91,12 @@ def predict(
     phase: Array | None = None,
 ) -> ComplexArray:
     """Return the phasors that `observe` returns, shape (..., tones, 3) (T), without Jacobian."""
-    if magnetometer.coil_centres_sensor is not None:
-        apart = [
-            predict(beacon, axis, world_from_body, position_world, phase)[..., i]
-            for i, axis in enumerate(_axes_apart(magnetometer))
+    if is_apart(magnetometer):
+        seen = [
+            predict(beacon, at, world_from_body, position_world, phase)
+            for at in points_apart(magnetometer)
         ]
-        return np.stack(apart, axis=-1)
+        return joined_phasors(seen, magnetometer)
     offset = _offset_beacon(beacon, magnetometer, world_from_body, position_world)
     coils = coil_fields(beacon, offset)
     mapped = _mapped(beacon, offset, coils)
@@ -174,12 +145,12 @@ def observe(
     Observation
         Leading axes as those of the poses.
     """
-    if magnetometer.coil_centres_sensor is not None:
+    if is_apart(magnetometer):
         apart = [
-            observe(beacon, axis, world_from_body, position_world, phase, twist_body)
-            for axis in _axes_apart(magnetometer)
+            observe(beacon, at, world_from_body, position_world, phase, twist_body)
+            for at in points_apart(magnetometer)
         ]
-        return _joined(apart, magnetometer.coil_centres_sensor)
+        return joined(apart, magnetometer)
     mounting, matrix = magnetometer.body_from_sensor, magnetometer.matrix
     seen = _seen(beacon, magnetometer, world_from_body, position_world, phase)
     phasor, platform_pose = seen.phasor_sensor, seen.platform_pose
@@ -224,39 +195,11 @@ def observe_from(
     phase: Array | None = None,
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return phasor_sensor and platform_pose of `observe` alone, at a fraction of the cost."""
-    if magnetometer.coil_centres_sensor is not None:
+    if is_apart(magnetometer):
         whole = observe(beacon, magnetometer, world_from_body, position_world, phase)
         return whole.phasor_sensor, whole.platform_pose
     seen = _seen(beacon, magnetometer, world_from_body, position_world, phase)
     return seen.phasor_sensor, seen.platform_pose
-
-
-def _axes_apart(magnetometer: Magnetometer) -> list[Magnetometer]:
-    """Return a magnetometer for each axis, at its own coil: only that axis of it is true."""
-    assert magnetometer.coil_centres_sensor is not None
-    return [
-        replace(
-            magnetometer,
-            position_body=magnetometer.position_body + magnetometer.body_from_sensor @ centre,
-            coil_centres_sensor=None,
-        )
-        for centre in magnetometer.coil_centres_sensor
-    ]
-
-
-def _joined(apart: list[Observation], centres_sensor: Array) -> Observation:
-    """Return the observation whose axis i is that of the i-th."""
-    fields = {
-        name: np.stack([getattr(o, name)[..., i, :] for i, o in enumerate(apart)], axis=-2)
-        for name in ("platform_pose", "beacon_pose", "log_moments", "matrix", "body_from_sensor")
-    }
-    for i, centre in enumerate(centres_sensor):  # the mounting turns the coils' centres too
-        turning = fields["body_from_sensor"][..., i, :]
-        turning[..., :3] -= turning[..., 3:] @ skew(centre)
-    for name in ("phasor_sensor", "phase"):
-        fields[name] = np.stack([getattr(o, name)[..., i] for i, o in enumerate(apart)], axis=-1)
-    offsets = [o.time_offset[..., i] for i, o in enumerate(apart) if o.time_offset is not None]
-    return Observation(**fields, time_offset=np.stack(offsets, axis=-1) if offsets else None)
 
 
 class _Seen(NamedTuple):

@@ -299,6 +299,8 @@ class Magnetometer:
         ``position_body``.
     offset_walk : float
         Standard deviation that the offset gains in an hour (T).
+    coil_kappa : float
+        Finite size of each axis's coil (m^2, `magfusion.model.receive_coils`); zero for a point.
     """
 
     position_body: Array
@@ -309,6 +311,7 @@ class Magnetometer:
     sigma: MagnetometerSigma
     coil_centres_sensor: Array | None = None
     offset_walk: float = 2e-8
+    coil_kappa: float = 0.0
 
 
 @dataclass(frozen=True)

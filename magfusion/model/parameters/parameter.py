@@ -8,7 +8,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.model.field import EarthObservation, Observation
+from magfusion.model.field import EarthObservation
+from magfusion.model.receive_coils import Observation
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Beacon, Site
 from magfusion.units import DEGREE, Array, ComplexArray

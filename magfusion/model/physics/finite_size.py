@@ -59,6 +59,29 @@ def square_kappa(side: float) -> float:
     return side**2 / 24.0
 
 
+def coil_kappa(radius: float | None, length: float | None) -> float:
+    """Return the constant of a coil's shape, ``radius^2 / 8 - length^2 / 24`` (m^2).
+
+    Its moments are spread over a disc and along a line; at a length of ``sqrt(3)`` radii they
+    cancel.
+    """
+    return disc_kappa(radius or 0.0) - (length or 0.0) ** 2 / 24.0
+
+
+def coil_shape(kappa: float, length: float | None = None) -> tuple[float | None, float | None]:
+    """Return radius and length (m) of a coil of such a constant; None for none.
+
+    Parameters
+    ----------
+    length : float, optional
+        That is known; another one only where no radius would do with it.
+    """
+    square = 8.0 * kappa + (length or 0.0) ** 2 / 3.0
+    if square >= 0.0:
+        return (float(np.sqrt(square)) or None), length
+    return None, float(np.sqrt(-24.0 * kappa))
+
+
 @dataclass(frozen=True, eq=False)
 class CoilCoupling:
     """Flux density that a coil senses of another, and its derivatives.

@@ -1,0 +1,127 @@
+"""Axes of a magnetometer that are coils of their own: each at its centre, and of some size.
+
+The flux through a coil is the mean over it of a field without divergence and curl, the field at its
+centre and its second derivative along the axis: ``(1 - kappa d^2/dn^2) n . B``, for a flat coil
+``radius^2 / 8``, for a long one ``-length^2 / 24`` (`magfusion.model.physics.finite_size`).  Here
+that is a sum over three points on the axis, a long coil's that of Gauss and Legendre; what is left
+is of the fourth power of size over distance.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.model.site import Magnetometer
+from magfusion.units import Array, ComplexArray
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """Predicted phasors of one beacon with their Jacobian blocks.
+
+    Every block has the shape of ``phasor_sensor`` with one axis more, of the length given.
+
+    Parameters
+    ----------
+    phasor_sensor : complex ndarray, shape (..., tones, 3)
+        (T), measured axes.
+    platform_pose : complex ndarray, 6
+        Right perturbation of world_from_body: rotation, translation, body axes (T/rad, T/m).
+    beacon_pose : complex ndarray, 6
+        Right perturbation of world_from_beacon: rotation, translation, beacon axes.
+    log_moments : complex ndarray, coils
+        Logarithm of each coil's moment (T).
+    phase : complex ndarray
+        Drive phase of the phasor's own tone; no further axis (T/rad).
+    matrix : complex ndarray, 9
+        Magnetometer matrix, row by row (T).
+    body_from_sensor : complex ndarray, 6
+        Right perturbation of the sensor's pose in the body: rotation, translation, sensor axes.
+    time_offset : complex ndarray, optional
+        IMU time offset; no further axis (T/s).  None where no twist was given.
+    """
+
+    phasor_sensor: ComplexArray
+    platform_pose: ComplexArray
+    beacon_pose: ComplexArray
+    log_moments: ComplexArray
+    phase: ComplexArray
+    matrix: ComplexArray
+    body_from_sensor: ComplexArray
+    time_offset: ComplexArray | None
+
+
+def is_apart(magnetometer: Magnetometer) -> bool:
+    """Tell whether the axes do not measure the field at one and the same point."""
+    return magnetometer.coil_centres_sensor is not None or magnetometer.coil_kappa != 0.0
+
+
+def _centres_sensor(magnetometer: Magnetometer) -> Array:
+    centres = magnetometer.coil_centres_sensor
+    return np.zeros((3, 3)) if centres is None else centres
+
+
+def _along(magnetometer: Magnetometer) -> tuple[Array, Array]:
+    """Return places along a coil's axis (m), and their weights, which sum to one."""
+    kappa = magnetometer.coil_kappa
+    if kappa == 0.0:
+        return np.zeros(1), np.ones(1)
+    reach = np.sqrt(2.0 * abs(kappa))
+    side = -0.5 * np.sign(kappa)
+    return reach * np.array([-1.0, 0.0, 1.0]), np.array([side, 1.0 - 2.0 * side, side])
+
+
+def points_apart(magnetometer: Magnetometer) -> list[Magnetometer]:
+    """Return a magnetometer at each point, axis by axis: only that axis of it is true."""
+    centres, (places, _) = _centres_sensor(magnetometer), _along(magnetometer)
+    axes = magnetometer.matrix / np.linalg.norm(magnetometer.matrix, axis=1, keepdims=True)
+    return [
+        replace(
+            magnetometer,
+            position_body=magnetometer.position_body
+            + magnetometer.body_from_sensor @ (centre + place * axis),
+            coil_centres_sensor=None,
+            coil_kappa=0.0,
+        )
+        for centre, axis in zip(centres, axes, strict=True)
+        for place in places
+    ]
+
+
+def joined_phasors(apart: list[ComplexArray], magnetometer: Magnetometer) -> ComplexArray:
+    """Return what the coils measure, of the phasors (..., tones, 3) at `points_apart`."""
+    weights = _along(magnetometer)[1]
+    count = len(weights)
+    rows = [sum(w * apart[i * count + k][..., i] for k, w in enumerate(weights)) for i in range(3)]
+    return np.stack(rows, axis=-1)
+
+
+def joined(apart: list[Observation], magnetometer: Magnetometer) -> Observation:
+    """Return the observation of the coils, of those at `points_apart`."""
+    centres, (places, weights) = _centres_sensor(magnetometer), _along(magnetometer)
+    count, names = len(weights), ("platform_pose", "beacon_pose", "log_moments")
+    blocks: dict[str, list[ComplexArray]] = {n: [] for n in (*names, "matrix", "body_from_sensor")}
+    for i, (row, centre) in enumerate(zip(magnetometer.matrix, centres, strict=True)):
+        size = np.linalg.norm(row)
+        axis = row / size
+        across = (np.eye(3) - np.outer(axis, axis)) / size
+        own: dict[str, ComplexArray] = {}
+        for k, (place, weight) in enumerate(zip(places, weights, strict=True)):
+            seen = apart[i * count + k]
+            parts = {name: getattr(seen, name)[..., i, :] for name in names}
+            mounting = seen.body_from_sensor[..., i, :].copy()
+            matrix = seen.matrix[..., i, :].copy()
+            # The mounting turns the coil's points, and the row of the matrix turns its axis.
+            mounting[..., :3] -= np.cross(mounting[..., 3:], centre + place * axis)
+            matrix[..., 3 * i : 3 * i + 3] += place * mounting[..., 3:] @ across
+            parts |= {"matrix": matrix, "body_from_sensor": mounting}
+            own = {name: own.get(name, 0.0) + weight * part for name, part in parts.items()}
+        for name, part in own.items():
+            blocks[name].append(part)
+    offsets = [o.time_offset for o in apart if o.time_offset is not None]
+    return Observation(
+        **{name: np.stack(rows, axis=-2) for name, rows in blocks.items()},
+        phasor_sensor=joined_phasors([o.phasor_sensor for o in apart], magnetometer),
+        phase=joined_phasors([o.phase for o in apart], magnetometer),
+        time_offset=joined_phasors(offsets, magnetometer) if offsets else None,
+    )
