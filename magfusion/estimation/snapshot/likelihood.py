@@ -13,6 +13,7 @@ from magfusion.estimation.snapshot.candidates import attitudes, positions
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA, Epochs, Problem, State, epochs_of
 from magfusion.estimation.snapshot.refine import Solved, as_fixes, cost, joined, solved_from
+from magfusion.model.coil_field import is_sized
 from magfusion.model.parameters import Calibration
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trajectory import Trajectory
@@ -21,6 +22,7 @@ from magfusion.units import Array, BoolArray, IntArray
 CANDIDATES = 10  # positions that get an attitude
 REFINED = 6  # of these, how many are refined
 HYPOTHESES = 4  # of these, how many are returned
+SOFT = 0.03  # relative error of a phasor, in the first refinement beside coils of true size
 SAME_POSITION = 0.02  # m; two solutions closer than this and SAME_ROTATION are one
 SAME_ROTATION = 0.02  # rad
 
@@ -72,6 +74,9 @@ def _solve(epochs: Epochs) -> Fixes:
     problem = epochs.problem
     start, count = _starts(problem)
     epoch = np.repeat(np.arange(len(problem.time)), count)
+    if any(is_sized(beacon) for beacon in problem.calibration.site.beacons):
+        # Candidates are those of dipoles: at full weight some end short of the minimum.
+        start = solved_from(_softened(problem).rows(epoch), start).state
     solved = solved_from(problem.rows(epoch), start)
     best = np.argmin(solved.cost.reshape(-1, count), axis=1) + count * np.arange(len(problem.time))
     again = epochs.reweighed(solved.state.rotation[best], solved.state.position[best])
@@ -85,6 +90,14 @@ def _solve(epochs: Epochs) -> Fixes:
     kept = (order + count * np.arange(len(order))[:, None]).ravel()
     found = Solved(solved.state.rows(kept), solved.cost[kept], solved.information[kept])
     return replace(as_fixes(problem.rows(epoch[kept]), found, order.shape[1]), cost=ranked)
+
+
+def _softened(problem: Problem) -> Problem:
+    """Return the problem with an error of `SOFT` in each phasor, relative to its size."""
+    parts = np.stack([problem.measured[..., :3], problem.measured[..., 3:]], axis=-1)
+    square = np.sum((problem.sqrt_information @ parts) ** 2, axis=(-1, -2))[..., None, None]
+    share = 1.0 / np.sqrt(1.0 + SOFT**2 / 6.0 * square)
+    return replace(problem, sqrt_information=share * problem.sqrt_information)
 
 
 def _starts(problem: Problem) -> tuple[State, int]:
