@@ -133,15 +133,23 @@ def cause_of(
         return None
     known = snapshots_of(samples, part.imu, site)
     tried = _of_fields(known, samples, _steady(part, site))
-    best = clearly_best(tried)
-    if best is not None:
-        return best, best.text(f"the fields at {len(known.samples)} epochs")
-    rest = None if any(one.clear for one in tried) else _unexplained(known)
-    if rest is not None:
-        return rest
-    best = clearly_best(_of_motion(known, samples, part.imu))
-    if best is not None:
-        return best, best.text("the motion by the fields against that by the inertial sensor")
+    of_fields, of_motion = clearly_best(tried), None
+    if known.chi_square < MISFIT * known.freedom:
+        # As declared the fields may be so: what explains them is weighed against what moves.
+        of_motion = clearly_best(_of_motion(known, samples, part.imu))
+    elif of_fields is None and any(one.clear for one in tried):
+        return None  # it is of the fields, whichever it is: no inertial sensor explains it
+    elif of_fields is None:
+        rest = _unexplained(known)
+        if rest is not None:
+            return rest
+        of_motion = clearly_best(_of_motion(known, samples, part.imu))
+    if of_motion is not None and (of_fields is None or of_motion.fall > of_fields.fall):
+        return of_motion, of_motion.text(
+            "the motion by the fields against that by the inertial sensor"
+        )
+    if of_fields is not None:
+        return of_fields, of_fields.text(f"the fields at {len(known.samples)} epochs")
     return None
 
 
@@ -201,7 +209,7 @@ def _of_fields(known: Snapshots, samples: FieldSamples, steady: float | None) ->
     if clearly_best(tried) is None:
         tried += global_causes(known)
     # Where the platform stands, and of one beacon that may be wrong in two ways, no more is told.
-    if _moves(known) and not any(one.clear for one in tried):
+    if _moves(known) and not any(one.clear and one.after < known.freedom for one in tried):
         tried += survey_causes(known)
     return tried
 

@@ -52,15 +52,19 @@ class Explanation:
         return self.after + PENALTY * self.found
 
     @property
+    def fall(self) -> float:
+        """By how much chi square falls, less that price."""
+        return self.before - self.score
+
+    @property
     def clear(self) -> bool:
         """Whether it explains so much that it is worth saying."""
-        fall = self.before - self.score
         enough = self.after < max(ENOUGH * self.expected, LITTLE * self.before)
         # A bias or a lever arm that its prior holds back costs little, however sure it is.
         noise = max(self.after / max(self.expected, 1.0), 1e-9)
-        significant = self.found > 0 and fall / self.found > SIGNIFICANT * noise
+        significant = self.found > 0 and self.fall / self.found > SIGNIFICANT * noise
         clearly = self.before > CLEARLY * self.after or significant
-        return enough and fall > LEAST_FALL and clearly
+        return enough and self.fall > LEAST_FALL and clearly
 
     def as_well_as(self, other: "Explanation") -> bool:
         """Return whether it leaves hardly more than another."""

@@ -34,6 +34,7 @@ ACCEL_UNITS = {
 }
 LATEST = 3.0  # s
 PARTS = 4  # of a log, in each of which a delay is sought
+UNUSUAL = 3.0  # sigmas of a declared time offset
 LARGEST_BIAS = {"gyro": 0.5, "accel": 1.5}  # rad/s, m/s^2; what is larger is no bias
 EYE = np.eye(3)
 
@@ -245,12 +246,14 @@ def timing_causes(
     if steady is not None:
         after, _ = steady.explained(EYE, EYE)
         offset = after
+    # What every estimator finds, as its sigma says that it may be, is no mistake.
+    if steady is not None and abs(middle) > UNUSUAL * site.platform.imu.time_offset_sigma:
         yield Explanation(
             "time_offset",
             f"the inertial stamps are {middle:.3g} s late against the magnetometer's",
             "Correct the stamps, or declare platform.imu.time_offset_s.",
             before,
-            after * freedom / steady.freedom,
+            offset * freedom / steady.freedom,
             freedom,
             1,
         )
