@@ -129,6 +129,24 @@ def test_a_standard_stream_that_is_closed_or_full_is_told(
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("fix LOG -o OUT --start 1e300", "holds no row from 1e.300 s"),
+        ("fix LOG -o OUT --mains-hz 0.01", "--mains-hz must be 0 for none, or at least 10 Hz"),
+        ("simulate -o OUT --box 0,1e300,0,1,0,1", "--box .*within 100000 m of the origin"),
+        ("coverage LOG/site.yaml -o OUT --box 0,1e-9,0,1,0,1", "--box .* 0.001 m apart"),
+    ],
+)
+def test_an_option_beyond_what_is_is_told(
+    line: str, said: str, worked: Worked, tmp_path: Path, refuse: Refuse
+) -> None:
+    names = {"LOG": str(worked.log), "OUT": str(tmp_path / "run")}
+    for name, path in names.items():
+        line = line.replace(name, path)
+    assert re.search(said, refuse(*line.split()))
+
+
 # Files ----------------------------------------------------------------------------------------
 
 

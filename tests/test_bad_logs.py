@@ -12,6 +12,10 @@ from example_log import EPOCH_NS, example_log
 
 from magfusion.errors import InputError
 from magfusion.files.log import read_log, write_log
+from magfusion.files.parquet_bounds import MOST_ROWS
+from magfusion.files.plausible import check_imu
+from magfusion.model.samples import ImuSamples
+from magfusion.units import Array
 
 
 def _rewrite(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
@@ -44,6 +48,24 @@ def _twice(row: int) -> Callable[[dict[str, Any]], object]:
     return change
 
 
+def _most(column: str, row: int, value: object) -> Callable[[dict[str, Any]], object]:
+    """Write a value, or that of the row, into most rows from there on."""
+
+    def change(columns: dict[str, Any]) -> None:
+        count = 4 * (len(columns[column]) - row) // 5
+        found = columns[column][row] if value is None else value
+        columns[column][row : row + count] = [found] * count
+
+    return change
+
+
+def _hours_later(row: int) -> Callable[[dict[str, Any]], object]:
+    def change(columns: dict[str, Any]) -> None:
+        columns["time_ns"][row:] = [t + 7200 * 10**9 for t in columns["time_ns"][row:]]
+
+    return change
+
+
 def _microseconds(columns: dict[str, Any]) -> None:
     columns["time_ns"] = [EPOCH_NS + (t - EPOCH_NS) // 1000 for t in columns["time_ns"]]
 
@@ -58,13 +80,14 @@ BAD_TABLES = [
     ("imu", lambda c: c.pop("time_ns"), "column time_ns is missing"),
     ("imu", lambda c: c.update(gyro_x=["a"] * 400), "column gyro_x holds string; write numbers"),
     ("imu", lambda c: c.update(time_ns=[t * 1e-9 for t in c["time_ns"]]), "time_ns holds double"),
-    ("imu", _set("accel_z", 17, float("nan")), r"column accel_z, row 17 .*: found nan"),
+    ("imu", _most("accel_z", 17, float("nan")), r"column accel_z, row 17 .*: found nan"),
     ("imu", _set("gyro_x", 399, float("inf")), r"column gyro_x, row 399 .*: found inf"),
     ("imu", _set("gyro_x", 3, None), r"column gyro_x, row 3 .*: found no value"),
     ("imu", _set("time_ns", 3, None), r"column time_ns, row 3 .*: found no value"),
     ("imu", _set("time_ns", 40, EPOCH_NS), r"column time_ns, row 40 .*sort the rows"),
     ("imu", _set("time_ns", 399, 2**63 - 1), r"column time_ns, row 399 .*write nanoseconds"),
-    ("imu", _twice(7), r"column time_ns, row 8 .*remove one"),
+    ("imu", _most("time_ns", 8, None), r"column time_ns, row 9 .*remove one"),
+    ("imu", _hours_later(40), r"column time_ns, row 40 .*the clock jumped"),
     ("imu", lambda c: [v.clear() for v in c.values()], "holds no rows"),
     ("imu", _scale(_axes("accel"), 1 / 9.80665), "probably in g"),
     ("imu", _scale(_axes("gyro"), 180 / np.pi), "probably in deg/s"),
@@ -72,7 +95,7 @@ BAD_TABLES = [
     ("magnetometer", lambda c: c.pop("field_z"), "column field_z is missing"),
     ("magnetometer", _scale(_axes("field"), 1e9), "divide nanotesla by 1e9"),
     ("magnetometer", _scale(_axes("field"), 1e4), "gauss by 1e4"),
-    ("magnetometer", _twice(0), r"column time_ns, row 1 .*remove one"),
+    ("magnetometer", _most("time_ns", 0, None), r"column time_ns, row 1 .*remove one"),
     ("fields", lambda c: c.pop("sigma"), "column sigma is missing"),
     ("fields", lambda c: c.pop("cov_yz"), "column cov_yz is missing"),
     ("fields", lambda c: c.update(beacon=[1] * len(c["tone"])), "beacon holds int64; write text"),
@@ -232,3 +255,72 @@ def test_any_damage_to_a_table_is_noticed(tmp_path: Path) -> None:
             np.testing.assert_array_equal(found.gyro_body, expected.gyro_body)
             np.testing.assert_array_equal(found.accel_body, expected.accel_body)
     assert refused > 30
+
+
+# What is no reason to refuse a log ------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stem", ["imu", "magnetometer"])
+def test_samples_without_a_number_or_a_time_of_their_own_are_left_out_and_counted(
+    tmp_path: Path, stem: str
+) -> None:
+    walk = tmp_path / "walk"
+    write_log(example_log(), walk)
+    whole = read_log(walk)
+    column = "gyro_x" if stem == "imu" else "field_z"
+    _rewrite(walk / f"{stem}.parquet", _set(column, 9, float("nan")))
+    _rewrite(walk / f"{stem}.parquet", _twice(7))
+    found = read_log(walk)
+    before, after = (
+        (log.imu.time if stem == "imu" else log.waveform.time)  # type: ignore[union-attr]
+        for log in (whole, found)
+    )
+    assert np.array_equal(after, np.delete(before, 9))
+    assert [finding.code for finding in found.noticed] == ["repeated_stamps", "missing_samples"]
+    assert all("1 samples" in finding.text for finding in found.noticed)
+
+
+def _imu(gyro_body: Array, accel_body: Array) -> ImuSamples:
+    return ImuSamples(0.01 * np.arange(len(gyro_body)), gyro_body, accel_body)
+
+
+def test_a_spike_or_a_stuck_gyroscope_is_not_told_to_be_in_degrees() -> None:
+    rng = np.random.default_rng(5)
+    gyro, accel = 0.1 * rng.normal(size=(1000, 3)), np.tile([0.0, 0.0, 9.81], (1000, 1))
+    gyro[[100, 500]] = 1e5
+    check_imu(_imu(gyro, accel), "imu")
+    with pytest.raises(InputError, match="no gyroscope measures"):
+        check_imu(_imu(np.full((1000, 3), 100.0), accel), "imu")
+
+
+def test_an_acceleration_of_one_is_in_g_only_if_it_keeps_its_direction() -> None:
+    """On a circle without gravity the acceleration turns with the body, and gravity does not."""
+    angle = 0.02 * np.arange(1000)
+    gyro = np.tile([0.0, 0.0, 2.0], (1000, 1))
+    check_imu(_imu(gyro, np.tile([1.0, 0.0, 0.0], (1000, 1))), "imu")
+    still = np.stack([np.cos(angle), -np.sin(angle), np.zeros(1000)], axis=1)
+    with pytest.raises(InputError, match="probably in g"):
+        check_imu(_imu(gyro, still), "imu")
+
+
+def test_a_small_file_of_many_rows_is_refused_and_a_part_of_it_read(tmp_path: Path) -> None:
+    walk, rows = tmp_path / "walk", MOST_ROWS + 1
+    write_log(example_log(), walk)
+    names = pa.parquet.read_schema(walk / "imu.parquet").names
+    zeros = pa.array(np.zeros(rows, dtype=np.float32))
+    columns = {name: zeros for name in names}
+    columns["time_ns"] = pa.array(EPOCH_NS + 1_000_000 * np.arange(rows))
+    encoded = {"time_ns": "DELTA_BINARY_PACKED"}
+    pa.parquet.write_table(
+        pa.table(columns),
+        walk / "imu.parquet",
+        use_dictionary=names[1:],
+        column_encoding=encoded,
+        compression="zstd",
+    )
+    assert (walk / "imu.parquet").stat().st_size < 1 << 20
+    with pytest.raises(InputError, match=r"imu\.parquet: holds more than 10000000 rows"):
+        read_log(walk)
+    part = read_log(walk, 0.2, 0.8)
+    assert len(part.imu) == 600
+    assert part.imu.time[0] == pytest.approx(0.2)

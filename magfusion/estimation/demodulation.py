@@ -103,6 +103,9 @@ class Demodulation:
         return demodulate_about(operator, waveform.measured_sensor, states, imu, calibration)
 
 
+OFF_GRAVITY = 0.5  # of it; a specific force farther from it is not its opposite
+
+
 def demodulated(log: Log, site: Site, settings: LockinSettings | None = None) -> Demodulation:
     """Return the phasors of a log, demodulated where it has a waveform.
 
@@ -153,7 +156,12 @@ def gravity_at_rest(imu: ImuSamples, site: Site, time: Array) -> Gravity | None:
     noise = site.platform.imu.accel_noise / np.sqrt(REST_EPOCH)
     sigma = np.hypot(site.platform.imu.accel_bias_sigma, noise) / site.gravity
     near = np.abs(stamps[nearest] - time) < REST_EPOCH
-    return Gravity(mean / size, np.where(still[nearest] & near, sigma, np.inf))
+    weight = np.abs(size[:, 0] / site.gravity - 1.0) < OFF_GRAVITY
+    known = still[nearest] & near & weight
+    if not np.any(known):
+        return None
+    up = np.divide(mean, size, out=np.tile([0.0, 0.0, 1.0], (len(mean), 1)), where=size > 0.0)
+    return Gravity(up, np.where(known, sigma, np.inf))
 
 
 def first_fixes(

@@ -50,6 +50,8 @@ def naming(path: Path, unfinished: Path | None = None) -> Iterator[None]:
     try:
         yield
     except OSError as error:
+        if error.errno is None:
+            raise  # not the system's
         named = str(path) if error.filename is None else str(error.filename)
         error.filename = named if unfinished is None else named.replace(str(unfinished), str(path))
         raise

@@ -47,8 +47,8 @@ def read_correlation(path: Path) -> tuple[Correlation, Array]:
         raise InputError(f"{path}: there is no such correlation; {again}")
     try:
         table = pa.parquet.read_table(path)
-    except (pa.ArrowInvalid, OSError) as error:
-        reason = str(error).splitlines()[0]
+    except (pa.ArrowException, OSError, ValueError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{path}: is no correlation ({reason}); {again}") from error
     missing = [name for name in _COLUMNS if name not in table.column_names]
     if missing:
@@ -58,7 +58,7 @@ def read_correlation(path: Path) -> tuple[Correlation, Array]:
         parameters = tuple(Component(str(g), str(o), str(k), int(c)) for g, o, k, c in rows)
         sigma = np.array(table["sigma"].to_pylist(), dtype=np.float64)
         found = np.array(table["correlation"].to_pylist(), dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: a column holds no numbers; {again}") from error
     if not _is_correlation(found, len(parameters)) or len(set(parameters)) < len(parameters):
         raise InputError(f"{path}: holds what no correlation is; {again}")

@@ -5,7 +5,6 @@ their place: the headers' wording differs between the data sets that share the f
 """
 
 import csv
-from functools import partial
 from pathlib import Path
 
 from magfusion.errors import InputError
@@ -52,13 +51,16 @@ def read_euroc(path: Path, start: float | None = None, end: float | None = None)
     field = find_table(streams / "mag0", "data")
     truth = find_table(streams / "state_groundtruth_estimate0", "data")
     span = Span(_first_stamp(imu), start, end)
+    samples, of_imu = read_imu(imu, span, _IMU)
+    waveform, of_waveform = read_waveform(field, span, _FIELD)
     return Log(
         name=path.resolve().name,
         epoch_ns=span.epoch_ns,
         source="EuRoC folder",
-        imu=read_imu(imu, span, _IMU),
-        waveform=read_if_there(field, partial(read_waveform, names=_FIELD), span),
+        imu=samples,
+        waveform=waveform,
         truth=read_if_there(truth, _read_truth, span),
+        noticed=(*of_imu, *of_waveform),
     )
 
 

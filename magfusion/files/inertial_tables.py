@@ -8,21 +8,31 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.files.plausible import check_field, check_imu
-from magfusion.files.table import TIME, Layout, Span, read_table, write_table
+from magfusion.files.table import TIME, Layout, Span, Table, read_table, write_table
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import Array
 
-Stream = TypeVar("Stream", Waveform, FieldSamples, Trajectory)
+Stream = TypeVar("Stream", FieldSamples, Trajectory)
 
 _GYRO = ("gyro_x", "gyro_y", "gyro_z")
 _ACCEL = ("accel_x", "accel_y", "accel_z")
 _FIELD = ("field_x", "field_y", "field_z")
-_IMU_LAYOUT = Layout(numbers=(*_GYRO, *_ACCEL))
-_FIELD_LAYOUT = Layout(numbers=_FIELD)
+_IMU_LAYOUT = Layout(numbers=(*_GYRO, *_ACCEL), repeats=True)
+_FIELD_LAYOUT = Layout(numbers=_FIELD, repeats=True)
+MOST_MISSING, MOST_TWICE = 0.5, 0.1  # of the rows; more is a mistake of the recording
 
 
-def read_imu(path: Path, span: Span, names: tuple[str, ...] = ()) -> ImuSamples:
+def read_imu(
+    path: Path, span: Span, names: tuple[str, ...] = ()
+) -> tuple[ImuSamples, tuple[Finding, ...]]:
     """Read and check inertial samples; ``names`` as in `read_table`.
+
+    Returns
+    -------
+    ImuSamples, tuple of Finding
+        Without rows that hold NaN or whose time stands twice, and how many these are.
 
     Raises
     ------
@@ -32,9 +42,10 @@ def read_imu(path: Path, span: Span, names: tuple[str, ...] = ()) -> ImuSamples:
     table = read_table(path, _IMU_LAYOUT, span, names)
     if not len(table):
         raise InputError(f"{path}: holds no row {span}; choose a span that the log covers.")
-    imu = ImuSamples(table.time, table.numbers(_GYRO), table.numbers(_ACCEL))
+    time, values, noticed = _measured(table, (*_GYRO, *_ACCEL), "IMU")
+    imu = ImuSamples(time, values[:, :3].copy(), values[:, 3:].copy())
     check_imu(imu, str(path))
-    return imu
+    return imu, noticed
 
 
 def write_imu(imu: ImuSamples, path: Path, epoch_ns: int) -> None:
@@ -45,18 +56,54 @@ def write_imu(imu: ImuSamples, path: Path, epoch_ns: int) -> None:
     write_table(columns, path)
 
 
-def read_waveform(path: Path, span: Span, names: tuple[str, ...] = ()) -> Waveform:
+def read_waveform(
+    path: Path | None, span: Span, names: tuple[str, ...] = ()
+) -> tuple[Waveform | None, tuple[Finding, ...]]:
     """Read and check magnetometer samples; ``names`` as in `read_table`.
+
+    Returns
+    -------
+    Waveform or None, tuple of Finding
+        As `read_imu`; None where there is no file or no row within the span.
 
     Raises
     ------
     InputError
         As `read_table` and `check_field`.
     """
+    if path is None:
+        return None, ()
     table = read_table(path, _FIELD_LAYOUT, span, names)
-    waveform = Waveform(table.time, table.numbers(_FIELD))
-    check_field(np.linalg.norm(waveform.measured_sensor, axis=1), str(path))
-    return waveform
+    if not len(table):
+        return None, ()
+    time, values, noticed = _measured(table, _FIELD, "magnetometer")
+    check_field(np.linalg.norm(values, axis=1), str(path))
+    return Waveform(time, values), noticed
+
+
+def _measured(
+    table: Table, names: tuple[str, ...], stream: str
+) -> tuple[Array, Array, tuple[Finding, ...]]:
+    """Return times (s) and columns of the rows that hold a sample, and what the others are."""
+    values = table.numbers(names, nan=True)
+    twice = np.asarray(np.diff(table.time_ns, prepend=table.time_ns[:1] - 1) == 0)
+    absent = np.asarray(np.any(np.isnan(values), axis=1))
+    if np.mean(twice) > MOST_TWICE:
+        remedy = "the time of the row above: remove one of the two"
+        table.refuse(twice, TIME, table.time_ns, remedy)
+    if np.mean(absent) > MOST_MISSING:
+        name = next(n for n, v in zip(names, values.T, strict=True) if np.isnan(v).any())
+        table.refuse(absent, name, np.full(len(table), np.nan), "write a finite number")
+    noticed = [
+        Finding(code, f"{stream}: {text} They are left out.", Verdict.TRUSTWORTHY)
+        for code, text in (
+            ("repeated_stamps", f"{np.sum(twice)} samples have the stamp of the one before."),
+            ("missing_samples", f"{np.sum(absent)} samples are NaN."),
+        )
+        if (twice if code == "repeated_stamps" else absent).any()
+    ]
+    kept = ~(twice | absent)
+    return table.time[kept], values[kept], tuple(noticed)
 
 
 def write_waveform(waveform: Waveform, path: Path, epoch_ns: int) -> None:

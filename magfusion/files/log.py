@@ -75,14 +75,17 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
         raise InputError(
             f"{path}: holds no magnetometer.parquet and no fields.parquet (nor .csv); add one."
         )
+    imu, of_imu = read_imu(tables["imu"], span)
+    waveform, of_waveform = read_waveform(tables["magnetometer"], span)
     log = Log(
         name=header.name,
         epoch_ns=header.epoch_ns,
         source=header.source,
-        imu=read_imu(tables["imu"], span),
-        waveform=read_if_there(tables["magnetometer"], read_waveform, span),
+        imu=imu,
+        waveform=waveform,
         fields=read_if_there(tables["fields"], read_fields, span),
         truth=read_if_there(tables["truth"], _read_truth, span),
+        noticed=(*of_imu, *of_waveform),
     )
     if log.waveform is None and log.fields is None:
         raise InputError(f"{path}: holds no field {span}; choose a span that the log covers.")

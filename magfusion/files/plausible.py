@@ -1,6 +1,7 @@
 """Samples that no instrument gives in SI units: the mistake of unit that explains them."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.model.samples import ImuSamples
@@ -8,6 +9,12 @@ from magfusion.units import Array
 
 LARGEST_FIELD = 1e-3  # T; twenty times the Earth's
 LARGEST_RATE = 50.0  # rad/s; beyond the range of common gyroscopes
+LARGEST_RATE_IN_DEGREES = 6000.0  # deg/s, and as much written for rad/s
+LARGEST_FORCE = 1e4  # m/s^2
+SOUND = 0.98  # of the samples, by size
+WITNESSED = 2.0  # s
+MOST_WITNESSES = 20_000  # samples
+ONE_WAY = 0.9  # length of the mean of directions that are one
 WEIGHT_IN_G = (0.9, 1.1)  # where gravity is 9.8 m/s^2
 # Of the median, what nine in ten samples exceed: of a specific force without gravity half.
 LEAST_WEIGHT = 0.6
@@ -22,15 +29,29 @@ def check_imu(imu: ImuSamples, place: str) -> None:
     InputError
         Naming ``place``, what was found and the likely factor.
     """
-    rate = float(np.sqrt(np.mean(np.sum(imu.gyro_body**2, axis=1))))
-    if rate > LARGEST_RATE:
+    # A few false samples are not the unit's fault.
+    turning = np.sum(imu.gyro_body**2, axis=1)
+    turning = turning[turning <= np.quantile(turning, SOUND)]
+    rate, changes = float(np.sqrt(np.mean(turning))), bool(np.ptp(turning) > 0.0)
+    if LARGEST_RATE < rate < LARGEST_RATE_IN_DEGREES and changes:
         raise InputError(
             f"{place}: the angular rate is {rate:.3g} rad/s (RMS), so it is probably in deg/s;"
             " multiply it by pi/180."
         )
+    if rate > LARGEST_RATE:
+        raise InputError(
+            f"{place}: the angular rate is {rate:.3g} rad/s (RMS), which no gyroscope measures;"
+            " repair the sensor, or give its rates in rad/s."
+        )
     sizes = np.linalg.norm(imu.accel_body, axis=1)
     force, least = (float(np.quantile(sizes, share)) for share in (0.5, 0.1))
-    if WEIGHT_IN_G[0] < force < WEIGHT_IN_G[1] and least > LEAST_WEIGHT * force:
+    if force > LARGEST_FORCE:
+        raise InputError(
+            f"{place}: the specific force is {force:.3g} m/s^2 (median), which no accelerometer"
+            " measures; repair the sensor, or give it in m/s^2."
+        )
+    in_g = WEIGHT_IN_G[0] < force < WEIGHT_IN_G[1] and least > LEAST_WEIGHT * force
+    if in_g and _keeps_its_direction(imu):
         raise InputError(
             f"{place}: the specific force is {force:.3g} m/s^2 (median), so it is probably in g;"
             " multiply it by 9.80665."
@@ -41,6 +62,32 @@ def check_imu(imu: ImuSamples, place: str) -> None:
             f"{place}: samples are {step:.3g} s apart (median), so that the times are probably"
             " not in nanoseconds; multiply them, by 1000 if they are in microseconds."
         )
+
+
+def _keeps_its_direction(imu: ImuSamples) -> bool:
+    """Return whether the specific force points one way in the world, as gravity does.
+
+    Over spans so short that the gyroscope tells how the body turned in them: without gravity an
+    acceleration of a g's tenth turns with the motion that makes it.
+    """
+    step = np.diff(imu.time, append=imu.time[-1:])
+    step[step > WITNESSED] = 0.0
+    count = max(1, int(WITNESSED / max(float(np.median(step)), SHORTEST_STEP)))
+    if len(imu) < 2 * count:
+        return True  # too little to contradict the size
+    ahead: list[Array] = []
+    firm: list[float] = []
+    world_from_body = np.eye(3)
+    for k in range(min(len(imu), MOST_WITNESSES)):
+        if k % count == 0:
+            if ahead:
+                firm.append(float(np.linalg.norm(np.mean(ahead, axis=0))))
+            world_from_body, ahead = np.eye(3), []
+        force = imu.accel_body[k]
+        ahead.append(world_from_body @ force / max(float(np.linalg.norm(force)), 1e-12))
+        turn = Rotation.from_rotvec(imu.gyro_body[k] * step[k]).as_matrix()
+        world_from_body = world_from_body @ turn
+    return float(np.median(firm)) > ONE_WAY
 
 
 def check_field(size: Array, place: str) -> None:

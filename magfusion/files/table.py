@@ -12,12 +12,14 @@ import pyarrow.parquet
 
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
+from magfusion.files.parquet_bounds import MOST_BYTES, MOST_ROWS, read_batches, refuse_unfolding
 from magfusion.units import NANOSECOND, AnyArray, Array, IntArray
 
 TIME = "time_ns"
 ROWS_PER_GROUP = 1 << 17  # a slice reads whole groups
 # Larger than any clock's reading, and far enough from the ends of int64 to subtract.
 LARGEST_TIME_NS = 1 << 62
+LONGEST_GAP = 3600.0  # s; of a clock that did not jump
 LARGEST_NUMBER = 1e100  # whose square is still finite
 
 
@@ -65,7 +67,8 @@ class Span:
     def _stamp(self, time: float | None, default: int) -> int:
         if time is None:
             return default
-        stamp = self.epoch_ns + round(time / NANOSECOND)
+        most = LARGEST_TIME_NS * NANOSECOND
+        stamp = self.epoch_ns + round(max(-most, min(time, most)) / NANOSECOND)
         return max(-LARGEST_TIME_NS, min(stamp, LARGEST_TIME_NS))
 
 
@@ -139,15 +142,21 @@ class Table:
         """Return whether the table holds these columns."""
         return set(names) <= set(self.data.column_names)
 
-    def numbers(self, names: Sequence[str]) -> Array:
-        """Return columns side by side, shape (n, names); refuse what is not a finite number."""
+    def numbers(self, names: Sequence[str], *, nan: bool = False) -> Array:
+        """Return columns side by side, shape (n, names); refuse what is not a finite number.
+
+        Parameters
+        ----------
+        nan : bool
+            Whether a number may be missing.
+        """
         values = np.empty((len(self), len(names)))
         for k, name in enumerate(names):
             column = self._present(name)
             if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
                 raise InputError(f"{self.path}: column {name} holds {column.type}; write numbers.")
             values[:, k] = column.to_numpy()
-            bad = ~(np.abs(values[:, k]) < LARGEST_NUMBER)  # NaN too
+            bad = ~(np.abs(values[:, k]) < LARGEST_NUMBER) & ~(nan & np.isnan(values[:, k]))
             self.refuse(bad, name, values[:, k], "write a finite number")
         return values
 
@@ -228,7 +237,14 @@ def read_table(path: Path, layout: Layout, span: Span, names: tuple[str, ...] = 
     begin, end = np.searchsorted(time_ns, span.bounds_ns)
     inside = data.slice(begin, end - begin)
     within = time_ns[begin:end]
-    return Table(path, inside, within, span.seconds(within), first_row + int(begin))
+    table = Table(path, inside, within, span.seconds(within), first_row + int(begin))
+    jumped = np.diff(within, prepend=within[:1]) * NANOSECOND > LONGEST_GAP
+    remedy = (
+        "more than an hour after the row above: the clock jumped; correct the times, or use one"
+        " side by --start and --end"
+    )
+    table.refuse(jumped, TIME, within, remedy)
+    return table
 
 
 def write_table(columns: dict[str, object], path: Path) -> None:
@@ -251,8 +267,12 @@ def _read_parquet(path: Path, layout: Layout, span: Span) -> tuple[pa.Table, int
         groups = _groups_within(file, span)
         if not groups:
             return file.schema_arrow.empty_table().select(names), 0
+        own = [file.metadata.row_group(g) for g in groups]
         skipped = sum(file.metadata.row_group(g).num_rows for g in range(groups[0]))
-        return file.read_row_groups(list(groups), columns=names), skipped
+        refuse_unfolding(file, names, own, path)
+        if sum(group.num_rows for group in own) <= MOST_ROWS:
+            return file.read_row_groups(list(groups), columns=names), skipped
+        return read_batches(file, names, groups, span.bounds_ns, path, skipped)
 
 
 def _groups_within(file: pa.parquet.ParquetFile, span: Span) -> range:
@@ -268,6 +288,11 @@ def _groups_within(file: pa.parquet.ParquetFile, span: Span) -> range:
 
 
 def _read_csv(path: Path, layout: Layout, renamed: tuple[str, ...]) -> pa.Table:
+    if path.stat().st_size > MOST_BYTES:
+        raise InputError(
+            f"{path}: is larger than {MOST_BYTES >> 20} MiB; write it as Parquet, of which a part"
+            " can be read."
+        )
     with path.open(newline="", encoding="utf-8-sig") as stream:
         header = next(csv.reader(stream), [])
     found = [*renamed[: len(header)], *(name.strip() for name in header[len(renamed) :])]

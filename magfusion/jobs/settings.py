@@ -204,6 +204,9 @@ class LogSettings(PartSettings):
         return Job(self.log, self.site, output, self.start, self.end, topics_option(self.topics))
 
 
+LOWEST_MAINS = 10.0  # Hz; below, its harmonics would be fitted to the motion
+
+
 @dataclass(frozen=True, kw_only=True)
 class WindowSettings(Settings):
     """How a waveform is demodulated."""
@@ -226,6 +229,11 @@ class WindowSettings(Settings):
         InputError
             Where they do not fit the site's tones.
         """
+        if 0.0 < self.mains_hz < LOWEST_MAINS:
+            raise InputError(
+                f"--mains-hz must be 0 for none, or at least {LOWEST_MAINS:g} Hz; got"
+                f" {self.mains_hz:g}"
+            )
         if self.window is None and self.step is None and self.mains_hz == WindowSettings.mains_hz:
             return None
         from magfusion.jobs.inputs import read_site

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from magfusion.units import Array
 
 
+LARGEST_BOX, SMALLEST_BOX = 1e5, 1e-3  # m
+
+
 @dataclass(frozen=True, kw_only=True)
 class SimulateSettings(RandomSettings):
     """What is simulated."""
@@ -47,6 +50,11 @@ def box_option(text: str | None) -> Array | None:
         ) from None
     if not np.all(np.isfinite(box)) or np.any(box[0] >= box[1]):
         raise InputError(f"--box {text!r}: each lower limit must be below its upper limit")
+    if np.max(np.abs(box)) > LARGEST_BOX or np.min(box[1] - box[0]) < SMALLEST_BOX:
+        raise InputError(
+            f"--box {text!r}: limits must lie within {LARGEST_BOX:g} m of the origin and"
+            f" {SMALLEST_BOX:g} m apart"
+        )
     return box
 
 

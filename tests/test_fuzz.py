@@ -1,0 +1,47 @@
+"""The command line survives what nobody would write; what once broke it is kept beside."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("hypothesis")
+
+from fuzz import CORPUS, Case, fuzz, run_case
+from fuzz_cases import example_inputs
+
+KEPT = sorted(CORPUS.glob("*.json"))
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return example_inputs(tmp_path_factory.mktemp("inputs") / "inputs")
+
+
+def test_what_breaks_is_found(
+    inputs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fuzzer that finds nothing proves nothing unless it would find something."""
+
+    def broken(*_: object, **__: object) -> None:
+        raise ZeroDivisionError("a fault")
+
+    case: Case = {"kind": "site", "changes": [], "command": "navigate - --site SITE"}
+    assert run_case(case, inputs, tmp_path / "good") is None
+    monkeypatch.setattr("magfusion.jobs.stream.run_stream", broken)
+    found = run_case(case, inputs, tmp_path / "bad")
+    assert found is not None
+    assert "ZeroDivisionError: a fault" in found
+
+
+@pytest.mark.parametrize("path", KEPT, ids=lambda path: path.stem)
+def test_what_once_broke_is_answered(path: Path, inputs: Path, tmp_path: Path) -> None:
+    assert run_case(json.loads(path.read_text()), inputs, tmp_path / "place") is None
+
+
+@pytest.mark.slow
+def test_ten_thousand_inputs_break_nothing(tmp_path: Path) -> None:
+    """Or as many as there are in three minutes."""
+    ran, finds = fuzz(10_000, 180.0, 0, tmp_path)
+    assert ran > 0
+    assert not finds, finds
