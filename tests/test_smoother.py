@@ -194,7 +194,7 @@ def test_the_marginals_are_gtsams(solved: tuple[SmallLog, Graph, Estimate, float
     small, problem, estimate, _ = solved
     graph = native_graph(small, problem, problem.blocks)
     native = gtsam.Marginals(graph, native_values(problem, estimate))
-    poses, calibration = marginals(problem, estimate)
+    poses, calibration, _ = marginals(problem, estimate)
     for i in range(problem.epochs):
         assert same_covariance(poses[i], native.marginalCovariance(X(i)), rtol=1e-6)
     for k, block in enumerate(problem.blocks):
@@ -257,8 +257,8 @@ def test_what_is_held_is_considered_as_dense_algebra_has_it(
     estimate = optimise(problem, start, iterations=50, tolerance=1e-12).estimate
     wanted = considered_blocks(small.site, problem.blocks)
     held = tuple(b for b in wanted if b.kind != "time_offset")
-    poses, calibration = marginals(problem, estimate, held)
-    alone, _ = marginals(problem, estimate)
+    poses, calibration, _ = marginals(problem, estimate, held)
+    alone, _, _ = marginals(problem, estimate)
 
     jacobian, _ = dense(problem, estimate)
     inverse = np.linalg.pinv(jacobian, rcond=1e-15)
@@ -287,8 +287,8 @@ def test_a_considered_survey_covers_errors_of_the_survey() -> None:
     problem, start = small_problem(small, ())
     held = tuple(b for b in considered_blocks(small.site, ()) if b.kind != "time_offset")
     estimate = optimise(problem, start, tolerance=1e-12).estimate
-    with_survey, _ = marginals(problem, estimate, held)
-    alone, _ = marginals(problem, estimate)
+    with_survey, _, _ = marginals(problem, estimate, held)
+    alone, _, _ = marginals(problem, estimate)
     steps = []
     for _ in range(300):
         moved = retract(
@@ -464,9 +464,9 @@ def test_a_missing_channel_has_no_say() -> None:
     found = optimise(problem, start)
     states = read_states(found.estimate.values, small.truth.time)
     assert trajectory_errors(states, small.truth, max_gap=1.0).ate < 0.01  # m
-    poses, _ = marginals(problem, found.estimate)
+    poses, _, _ = marginals(problem, found.estimate)
     trace = np.trace(poses[:, 3:, 3:], axis1=1, axis2=2)
-    whole, _ = marginals(small_problem(small, ())[0], found.estimate)
+    whole, _, _ = marginals(small_problem(small, ())[0], found.estimate)
     ratio = trace / np.trace(whole[:, 3:, 3:], axis1=1, axis2=2)
     assert np.argmax(ratio) == 7  # the IMU alone carries the empty epoch
     assert ratio[7] > 1.1

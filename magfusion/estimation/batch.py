@@ -1,7 +1,7 @@
 """The whole offline estimate of one log: start, passes over the waveform, posterior."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from gtsam.symbol_shorthand import V
@@ -97,6 +97,8 @@ class Smoothed:
     field_errors : tuple of Block
         Errors of the beacons' fields that are constant in place, likewise.
     calibration_cov : ndarray, shape (dimension, dimension)
+    calibration_response : ndarray, shape (dimension, uncertain)
+        What one sigma of what is uncertain does to it; its part is in that covariance.
     residual : ndarray, shape (n, channels, 6)
         Whitened; NaN where a channel is missing, or with loose coupling.
     graph : Graph
@@ -154,6 +156,7 @@ class Smoothed:
     fix_response: Array | None = None
     noise: tuple[Tuned, ...] = ()
     field_errors: tuple[Block, ...] = ()
+    calibration_response: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def uncertain(self) -> tuple[Block, ...]:
@@ -332,7 +335,7 @@ def solved_again(result: Smoothed, measurements: tuple[Measurement, ...]) -> Smo
     """
     graph = replace(result.graph, measurements=measurements)
     found = optimise(graph, result.estimate)
-    pose_cov, calibration_cov = marginals(graph, found.estimate, result.uncertain)
+    pose_cov, calibration_cov, response = marginals(graph, found.estimate, result.uncertain)
     states = read_states(found.estimate.values, result.states.time)
     phasors = next(m for m in measurements if isinstance(m, FieldPhasors))
     heard = np.any(phasors.sqrt_information != 0.0, axis=(2, 3))
@@ -342,6 +345,7 @@ def solved_again(result: Smoothed, measurements: tuple[Measurement, ...]) -> Smo
         states=replace(states, pose_cov=pose_cov),
         calibration=found.estimate.calibration,
         calibration_cov=calibration_cov,
+        calibration_response=response,
         residual=np.where(heard[..., None], error, np.nan),
         graph=graph,
         estimate=found.estimate,
@@ -373,7 +377,7 @@ def _posterior(
     if log.fixes is None:
         errors = field_errors(estimate.calibration.site, samples.time, log.at_fields(states))
     uncertain = placed((*log.considered, *errors))
-    pose_cov, calibration_cov = marginals(graph, estimate, uncertain)
+    pose_cov, calibration_cov, moved = marginals(graph, estimate, uncertain)
     if log.fixes is not None:
         here = survey_response(log.declared, log.samples, log.at_fields(states))
         later = np.searchsorted(log.epoch, np.arange(len(states)))
@@ -382,8 +386,8 @@ def _posterior(
     left = {type(m): graph.residual(m, estimate) for m in map(alone, graph.measurements)}
     error = left.get(FieldPhasors, np.nan)
     residual = np.where(samples.valid[..., None], error, np.full(6, np.nan))
-    field = next((m for m in graph.measurements if isinstance(m, EarthField)), None)
-    earth = None if field is None else left[EarthField][:, 0]
+    earth_field = next((m for m in graph.measurements if isinstance(m, EarthField)), None)
+    earth = None if earth_field is None else left[EarthField][:, 0]
     return Smoothed(
         states=replace(states, pose_cov=pose_cov),
         epoch=log.epoch,
@@ -406,7 +410,10 @@ def _posterior(
         iterations=found.iterations,
         converged=found.converged,
         earth_residual=earth,
-        earth_disturbed=None if earth is None or field is None else disturbed(earth, field.repeats),
+        earth_disturbed=(
+            None if earth is None or earth_field is None else disturbed(earth, earth_field.repeats)
+        ),
         fix_response=response,
         field_errors=errors,
+        calibration_response=moved,
     )

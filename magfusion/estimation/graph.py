@@ -357,7 +357,7 @@ def read_states(values: gtsam.Values, time: Array) -> Trajectory:
 
 def marginals(
     graph: Graph, estimate: Estimate, considered: tuple[Block, ...] = ()
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """Return the posterior covariance of every pose and of the calibration.
 
     Parameters
@@ -371,17 +371,20 @@ def marginals(
     pose_cov : ndarray, shape (n, 6, 6)
         Calibration marginalised, its gauge included.
     calibration_cov : ndarray, shape (dimension, dimension)
+    calibration_response : ndarray, shape (dimension, considered)
+        What one sigma of what is considered does to the calibration: its part of that covariance.
     """
     linear, ordering = graph.linearized(estimate), graph.ordering
     tree = eliminate(linear, ordering)
     poses = np.array([tree.marginalCovariance(X(i)) for i in range(graph.epochs)])
     calibration = last_marginal(tree, linear, ordering) if graph.blocks else np.zeros((0, 0))
+    response = np.zeros((len(calibration), 0))
     if considered and graph.measurements:
         steps = graph.responses(estimate, considered)
         keys = [X(i) for i in range(graph.epochs)]
         by_pose = np.array([step.vector(keys).reshape(-1, 6) for step in steps])
         poses += np.einsum("hni,hnj->nij", by_pose, by_pose)
         if graph.blocks:
-            by_calibration = np.array([step.at(CALIBRATION_KEY) for step in steps])
-            calibration += by_calibration.T @ by_calibration
-    return poses, calibration
+            response = np.array([step.at(CALIBRATION_KEY) for step in steps]).T
+            calibration += response @ response.T
+    return poses, calibration, response

@@ -27,9 +27,8 @@ def calibration_change(case: Case) -> Testimony:
     spread = prior_sqrt_covariance(result.declared.site, result.blocks)
     change = difference(result.declared, result.calibration, result.blocks)
     cov = spread @ spread.T - result.calibration_cov
-    if case.score is not None:  # what is held disturbs the change as well
-        moved = case.score.by_calibration @ case.score.spread
-        cov = cov + 2.0 * moved @ moved.T
+    moved = result.calibration_response  # what is not estimated disturbs the change as well
+    cov = cov + 2.0 * moved @ moved.T
     scale = np.sqrt(np.diagonal(spread @ spread.T))
     change, cov = change / scale, cov / scale[:, None] / scale
     tests = [_distance(change, cov, [block]) for block in result.blocks]
