@@ -14,6 +14,7 @@ from magfusion.estimation.initialization.chain import Start
 from magfusion.estimation.initialization.offline import begin, carried, with_rest_bias
 from magfusion.estimation.integrity.detection import detected, only
 from magfusion.estimation.integrity.mending import mended
+from magfusion.estimation.likeliest import likeliest
 from magfusion.estimation.log_graph import PreparedLog, graph_of
 from magfusion.estimation.measurements.earth import EarthField, check_earth, disturbed
 from magfusion.estimation.measurements.field_error import field_errors
@@ -37,7 +38,6 @@ from magfusion.units import Array, BoolArray, IntArray
 LONGEST_STEP = 5.0  # s; without any field a state is made after so long
 REST_STEP = 2.0  # s; and so long at rest, where each has a zero velocity
 SPARSE = 2.5  # intervals; a longer one than so many usual ones is a gap
-AMBIGUOUS_CHI_SQUARE = 20.0  # below this a mirrored trajectory explains the data nearly as well
 QUIET = 0.3  # sigmas; a last pass that moved the poses by less has converged all the same
 TUNINGS = 3  # passes after which the noise is found anew; then it stays as it is
 
@@ -108,7 +108,7 @@ class Smoothed:
     rival_chi_square : float, optional
         How much worse the best trajectory from another chain of hypotheses is, after its first
         pass: a small figure means that the log leaves a mirrored trajectory possible.  None where
-        there was no other chain.
+        there was no other chain, or all came to the same.
     converged : bool
         Whether the last pass moved nothing, or little in units of its sigma.
     last_move : float
@@ -224,7 +224,7 @@ def _prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) 
             fixes=beginning.fixes if loose else None,
             start=beginning.start,
             states=with_rest_bias(
-                carried(beginning.start.states, log.imu, offset, time), log.imu, calibration
+                carried(beginning.states, log.imu, offset, time), log.imu, calibration
             ),
             declared=beginning.declared,
             blocks=blocks,
@@ -234,7 +234,7 @@ def _prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) 
         )
         for beginning in begin(samples, steady, log, calibration)
     ]
-    return starts[0] if len(starts) == 1 else _likeliest(starts)
+    return likeliest(starts)
 
 
 def _in_gaps(time: Array, imu: ImuSamples, time_offset: float, motion: MotionModel) -> Array:
@@ -253,20 +253,6 @@ def _in_gaps(time: Array, imu: ImuSamples, time_offset: float, motion: MotionMod
         every = np.arange(1, len(inner) + 1) % int(LONGEST_STEP / REST_STEP) == 0
         out.append(inner[every | quiet_before(imu, inner - time_offset, motion)])
     return np.concatenate(out)
-
-
-def _likeliest(starts: list[PreparedLog]) -> PreparedLog:
-    """Let the motion decide between chains that single epochs cannot distinguish."""
-    found = []
-    for log in starts:
-        graph, _ = graph_of(log, log.states, log.declared)
-        found.append(optimise(graph, initial_estimate(log.states, log.declared)))
-    best, second = np.argsort([one.cost for one in found])[:2]
-    return replace(
-        starts[best],
-        rival_chi_square=float(2.0 * (found[second].cost - found[best].cost)),
-        rival=read_states(found[second].estimate.values, starts[second].states.time),
-    )
 
 
 def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smoothed:

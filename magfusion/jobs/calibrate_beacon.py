@@ -319,7 +319,7 @@ def _bent_deg(found: _Calibrated) -> float:
 
 
 def _rivals(found: _Calibrated) -> list[tuple[Array, float]]:
-    from magfusion.estimation.batch import AMBIGUOUS_CHI_SQUARE
+    from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
 
     excess = found.fits.rival_chi_square[0] - found.fits.chi_square[0]
     out: list[tuple[Array, float]] = []

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.estimation.batch import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.integrity.judgement import JudgedState
+from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
 from magfusion.files.checkpoint import run_key

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.estimation.batch import AMBIGUOUS_CHI_SQUARE, Smoothed
+from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.self_survey import Placement
 from magfusion.estimation.snapshot.ambiguity import ambiguities, relations
 from magfusion.estimation.snapshot.fix import Fixes

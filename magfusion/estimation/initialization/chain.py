@@ -35,6 +35,8 @@ class Start:
         Chi square of the chain.
     determined : bool ndarray, shape (n,)
         False where the epoch alone leaves a direction of its pose open.
+    leaps : int
+        Steps between hypotheses that no motion joins.
     """
 
     states: Trajectory
@@ -42,6 +44,7 @@ class Start:
     chosen: IntArray
     cost: float
     determined: BoolArray
+    leaps: int = 0
 
 
 def choose_chains(
@@ -75,14 +78,17 @@ def choose_chains(
         fresh = all(np.mean(chosen != other.chosen) > 0.5 for other in chains)
         if not fresh or (chains and cost > chains[0].cost + RIVAL_COST):
             break
-        chains.append(_start(fixes, chosen, cost))
+        steps = link[np.arange(len(link)), chosen[:-1], chosen[1:]]
+        leaps = int(np.sum(steps >= LEAP_COST))
+        chains.append(replace(start_of(fixes, chosen, cost), leaps=leaps))
         left[np.arange(len(fixes)), chosen] = np.inf
         spent = ~np.isfinite(left).any(axis=1)
         left[spent] = unary[spent]
     return tuple(chains)
 
 
-def _start(fixes: Fixes, chosen: IntArray, cost: float) -> Start:
+def start_of(fixes: Fixes, chosen: IntArray, cost: float) -> Start:
+    """Return the chosen hypothesis of each epoch, shape (n,), as a start."""
     rows = np.arange(len(fixes))
     position = fixes.position_world[rows, chosen]
     return Start(

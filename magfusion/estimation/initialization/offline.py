@@ -1,5 +1,7 @@
 """Where the smoother of a log begins: chains of fixes, or gravity and the Earth field.
 
+Where the chains leave a doubt, by a leap, an open direction or a mirrored rival, tracks of the
+hypotheses through the inertial stream are offered too.
 At epochs without any beacon the gyro carries the attitude on from those with one, as it does from
 the fix of a cycle to the slots in it.
 """
@@ -10,7 +12,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.demodulation import fix_inputs
-from magfusion.estimation.initialization.chain import Start, choose_chains, start_phases
+from magfusion.estimation.initialization.chain import (
+    Start,
+    choose_chains,
+    start_of,
+    start_phases,
+)
+from magfusion.estimation.initialization.search import Found, can_search, search
 from magfusion.estimation.integrity.fix_separation import separate_fixes
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
@@ -37,6 +45,10 @@ class OfflineStart:
 
     Parameters
     ----------
+    start : Start
+        Of the fixes' hypotheses.
+    states : Trajectory
+        Where to begin: those of the start, or what a track made of them.
     declared : Calibration
         Unsynchronised drives have no declared phase: their prior is centred on the start.
     fixes : Fixes, optional
@@ -44,6 +56,7 @@ class OfflineStart:
     """
 
     start: Start
+    states: Trajectory
     declared: Calibration
     fixes: Fixes | None
 
@@ -60,34 +73,68 @@ def begin(
     """
     detected = np.asarray(samples.valid.any(axis=1))
     if steady is not None and np.sum(detected) < LEAST_DETECTED:
-        return [
-            OfflineStart(_by_earth(samples, steady, log.imu, calibration.site), calibration, None)
-        ]
+        start = _by_earth(samples, steady, log.imu, calibration.site)
+        return [OfflineStart(start, start.states, calibration, None)]
     # An epoch that hears nothing has no fix at all, and would end the chain somewhere.
     some = samples.rows(detected) if np.sum(detected) >= LEAST_DETECTED else samples
     epochs, gravity = fix_inputs(some, log, calibration.site)
     fixes = fix_epochs(epochs, calibration, gravity=gravity)
     # A beacon that fell silent, or is false, would lead the chain astray.
     fixes = separate_fixes(epochs, calibration, fixes, gravity=gravity).fixes
-    offset = calibration.time_offset
+    imu, offset = log.imu, calibration.time_offset
+    chains = choose_chains(fixes, imu, offset, calibration.site)
+    everywhere = len(fixes) == len(samples)
     out = []
-    for start in choose_chains(fixes, log.imu, offset, calibration.site):
+    for start in chains:
         declared = start_phases(calibration, fixes.time, start.phase)
-        everywhere = len(fixes) == len(samples)
-        whole = start if everywhere else _carried(start, log.imu, offset, samples.time)
-        out.append(OfflineStart(whole, declared, fixes))
+        whole = start if everywhere else _carried(start, imu, offset, samples.time)
+        out.append(OfflineStart(whole, whole.states, declared, fixes))
+    if _doubtful(chains) and can_search(epochs):
+        still = replace(imu, gyro_body=imu.gyro_body - _rest_bias(imu, calibration))
+        for found in search(epochs, fixes, still, calibration):
+            out.append(_tracked(found, fixes, imu, calibration, samples.time))
     return out
+
+
+def _doubtful(chains: tuple[Start, ...]) -> bool:
+    """Tell whether single epochs and their links may have led astray."""
+    best = chains[0]
+    return len(chains) > 1 or best.leaps > 0 or not bool(np.all(best.determined))
+
+
+def _tracked(
+    found: Found, fixes: Fixes, imu: ImuSamples, calibration: Calibration, time: Array
+) -> OfflineStart:
+    """Return what a track found as a start, with the hypotheses of the fixes that are nearest."""
+    offset = calibration.time_offset
+    there = carried(found.states, imu, offset, fixes.time)
+    away = np.linalg.norm(fixes.position_world - there.position_world[:, None], axis=2)
+    cross = np.einsum("nij,nhij->nh", there.world_from_body, fixes.world_from_body)
+    apart = away**2 + (3.0 - cross) * np.median(away)
+    chosen = np.argmin(np.where(np.isfinite(fixes.cost), apart, np.inf), axis=1)
+    start = start_of(fixes, chosen, found.cost)
+    whole = start if len(fixes) == len(time) else _carried(start, imu, offset, time)
+    return OfflineStart(
+        whole,
+        carried(found.states, imu, offset, time),
+        start_phases(calibration, found.states.time, found.phase),
+        fixes,
+    )
 
 
 def with_rest_bias(states: Trajectory, imu: ImuSamples, calibration: Calibration) -> Trajectory:
     """Return states with the gyro bias of the rests, where there are any."""
-    motion, time = calibration.site.platform.motion, imu.time + calibration.time_offset
-    still = resting(time, imu.gyro_body, imu.accel_body, motion=motion)
-    bias = np.mean(imu.gyro_body[still], axis=0) if np.any(still) else np.zeros(3)
-    shape = (len(states), 3)
+    bias, shape = _rest_bias(imu, calibration), (len(states), 3)
     return replace(
         states, gyro_bias_body=np.broadcast_to(bias, shape).copy(), accel_bias_body=np.zeros(shape)
     )
+
+
+def _rest_bias(imu: ImuSamples, calibration: Calibration) -> Array:
+    """Return the mean rate at rest (rad/s); zero where there is none."""
+    motion, time = calibration.site.platform.motion, imu.time + calibration.time_offset
+    still = resting(time, imu.gyro_body, imu.accel_body, motion=motion)
+    return np.mean(imu.gyro_body[still], axis=0) if np.any(still) else np.zeros(3)
 
 
 def _by_earth(samples: FieldSamples, steady: SteadyFields, imu: ImuSamples, site: Site) -> Start:

@@ -6,15 +6,11 @@ from dataclasses import fields as fields_of
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.batch import (
-    AMBIGUOUS_CHI_SQUARE,
-    Smoothed,
-    SmootherSettings,
-    smooth,
-)
+from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.initialization.handover import last_state
 from magfusion.estimation.integrity.judge import judged
 from magfusion.estimation.integrity.score import Score, score_of
+from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.settings import EstimatorSettings
 from magfusion.estimation.state import POSITION, ROTATION, State
 from magfusion.estimation.stream_buffer import Buffer

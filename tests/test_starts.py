@@ -1,0 +1,178 @@
+"""Starts that are found where single epochs and their links lead astray."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.estimation.demodulation import first_fixes, phasors
+from magfusion.estimation.initialization.chain import choose_chains
+from magfusion.estimation.initialization.offline import OfflineStart, begin
+from magfusion.estimation.initialization.search import differ, search, thinned
+from magfusion.estimation.integrity.judge import judged
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Verdict
+from magfusion.results.errors import trajectory_errors
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
+from magfusion.simulation.motion import Rests
+
+FAR_M, FAR_RAD = 0.3, 0.4  # further off, an epoch is at another hypothesis
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A simulated log and its phasors."""
+
+    site: Site
+    made: SimulatedLog
+    samples: FieldSamples
+
+    def starts(self) -> list[OfflineStart]:
+        calibration = initial_calibration(self.site, float(np.mean(self.samples.time)))
+        return begin(self.samples, None, self.made.log, calibration)
+
+    def wrong(self, states: Trajectory) -> float:
+        """Return the share of epochs that are at another hypothesis than the truth's."""
+        truth = self.made.motion.trajectory(states.time)
+        away = np.linalg.norm(states.position_world - truth.position_world, axis=1)
+        between = np.swapaxes(truth.world_from_body, 1, 2) @ states.world_from_body
+        angle = Rotation.from_matrix(between).magnitude()
+        return float(np.mean((away > FAR_M) | (angle > FAR_RAD)))
+
+
+def lone(
+    seed: int,
+    duration: float,
+    *,
+    synchronised: bool = True,
+    rpy_deg: tuple[float, ...] = (2, -3, 10),
+) -> Case:
+    """Return a walk about one rotating beacon."""
+    site = replace(demo_site(coil_radius=None), model_error=1e-3)
+    beacon = replace(
+        site.beacons[0],
+        synchronised=synchronised,
+        world_from_beacon=Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix(),
+    )
+    return recorded(replace(site, beacons=(beacon,)), seed, duration)
+
+
+def recorded(site: Site, seed: int, duration: float, speed: float = 0.5) -> Case:
+    config = SimulationConfig(
+        DEMO_BOX_WORLD, duration, speed=speed, rests=Rests(start=3.0, move=20.0, pause=3.0)
+    )
+    made = simulate_log(site, config, np.random.default_rng([7, seed]))
+    samples, _ = phasors(made.log, site)
+    return Case(site, made, samples)
+
+
+@pytest.fixture(scope="module")
+def unknown_phase() -> Case:
+    """Return a log of which no epoch alone tells the azimuth."""
+    return lone(1, 8.0, synchronised=False, rpy_deg=(-85, 4, 20))
+
+
+def test_a_lone_beacon_of_unknown_phase_is_found_by_tracks_alone(unknown_phase: Case) -> None:
+    case = unknown_phase
+    calibration = initial_calibration(case.site, float(np.mean(case.samples.time)))
+    fixes = first_fixes(case.samples, case.made.log, calibration)
+    chains = choose_chains(fixes, case.made.log.imu, 0.0, case.site)
+    assert min(case.wrong(chain.states) for chain in chains) > 0.5
+    found = search(case.samples, fixes, case.made.log.imu, calibration)
+    assert case.wrong(found[0].states) < 0.02
+    assert all(differ(found[0].states, other.states) for other in found[1:])
+    np.testing.assert_array_equal(found[0].states.time, case.samples.time[thinned(case.samples)])
+
+
+def test_the_drive_phase_goes_with_the_start(unknown_phase: Case) -> None:
+    case = unknown_phase
+    best = case.starts()
+    declared = next(s.declared for s in best if case.wrong(s.states) < 0.02)
+    drives, time = case.made.drives, np.array(declared.reference_time)
+    true = replace(declared, phase=drives.phase, drift=drives.drift, reference_time=0.0)
+    lag = np.angle(np.exp(1j * (declared.phase - true.drive_phase(time))))
+    assert np.max(np.abs(lag)) < 0.1  # rad
+
+
+def test_the_smoother_takes_it_from_there(unknown_phase: Case) -> None:
+    case = unknown_phase
+    result = smooth(case.made.log, case.site, SmootherSettings(tune=False))
+    truth = case.made.log.truth
+    assert truth is not None
+    assert case.wrong(result.states) == 0.0
+    assert trajectory_errors(result.states, truth).ate < 0.05  # m
+
+
+def test_starts_of_the_same_trajectory_are_no_rivals() -> None:
+    """Two chains that differ at most epochs may lead to one optimum."""
+    case = lone(2, 8.0)
+    result = smooth(case.made.log, case.site, SmootherSettings(tune=False))
+    assert case.wrong(result.states) == 0.0
+    if result.rival is not None:
+        assert differ(result.states, result.rival)
+
+
+def test_four_beacons_need_no_tracks() -> None:
+    case = recorded(replace(demo_site(coil_radius=None), model_error=1e-3), 1, 6.0)
+    starts = case.starts()
+    assert len(starts) == 1
+    assert starts[0].start.leaps == 0
+    np.testing.assert_array_equal(
+        starts[0].states.position_world, starts[0].start.states.position_world
+    )
+
+
+def test_a_swap_of_a_stretch_is_undone() -> None:
+    """Fixes in which a mirror is the best hypothesis for two seconds lead no track astray."""
+    case = lone(5, 10.0)
+    calibration = initial_calibration(case.site, float(np.mean(case.samples.time)))
+    fixes = first_fixes(case.samples, case.made.log, calibration)
+    truth = case.made.motion.trajectory(fixes.time).position_world
+    away = np.linalg.norm(fixes.position_world - truth[:, None], axis=2)
+    right = np.argmin(away, axis=1)
+    stretch = (fixes.time > 4.0) & (fixes.time < 6.0)
+    rows = np.arange(len(fixes))
+    cost = fixes.cost.copy()
+    cost[rows[stretch], right[stretch]] += 150.0
+    found = search(case.samples, replace(fixes, cost=cost), case.made.log.imu, calibration)
+    assert case.wrong(found[0].states) < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
+def test_a_lone_rotating_beacon_is_found_or_not_trusted(seed: int) -> None:
+    case = lone(seed, 30.0)
+    result, trust = judged(smooth(case.made.log, case.site), case.made.log)
+    truth = case.made.log.truth
+    assert truth is not None
+    errors = trajectory_errors(result.states, truth)
+    assert errors.nees is not None
+    assert case.wrong(result.states) == 0.0
+    assert np.mean(errors.nees) <= 12.0 or trust.verdict is not Verdict.TRUSTWORTHY
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(40))
+def test_whatever_beacons_there_are_some_start_is_right(seed: int) -> None:
+    rng = np.random.default_rng([11, seed])
+    site = replace(demo_site(coil_radius=None), model_error=1e-3)
+    sync = bool(rng.random() < 0.5)
+    beacons = tuple(
+        replace(
+            site.beacons[i % 4],
+            name="ABCDEFGH"[i],
+            position_world=rng.uniform([-1.0, -1.0, -0.5], [0.5, 6.0, 2.5]),
+            world_from_beacon=Rotation.random(rng=rng).as_matrix(),
+            frequency_hz=20.0 + 5.0 * i,
+            synchronised=sync,
+        )
+        for i in range(int(rng.integers(1, 9)))
+    )
+    case = recorded(replace(site, beacons=beacons), seed, 15.0, float(rng.uniform(0.2, 1.5)))
+    assert min(case.wrong(start.states) for start in case.starts()) < 0.05
