@@ -12,6 +12,7 @@ import numpy as np
 
 from magfusion.estimation.initialization.strides import Strides, strides_between
 from magfusion.estimation.initialization.tracks import (
+    MOTION,
     Heard,
     Tracks,
     carried,
@@ -165,20 +166,10 @@ def _seeds(asked: _Search, k: int) -> Tracks:
         asked.samples.rows(rows), hearing.calibration, gravity=asked.gravity.rows(rows)
     )
     good = np.flatnonzero(np.isfinite(fixes.cost[0]))
-    imu, free = asked.site.platform.imu, int(np.sum(hearing.free))
-    none = np.zeros((len(good), 3))
+    free, none = int(np.sum(hearing.free)), np.zeros((len(good), 3))
     clock = asked.site.clock.drift_sigma * 2.0 * np.pi * _frequencies(asked.site)[hearing.free]
-    sigma = np.concatenate(
-        [
-            np.full(3, FIRST_ROTATION),
-            np.full(3, FIRST_POSITION),
-            np.full(3, asked.site.platform.motion.speed_sigma),
-            np.full(3, max(imu.accel_bias_sigma, 1e-6)),
-            np.full(3, max(imu.gyro_bias_sigma, 1e-8)),
-            np.full(free, FIRST_PHASE),
-            np.maximum(clock, 1e-9),
-        ]
-    )
+    phases = [np.full(free, FIRST_PHASE), np.maximum(clock, 1e-9)]
+    sigma = np.concatenate([_motion_sigma(asked.site), *phases])
     own = hearing.calibration.drive_phase(hearing.time[k])
     tracks = Tracks(
         rotation=fixes.world_from_body[0, good],
@@ -195,6 +186,19 @@ def _seeds(asked: _Search, k: int) -> Tracks:
     _, by = rows_at(tracks, hearing, k)
     information = np.diag(1.0 / sigma**2) + np.swapaxes(by, 1, 2) @ by
     return replace(tracks, cov=np.linalg.inv(information))
+
+
+def _motion_sigma(site: Site) -> Array:
+    """Return how well a track's motion is known before anything is heard, shape (15,)."""
+    imu = site.platform.imu
+    sigma = [
+        FIRST_ROTATION,
+        FIRST_POSITION,
+        site.platform.motion.speed_sigma,
+        max(imu.accel_bias_sigma, 1e-6),
+        max(imu.gyro_bias_sigma, 1e-8),
+    ]
+    return np.repeat(sigma, 3)
 
 
 def _frequencies(site: Site) -> Array:
@@ -251,7 +255,10 @@ def _with_others(asked: _Search, tracks: Tracks, k: int, level: float, *, fresh:
 
 
 def _anew(asked: _Search, tracks: Tracks, best: int, k: int) -> Tracks:
-    """Return tracks at the fixes of an epoch, all else but the velocity as of the best track."""
+    """Return tracks at the fixes of an epoch, with the drive phases of the best track.
+
+    What else it has made of the motion may be what led it astray.
+    """
     hearing = asked.hearing
     fixes, row = asked.fixes, k
     if np.any(hearing.free) and not np.all(fixes.determined[row, np.isfinite(fixes.cost[row])]):
@@ -273,14 +280,17 @@ def _anew(asked: _Search, tracks: Tracks, best: int, k: int) -> Tracks:
     to_world = np.tile(np.eye(6), (len(good), 1, 1))
     to_world[:, 3:, 3:] = rotation
     cov = new.cov.copy()
-    cov[:, :9, :] = cov[:, :, :9] = 0.0
+    cov[:, :MOTION, :] = cov[:, :, :MOTION] = 0.0
+    cov[:, :MOTION, :MOTION] = np.diag(_motion_sigma(asked.site) ** 2)
     cov[:, :6, :6] = to_world @ fixes.pose_cov[row, good] @ np.swapaxes(to_world, 1, 2)
-    cov[:, 6:9, 6:9] = asked.site.platform.motion.speed_sigma**2 * np.eye(3)
+    none = np.zeros((len(good), 3))
     return replace(
         new,
         rotation=rotation,
         position=fixes.position_world[row, good],
-        velocity=np.zeros((len(good), 3)),
+        velocity=none,
+        accel_bias=none,
+        gyro_bias=none,
         cov=cov,
         cost=cost[good],
     )

@@ -24,7 +24,7 @@ ROTATION, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
 ACCEL, GYRO = slice(9, 12), slice(12, 15)
 MOTION = 15
 ROUNDS = 3  # of linearising anew in one update: the first prediction may be wide
-LOUD = 16.0  # times the expected chi square, from which an epoch counts less
+LOUD = 16.0  # times the expected chi square, from which a channel counts less
 LEAST_WALK = 1e-9  # of a bias: without any a covariance may become singular
 
 
@@ -237,36 +237,42 @@ def rows_at(tracks: Tracks, hearing: Heard, k: int) -> tuple[Array, Array]:
 def updated(tracks: Tracks, hearing: Heard, k: int) -> Tracks:
     """Take in the phasors of an epoch.
 
-    One that explains them badly pays for it, but is not torn away by them.
+    A channel that is explained badly costs, but tears no track away.
     """
-    components = float(hearing.components[k])
-    if components == 0.0:
+    if hearing.components[k] == 0.0:
         return tracks
-    size = tracks.cov.shape[1]
-    step, there = np.zeros((len(tracks), size)), tracks
-    weight = np.ones(len(tracks))
+    step, there = np.zeros((len(tracks), tracks.cov.shape[1])), tracks
     for _ in range(ROUNDS):
         error, by = rows_at(there, hearing, k)
-        root = np.sqrt(weight)[:, None]
         # From the prediction, which holds what is known.
-        error = root * (error - (by @ step[..., None])[..., 0])
-        by = root[..., None] * by
+        error = error - (by @ step[..., None])[..., 0]
+        excess = _excess(error, by, tracks.cov)
+        root = np.repeat(1.0 / np.sqrt(np.maximum(excess, 1.0)), 6, axis=1)
+        error, by = root * error, root[..., None] * by
         across = tracks.cov @ np.swapaxes(by, 1, 2)
         spread = by @ across + np.eye(by.shape[1])
         solved = np.linalg.solve(spread, error[..., None])
-        square = np.einsum("hi,hi->h", error, solved[..., 0])
-        excess = square / weight / (LOUD * components)
         before, step = step, -(across @ solved)[..., 0]
         there = moved(tracks, step, hearing.free)
-        weight = 1.0 / np.maximum(excess, 1.0)
         if np.max(np.abs(step - before)[:, : POSITION.stop]) < 1e-2:
             break
     gain = np.linalg.solve(spread, np.swapaxes(across, 1, 2))
     cov = tracks.cov - across @ gain
-    most = LOUD * components
+    square = np.einsum("hi,hi->h", error, solved[..., 0])
     # As of a loss that grows with the logarithm beyond what is credible.
-    cost = np.where(excess > 1.0, most * (1.0 + np.log(np.maximum(excess, 1.0))), square)
+    lost = 6.0 * LOUD * np.sum(np.log(np.maximum(excess, 1.0)), axis=1)
     _, volume = np.linalg.slogdet(spread)
     return replace(
-        there, cov=0.5 * (cov + np.swapaxes(cov, 1, 2)), cost=tracks.cost + cost + volume
+        there,
+        cov=0.5 * (cov + np.swapaxes(cov, 1, 2)),
+        cost=tracks.cost + square + lost + volume,
     )
+
+
+def _excess(error: Array, by: Array, cov: Array) -> Array:
+    """Return each channel's chi square against its prediction, of what is credible."""
+    apart = error.reshape(len(error), -1, 6)
+    blocks = by.reshape(*apart.shape, -1)
+    spread = blocks @ cov[:, None] @ np.swapaxes(blocks, -1, -2) + np.eye(6)
+    solved = np.linalg.solve(spread, apart[..., None])[..., 0]
+    return np.asarray(np.sum(apart * solved, axis=-1) / (6.0 * LOUD))
