@@ -185,7 +185,7 @@ def _seeds(asked: _Search, k: int) -> Tracks:
     )
     _, by = rows_at(tracks, hearing, k)
     information = np.diag(1.0 / sigma**2) + np.swapaxes(by, 1, 2) @ by
-    return replace(tracks, cov=np.linalg.inv(information))
+    return replace(tracks, cov=np.asarray(np.linalg.inv(information), dtype=np.float64))
 
 
 def _motion_sigma(site: Site) -> Array:
