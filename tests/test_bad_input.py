@@ -239,3 +239,7 @@ def test_sigterm_ends_as_an_interrupt_does(worked: Worked) -> None:
         _, said = run.communicate()
     assert run.returncode == 130
     assert said == b""
+
+
+def test_a_refused_drift_leaves_nothing(tmp_path: Path, refuse: Refuse) -> None:
+    assert "--workers" in refuse("drift", "-o", tmp_path / "run", "--hours", 0.1, "--workers", 0)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import shutil
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from magfusion.errors import InputError
 from magfusion.jobs.settings import Command, RandomSettings, option
 from magfusion.model.progress import Report
 
@@ -113,14 +114,21 @@ def run_drift(settings: DriftSettings, output: Path, report: Report | None = Non
     else:
         shutil.rmtree(place, ignore_errors=True)
     place.mkdir(parents=True, exist_ok=True)
-    with _progress(tasks, report):
-        runs = run_many(
-            run_world,
-            tasks,
-            seed=settings.seed,
-            cluster=settings.cluster,
-            workers=settings.workers,
-        )
+    try:
+        with _progress(tasks, report):
+            runs = run_many(
+                run_world,
+                tasks,
+                seed=settings.seed,
+                cluster=settings.cluster,
+                workers=settings.workers,
+            )
+    except InputError:
+        if not settings.resume:  # nothing is there to go on with
+            shutil.rmtree(place, ignore_errors=True)
+            with suppress(OSError):
+                place.parent.rmdir()
+        raise
     figures = summarise(settings, runs)
     drawn = courses(settings, runs)
     with claimed as directory:
