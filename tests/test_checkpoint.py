@@ -19,6 +19,7 @@ from test_navigate_stream import EKF, answered, records
 from magfusion.errors import InputError
 from magfusion.estimation.navigator import Navigator, NavigatorSettings, restored
 from magfusion.estimation.state import State
+from magfusion.files.atomic import whole_file
 from magfusion.files.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from magfusion.files.log import write_log
 from magfusion.files.open import open_log
@@ -185,7 +186,12 @@ def test_killed_before_the_first_checkpoint_it_begins_again(
     begun.append({"time": 1.0})
     begun.settle()
     begun.close()
-    (output / ".checkpoint.bin.123").write_bytes(b"\0")  # and the first checkpoint
+    with whole_file(output / "checkpoint.bin") as unfinished:  # and the first checkpoint
+        unfinished.write_bytes(b"\0")
+        left = unfinished.read_bytes()
+        name = unfinished.name.replace(f"-{os.getpid()}.", "-4194305.")  # no process has it
+    (output / "checkpoint.bin").unlink()
+    (output / name).write_bytes(left)
     run_command("navigate", phasors, "-o", output, "--resume")
     assert (output / "trajectory.tum").read_bytes() == (
         uninterrupted / "trajectory.tum"

@@ -38,7 +38,7 @@ SCALES = 8  # epochs in a row that are compared, so far apart that they share no
 FAULT = 3.0  # of a declared model error; more is no error of that kind, and is not covered by it
 WEIGHINGS = 5  # times that the epochs are weighed by what is found, at first as if noise were all
 OF_IMU = ("gyro_noise", "accel_noise")  # a beacon may be called "imu", too
-PLAUSIBLE = 5.0  # by a factor of more, either way, white noise is a fault under another name
+PLAUSIBLE = 6.0  # by a factor of more, either way, white noise is a fault under another name
 LEFT = 1e-3  # of an error; of which less is left says nothing
 
 
