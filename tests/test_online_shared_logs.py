@@ -35,8 +35,8 @@ class Compared:
 )
 def compared(request: pytest.FixtureRequest) -> Compared:
     log, declared = open_log(LOGS / request.param), load_site(LOGS / request.param / "site.yaml")
-    # What the future is worth: with the same weights, which tuning and a model error that is constant
-    # in place make others in a whole log than online.
+    # What the future is worth, with the same weights: tuning, and a model error that is constant in
+    # place, make others in a whole log than online.
     site, now = replace(declared, model_error_length=0.0), {}
     estimators: tuple[Literal["smoother", "ekf"], ...] = ("ekf", "smoother")
     for estimator in estimators:
