@@ -40,8 +40,8 @@ def test_what_once_broke_is_answered(path: Path, inputs: Path, tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_ten_thousand_inputs_break_nothing(tmp_path: Path) -> None:
-    """Or as many as there are in three minutes."""
-    ran, finds = fuzz(10_000, 180.0, 0, tmp_path)
-    assert ran > 0
+def test_two_hundred_inputs_break_nothing(tmp_path: Path) -> None:
+    """The same ones each time; ``tools/fuzz.py`` makes as many others as there is time for."""
+    ran, finds = fuzz(200, 900.0, 0, tmp_path)
+    assert ran >= 200
     assert not finds, finds

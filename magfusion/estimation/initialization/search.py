@@ -146,7 +146,8 @@ def thinned(samples: FieldSamples) -> IntArray:
     """Return which epochs are taken: no two windows share a sample."""
     usual = float(np.median(np.diff(samples.time)))
     wanted = max(STEP, float(np.median(samples.window)), float(np.ptp(samples.time)) / VISITS)
-    return np.arange(0, len(samples), max(1, round(wanted / usual)))
+    stride = min(round(wanted / usual), len(samples) - 1)  # of the shortest log both ends
+    return np.arange(0, len(samples), max(1, stride))
 
 
 def _upright(imu: ImuSamples, time_offset: float, time: Array, site: Site) -> Gravity:
