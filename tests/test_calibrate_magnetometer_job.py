@@ -13,9 +13,10 @@ from conftest import Refuse, Worked, change_table, run_command
 from test_shared_logs import LOGS, needs_shared_logs
 
 from magfusion.calibration.magnetometer import field_from_measured, spread
+from magfusion.calibration.magnetometer_log import calibrate_log
 from magfusion.calibration.steady_field import steady_field, window_length
 from magfusion.calibration.stops import find_stops
-from magfusion.errors import InputError
+from magfusion.errors import EstimationError, InputError
 from magfusion.files.log import write_log
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site, save_site
@@ -154,6 +155,98 @@ def test_a_site_that_declares_no_sigma_gets_a_wide_prior(
     usual = load_site(result / "site.yaml").platform.magnetometer
     np.testing.assert_allclose(wide.matrix, usual.matrix, rtol=0.0, atol=2e-3)
     np.testing.assert_allclose(wide.offset, usual.offset, rtol=0.0, atol=2e-9)
+
+
+HARD_IRON = 9e-5 * np.array([0.6, 0.64, 0.48])  # T; twice the Earth's field
+
+
+def with_hard_iron(
+    turned: tuple[SimulatedLog, Path],
+    place: Path,
+    sigma: float,
+    end: float,
+    field_world: bool = True,
+) -> Path:
+    """Write the turned log with a large hard iron, declared with a sigma (T)."""
+    log, site = turned[0].log, miscalibrated()
+    assert log.waveform is not None
+    kept = log.waveform.time < end
+    waveform = Waveform(log.waveform.time[kept], log.waveform.measured_sensor[kept] + HARD_IRON)
+    sensor = site.platform.magnetometer
+    sensor = replace(sensor, sigma=replace(sensor.sigma, offset=np.full(3, sigma)))
+    site = replace(site, platform=replace(site.platform, magnetometer=sensor))
+    if not field_world:
+        site = replace(site, earth_field_world=None)
+    return write(replace(log, waveform=waveform), site, place)
+
+
+@pytest.mark.parametrize("field_world", [pytest.param(True, marks=pytest.mark.slow), False])
+def test_a_large_hard_iron_is_found_where_its_sigma_allows_it(
+    field_world: bool, turned: tuple[SimulatedLog, Path], tmp_path: Path
+) -> None:
+    log = with_hard_iron(turned, tmp_path / "log", 3e-5, 30.0, field_world)
+    report = run_calibrate_magnetometer(Job(log, None, tmp_path / "out"))
+    found = load_site(tmp_path / "out" / "site.yaml").platform.magnetometer
+    true = turned[0].true_site.platform.magnetometer.offset + HARD_IRON
+    assert np.max(np.abs(found.offset - true) / found.sigma.offset) < 3.5
+    assert np.max(found.sigma.offset) < 5e-7
+    assert report["verdict"] != "failed"
+
+
+@pytest.mark.parametrize(
+    ("end", "field_world"),
+    [
+        pytest.param(30.0, True, marks=pytest.mark.slow),
+        pytest.param(12.0, True, marks=pytest.mark.slow),
+        (12.0, False),
+    ],
+)
+def test_a_hard_iron_beyond_its_sigma_is_never_called_determined(
+    end: float, field_world: bool, turned: tuple[SimulatedLog, Path], tmp_path: Path
+) -> None:
+    log = with_hard_iron(turned, tmp_path / "log", 5e-7, end, field_world)
+    with pytest.raises(EstimationError):
+        run_calibrate_magnetometer(Job(log, None, tmp_path / "out"))
+    assert not (tmp_path / "out" / "site.yaml").exists()
+
+
+def test_what_is_kept_keeps_the_sigma_that_it_had(
+    turned: tuple[SimulatedLog, Path],
+) -> None:
+    simulated = turned[0]
+    log = simulated.log
+    assert log.waveform is not None
+    true = simulated.true_site.platform.magnetometer
+    sigma = replace(true.sigma, matrix=np.full((3, 3), 0.003), offset=np.full(3, 3e-8))
+    known = replace(true, sigma=sigma)
+    site = miscalibrated()
+    site = replace(site, platform=replace(site.platform, magnetometer=known))
+    kept = log.waveform.time < 14.0  # in which one half tells little of the other
+    waveform = Waveform(log.waveform.time[kept], log.waveform.measured_sensor[kept])
+    found = calibrate_log(waveform, log.imu, site)
+    assert found.shape_kept
+    np.testing.assert_allclose(found.magnetometer.offset, known.offset, rtol=0.0, atol=0.0)
+    np.testing.assert_allclose(found.magnetometer.sigma.offset, sigma.offset, rtol=1e-6)
+    size = np.linalg.norm(found.magnetometer.matrix, axis=0) / np.linalg.norm(known.matrix, axis=0)
+    np.testing.assert_allclose(size, 1.0, rtol=0.0, atol=0.02)
+    assert np.all(np.diagonal(found.magnetometer.sigma.matrix) > 0.9 * 0.003)
+
+
+def test_the_size_of_the_field_speaks_against_a_small_spread(
+    turned: tuple[SimulatedLog, Path],
+) -> None:
+    """Twelve seconds: the declared offset of zero leaves little spread, of a field too large."""
+    log, site = turned[0].log, miscalibrated()
+    assert log.waveform is not None
+    sensor = site.platform.magnetometer
+    zero = np.zeros(3)
+    none = replace(sensor.sigma, matrix=np.zeros((3, 3)), offset=zero)
+    site = replace(site, platform=replace(site.platform, magnetometer=replace(sensor, sigma=none)))
+    kept = log.waveform.time < 12.0
+    waveform = Waveform(log.waveform.time[kept], log.waveform.measured_sensor[kept])
+    found = calibrate_log(waveform, log.imu, site).magnetometer
+    true = turned[0].true_site.platform.magnetometer
+    assert np.max(np.abs(found.offset - true.offset) / found.sigma.offset) < 3.5
 
 
 def test_twelve_stops_are_found_in_the_stream(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from magfusion.calibration.magnetometer_graph import Epochs, GraphFit, Prior, fi
 from magfusion.calibration.steady_field import LONGEST, SteadyField, average, steady_field
 from magfusion.calibration.stops import distinct, find_stops
 from magfusion.errors import EstimationError, InputError
+from magfusion.model.field import skew
 from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.model.site import Magnetometer, Site
 from magfusion.units import DEGREE, Array
@@ -36,6 +37,7 @@ SHAKEN = 5  # epochs over which disturbed specific force is looked for
 # so that many shaken epochs tell no more than a few.
 IN_STEP = 4.0
 FIRST_SIGMA = 1e-3  # of the field, before its noise is measured
+FIELD_SCALES = (0.05, 20.0)  # by which the first guess of an undeclared field's size may be wrong
 LINEARITY = 2e-5  # of the field; a reading is no better than this, however long the window
 PASSES = 3
 
@@ -99,7 +101,7 @@ def calibrate_log(
     readings = _readings(waveform, imu, site, known, at_stops)
     up_sensor = readings.accel_body @ known.body_from_sensor
     missing = missing_orientations(up_sensor)
-    _refuse_one_axis(readings, known, missing)
+    _refuse_one_axis(readings, known, site.earth_field_world, missing)
     prior = _prior(site, readings)
     turns = _turns(imu, site, readings.time)
     start = _start(readings, up_sensor, prior, missing)
@@ -114,6 +116,8 @@ def calibrate_log(
         )
         graph = fit_graph(epochs, prior, start)
         start = graph.fit
+        if site.earth_field_world is None:
+            prior, start = _scaled_as_declared(prior, start)
         found = replace(known, matrix=start.matrix, offset=start.offset)
         readings = _readings(waveform, imu, site, found, at_stops)
         sigma = _field_sigma(readings, found, prior)
@@ -122,9 +126,9 @@ def calibrate_log(
     if site.earth_field_world is None:
         graph = replace(graph, fit=_with_unknown_scale(graph.fit, prior))
     unseen = None if at_stops else _spread_unseen(epochs, prior, graph.fit)
-    kept = unseen is not None and _no_better(unseen, readings, known)
+    kept = unseen is not None and _no_better(unseen, readings, known, site.earth_field_world)
     if kept:
-        graph = replace(graph, fit=_turned_only(known, graph.fit))
+        graph = replace(graph, fit=_turned_only(known, graph.fit, prior))
     return LogCalibration(
         magnetometer=refined(known, graph.fit),
         graph=graph,
@@ -165,10 +169,13 @@ def _readings(
     return average(waveform, imu, offset, known, stops.centre + offset, window)
 
 
-def _refuse_one_axis(readings: SteadyField, known: Magnetometer, missing: list[str]) -> None:
+def _refuse_one_axis(
+    readings: SteadyField, known: Magnetometer, field_world: Array | None, missing: list[str]
+) -> None:
     field = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
-    unit = field / np.linalg.norm(field, axis=1, keepdims=True)
-    spreads = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(unit.T)), 0.0))
+    # Not the directions of the readings: a hard iron that is yet to be found hides their turning.
+    size = np.linalg.norm(field if field_world is None else field_world, axis=-1)
+    spreads = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(field.T)), 0.0)) / np.median(size)
     if spreads[1] < ONE_AXIS:
         raise InputError(
             "magnetometer: too few orientations to calibrate on: "
@@ -273,6 +280,21 @@ def _turns(
     return tuple(out)
 
 
+def _scaled_as_declared(prior: Prior, fit: MagnetometerFit) -> tuple[Prior, MagnetometerFit]:
+    """Return prior and fit with the field's size that leaves the declared scale.
+
+    The first guess of that size is as wrong as the declared offset.
+    """
+    scale = float(np.cbrt(np.linalg.det(fit.matrix) / np.linalg.det(prior.matrix)))
+    if not FIELD_SCALES[0] < scale < FIELD_SCALES[1]:
+        raise EstimationError(
+            f"the scale of the magnetometer comes out {scale:.3g} times the declared one; declare"
+            " its offset, or the Earth field (earth_field_t), or turn it about all its axes"
+        )
+    prior = replace(prior, field_world=scale * prior.field_world)
+    return prior, replace(fit, matrix=fit.matrix / scale)
+
+
 def _with_unknown_scale(fit: MagnetometerFit, prior: Prior) -> MagnetometerFit:
     """Add the scale, which only the declared matrix gives, to the covariance."""
     variance = float(np.mean(np.diagonal(prior.cov)[[0, 4, 8]])) / 3.0
@@ -306,13 +328,27 @@ def _part(epochs: Epochs, part: slice) -> Epochs:
     )
 
 
-def _no_better(unseen: float, readings: SteadyField, known: Magnetometer) -> bool:
-    """Return whether the spread is not below the declared calibration's by more than chance."""
+def _no_better(
+    unseen: float, readings: SteadyField, known: Magnetometer, field_world: Array | None
+) -> bool:
+    """Return whether the spread is not below the declared calibration's by more than chance.
+
+    A large hard iron makes a large field, of which any scatter is a small share: the declared
+    calibration must leave the size right, too.
+    """
     declared = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
-    return unseen > spread(declared) * (1.0 - float(np.sqrt(0.5 / len(readings))))
+    sizes = np.linalg.norm(declared, axis=1)
+    size = np.mean(sizes) if field_world is None else np.linalg.norm(field_world)
+    left = float(np.sqrt(np.mean((sizes - size) ** 2)) / size)
+    return unseen > left * (1.0 - float(np.sqrt(0.5 / len(readings))))
 
 
-def _turned_only(known: Magnetometer, fit: MagnetometerFit) -> MagnetometerFit:
-    """Return the declared shape and offset with the rotation that was found."""
+def _turned_only(known: Magnetometer, fit: MagnetometerFit, prior: Prior) -> MagnetometerFit:
+    """Return the declared shape and offset, known as before, with the rotation that was found."""
     left, _, right = np.linalg.svd(np.linalg.inv(known.matrix) @ fit.matrix)
-    return replace(fit, matrix=known.matrix @ left @ right, offset=known.offset)
+    turn = np.stack([(known.matrix @ skew(axis)).ravel() for axis in np.eye(3)], axis=1)
+    rotation = np.zeros((12, 12))
+    rotation[:9, :9] = turn @ np.linalg.pinv(turn)
+    shape = np.eye(12) - rotation
+    cov = rotation @ fit.cov @ rotation.T + shape @ prior.cov @ shape.T
+    return MagnetometerFit(known.matrix @ left @ right, known.offset, cov)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 JOB = "calibrate magnetometer"
 SCALE = 0.3  # of the matrix, by which it contradicts the site, however wide its sigmas
+SMALLEST, LARGEST = 1.5e-5, 1e-4  # T; the Earth's field, with what steel does to it
 _AXES = "xyz"
 
 
@@ -238,6 +239,7 @@ def _doubts(found: LogCalibration, site: Site) -> Iterator[Finding]:
             Verdict.FAILED,
             abs(ratio - 1.0) / SCALE,
         )
+    yield from _of_another_size(found, site)
     disturbed = found.field_sigma / float(np.linalg.norm(found.prior.field_world))
     if disturbed > site.earth.strength_sigma:
         yield Finding(
@@ -246,6 +248,37 @@ def _doubts(found: LogCalibration, site: Site) -> Iterator[Finding]:
             f" declares a disturbance of {100.0 * site.earth.strength_sigma:.2g} %"
             " (world.earth.strength_sigma). Turn the sensor in one place, away from iron.",
             weight=disturbed / site.earth.strength_sigma,
+        )
+
+
+def _of_another_size(found: LogCalibration, site: Site) -> Iterator[Finding]:
+    """Yield that the calibrated field is not of the declared size, or of no size on Earth."""
+    from magfusion.model.trust import Finding, Verdict
+
+    size = float(np.mean(np.linalg.norm(_fields(found, found.magnetometer), axis=1)))
+    remedy = (
+        " A hard iron remains that this motion does not tell from the field: turn the sensor about"
+        " all its axes, and declare a larger sigma of its offset"
+    )
+    if site.earth_field_world is None:
+        if not SMALLEST < size < LARGEST:
+            yield Finding(
+                "earth_field",
+                f"The calibrated field is {1e6 * size:.3g} uT, and the Earth's is 22 to 67."
+                f"{remedy}; or give the field there (earth_field_t).",
+                Verdict.FAILED,
+                size / LARGEST,
+            )
+        return
+    declared = float(np.linalg.norm(site.earth_field_world))
+    off = abs(size / declared - 1.0)
+    if off > site.earth.strength_sigma:
+        yield Finding(
+            "earth_field",
+            f"The calibrated field is {1e6 * size:.3g} uT, and the site declares"
+            f" {1e6 * declared:.3g} (within {100.0 * site.earth.strength_sigma:.2g} %).{remedy}.",
+            Verdict.FAILED if off > SCALE else Verdict.DOUBTFUL,
+            off / site.earth.strength_sigma,
         )
 
 
