@@ -143,7 +143,8 @@ def _command(path: str) -> Any:
     name = path.split()[-1]
     only = typer.Typer(add_completion=False)
     command: Command = import_module(f"magfusion.jobs.{module}").COMMAND
-    only.command(name, help=text)(_callback(path, command))
+    epilog = f"Example: {command.example}" if command.example else None
+    only.command(name, help=text, epilog=epilog)(_callback(path, command))
     return get_command(only)
 
 
@@ -217,7 +218,7 @@ def _parameters(command: Command, writes: bool) -> list[inspect.Parameter]:
     if writes:
         note = "" if command.output or command.output_required else _NAMED_BY_LOG
         note = _NOT_WRITTEN if command.output_optional else note
-        info = typer.Option("--output", "-o", help=f"Directory of the results{note}.")
+        info = typer.Option("--output", "-o", help=f"{command.output_help}{note}.")
         default: Any = Path(command.output) if command.output else None
         if command.output_required:
             default = inspect.Parameter.empty

@@ -22,6 +22,10 @@ JOBS = {
         "evaluate",
         "Compare a trajectory with a truth: ATE, RPE and attitude, absolute and aligned.",
     ),
+    "export": (
+        "export",
+        "Hand a result on: as a ROS 2 bag (MCAP, db3), TUM, KITTI or CSV.",
+    ),
     "view": ("view", "Open the recording of a result in the rerun viewer."),
     "demo": (
         "demo",

@@ -146,8 +146,12 @@ class Command:
         Whether it writes only where the user says.
     reports : bool
         Whether it makes a report, which ``--json`` prints.
+    output_help : str
+        What ``--output`` is; `magfusion.cli` adds its default.
     after : callable, optional
         Called with settings and output when the result has been shown.
+    example : str
+        With which the help ends.
     """
 
     settings: type[Settings]
@@ -156,7 +160,9 @@ class Command:
     output_required: bool = False
     output_optional: bool = False
     reports: bool = True
+    output_help: str = "Directory of the results"
     after: Callable[[Any, Path], None] | None = None
+    example: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)

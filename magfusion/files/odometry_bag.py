@@ -1,0 +1,123 @@
+"""Trajectories as ROS 2 bags, MCAP or SQLite, without ROS: odometry, and poses with covariance."""
+
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.files.result_states import ResultStates
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array
+
+ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseWithCovarianceStamped"
+# ROS has no word for "not known", and who fuses takes a zero for certain.
+UNKNOWN_VARIANCE = 1e6  # m^2, rad^2, and a second's of them
+_NS = 1_000_000_000
+_LAST_STAMP = (1 << 31) * _NS  # of builtin_interfaces/Time, whose seconds have 31 bits
+_STORAGES = {"mcap": StoragePlugin.MCAP, "db3": StoragePlugin.SQLITE3}
+
+
+class Frames(NamedTuple):
+    """Names of the frames, and the namespace of the topics."""
+
+    world: str = "world"
+    body: str = "body"
+    namespace: str = "/magfusion"
+
+
+def fixed_axes_covariance(trajectory: Trajectory) -> Array:
+    """Return covariances of poses as ROS means them, shape (n, 6, 6).
+
+    Ours is of a small motion on the right: rotation, then translation, both in body axes.  That of
+    ``geometry_msgs/PoseWithCovariance`` is of x, y, z and of rotations about the X, Y and Z axes of
+    the header's frame, which do not move the position.  To first order both parts are turned into
+    the world: ``d_position_world = R d_position_body`` and ``R exp(d) = exp(R d) R``.
+
+    Without a covariance, `UNKNOWN_VARIANCE` is on the diagonal.
+    """
+    n = len(trajectory)
+    if trajectory.pose_cov is None:
+        return np.tile(UNKNOWN_VARIANCE * np.eye(6), (n, 1, 1))
+    jacobian = np.zeros((n, 6, 6))
+    jacobian[:, :3, 3:] = jacobian[:, 3:, :3] = trajectory.world_from_body
+    cov = jacobian @ trajectory.pose_cov @ jacobian.swapaxes(1, 2)
+    return np.asarray(0.5 * (cov + cov.swapaxes(1, 2)))
+
+
+def write_bag(
+    states: ResultStates,
+    path: Path,
+    form: Literal["mcap", "db3"],
+    frames: Frames,
+    report: Callable[[int], None],
+) -> None:
+    """Write ``odometry`` and ``pose`` below the namespace, in one file.
+
+    Velocities are in body axes, as the child frame's are to be.  The rate of turning is no part of
+    a result: it is zero with `UNKNOWN_VARIANCE`, and so is the variance of velocity.
+
+    Parameters
+    ----------
+    report : callable
+        Is told from time to time how many states were written.
+
+    Raises
+    ------
+    InputError
+        Where a stamp is none of ROS.
+    """
+    stamps = states.stamp_ns
+    wrong = stamps[(stamps < 0) | (stamps >= _LAST_STAMP)]
+    if len(wrong):
+        raise InputError(
+            f"the stamp {wrong[0]} ns is none that ROS can write (1970 to 2038); give the log an"
+            " epoch_ns of its date, or export csv"
+        )
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    # The library writes a directory, of which the one file is wanted, with a name of its own.
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".bag-") as place:
+        bag = Path(place) / "bag"
+        with Writer(bag, version=9, storage_plugin=_STORAGES[form]) as writer:
+            topics = [
+                writer.add_connection(f"{frames.namespace}/{name}", msgtype, typestore=store)
+                for name, msgtype in (("odometry", ODOMETRY), ("pose", POSE))
+            ]
+            for k, messages in enumerate(_messages(states, frames, store.types)):
+                for topic, message in zip(topics, messages, strict=True):
+                    raw = store.serialize_cdr(message, topic.msgtype)
+                    writer.write(topic, int(stamps[k]), raw)
+                if k % 1000 == 0:
+                    report(k)
+        (bag / f"bag.{form}").replace(path)
+
+
+def _messages(states: ResultStates, frames: Frames, types: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield odometry and pose of each state."""
+    found = states.trajectory
+    quaternion = Rotation.from_matrix(found.world_from_body).as_quat().tolist()
+    cov = fixed_axes_covariance(found).reshape(-1, 36)
+    velocity = np.zeros((len(found), 3))
+    if found.velocity_world is not None:
+        velocity = np.einsum("nji,nj->ni", found.world_from_body, found.velocity_world)
+    vector, unknown = types["geometry_msgs/msg/Vector3"], (UNKNOWN_VARIANCE * np.eye(6)).ravel()
+    for k, stamp in enumerate(states.stamp_ns.tolist()):
+        time = types["builtin_interfaces/msg/Time"](*divmod(stamp, _NS))
+        header = types["std_msgs/msg/Header"](time, frames.world)
+        pose = types["geometry_msgs/msg/PoseWithCovariance"](
+            types["geometry_msgs/msg/Pose"](
+                types["geometry_msgs/msg/Point"](*found.position_world[k].tolist()),
+                types["geometry_msgs/msg/Quaternion"](*quaternion[k]),
+            ),
+            cov[k],
+        )
+        twist = types["geometry_msgs/msg/TwistWithCovariance"](
+            types["geometry_msgs/msg/Twist"](vector(*velocity[k].tolist()), vector(0.0, 0.0, 0.0)),
+            unknown,
+        )
+        yield types[ODOMETRY](header, frames.body, pose, twist), types[POSE](header, pose)

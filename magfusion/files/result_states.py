@@ -1,0 +1,87 @@
+"""The states of a result with all that is said of each, for those who hand them on."""
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from magfusion.errors import InputError
+from magfusion.files.table import Layout, Span, read_table
+from magfusion.files.trajectory_table import read_trajectory
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Verdict
+from magfusion.units import IntArray
+
+VERDICT = "verdict"
+
+
+@dataclass(frozen=True, eq=False)
+class ResultStates:
+    """States that have a pose.
+
+    Parameters
+    ----------
+    stamp_ns : ndarray of int, shape (n,)
+        As the file has them: the log's epoch is within.
+    trajectory : Trajectory
+        The same states, in seconds since the first.
+    columns : pyarrow.Table
+        All that the file holds of them.
+    left_out : int
+        States of the file whose verdict is failed: their poses are none.
+    """
+
+    stamp_ns: IntArray
+    trajectory: Trajectory
+    columns: pa.Table
+    left_out: int
+
+
+def read_result_states(path: Path) -> ResultStates:
+    """Read a table of states, Parquet or CSV, and leave out those that failed.
+
+    Raises
+    ------
+    InputError
+        As `magfusion.files.trajectory_table.read_trajectory`, or where no state has a pose.
+    """
+    stamps = read_table(path, Layout(numbers=()), Span(0)).time_ns
+    trajectory = read_trajectory(path, int(stamps[0]))
+    columns = pa.csv.read_csv(path) if path.suffix == ".csv" else pa.parquet.read_table(path)
+    kept = np.ones(len(stamps), dtype=bool)
+    if VERDICT in columns.column_names:
+        failed = str(Verdict.FAILED)
+        kept = np.array([said != failed for said in columns[VERDICT].to_pylist()])
+    if not kept.any():
+        raise InputError(
+            f"{path}: its {len(stamps)} states have all failed, so that none has a pose; its"
+            " report.json says why"
+        )
+    parts = {f.name: getattr(trajectory, f.name) for f in fields(trajectory)}
+    own = {name: part[kept] for name, part in parts.items() if part is not None}
+    return ResultStates(
+        stamps[kept], replace(trajectory, **own), columns.filter(kept), int(np.sum(~kept))
+    )
+
+
+def write_csv(states: ResultStates, path: Path) -> None:
+    """Write all columns as text; lists of names (``excluded``) are joined by spaces."""
+    columns = {
+        name: [" ".join(one or ()) for one in column.to_pylist()]
+        if pa.types.is_list(column.type)
+        else column
+        for name, column in zip(
+            states.columns.column_names, states.columns.itercolumns(), strict=True
+        )
+    }
+    pa.csv.write_csv(pa.table(columns), path)
+
+
+def write_kitti(states: ResultStates, path: Path) -> None:
+    """Write poses as the KITTI odometry benchmark does: 3 rows of 4, one line a pose, no times."""
+    found = states.trajectory
+    matrices = np.concatenate([found.world_from_body, found.position_world[:, :, None]], axis=2)
+    np.savetxt(path, matrices.reshape(-1, 12), fmt="%.9f")

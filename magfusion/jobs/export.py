@@ -1,0 +1,166 @@
+"""The job that hands a result on: as a ROS 2 bag, TUM, KITTI or CSV."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from magfusion.errors import InputError
+from magfusion.jobs.settings import Command, Settings, argument, option
+from magfusion.model.progress import Report, quiet
+from magfusion.results.figures import Figure, Figures, Section
+
+if TYPE_CHECKING:
+    from magfusion.files.result_states import ResultStates
+
+Format = Literal["mcap", "db3", "tum", "kitti", "csv"]
+FORMATS: tuple[Format, ...] = ("mcap", "db3", "tum", "kitti", "csv")
+_NAMESPACE = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportSettings(Settings):
+    """What is handed on, and how."""
+
+    result: Path = argument("Result directory, or a table of states in it")
+    format: Format | None = option(
+        None, "Form of the file", note="default: what its name ends with"
+    )
+    frame: str = option("world", "Frame of the poses, in a bag")
+    child: str = option("body", "Frame that they are the poses of, in a bag")
+    namespace: str = option("/magfusion", "Of the topics odometry and pose, in a bag")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("frame", "child"):
+            if not getattr(self, name).strip():
+                raise InputError(f"--{name} must name a frame; got nothing")
+        if self.frame == self.child:
+            raise InputError(f"--frame and --child must differ; got {self.frame!r} for both")
+        if not _NAMESPACE.fullmatch(self.namespace):
+            raise InputError(f"--namespace must be of the form /robot/nav; got {self.namespace!r}")
+
+    def format_of(self, output: Path) -> Format:
+        """Return the form of a file.
+
+        Raises
+        ------
+        InputError
+        """
+        if self.format is not None:
+            return self.format
+        for form in FORMATS:
+            if output.suffix.lower() == f".{form}":
+                return form
+        raise InputError(
+            f"{output}: the name does not say what to write; end it with one of"
+            f" {', '.join('.' + one for one in FORMATS)}, or give --format"
+        )
+
+
+def run_export(settings: ExportSettings, output: Path, report: Report = quiet) -> Figures:
+    """Write the states of a result that have a pose, stamped with the log's clock.
+
+    Raises
+    ------
+    InputError
+        Where there is no result, none of its states has a pose, or a directory is in the way.
+    """
+    from magfusion.files.atomic import whole_file
+    from magfusion.files.result_states import read_result_states
+    from magfusion.jobs.inputs import named
+
+    form = settings.format_of(output)
+    path, told = _source(settings.result)
+    if output.is_dir():
+        raise InputError(f"{output}: is a directory; give the path of a file to write")
+    if not output.absolute().parent.is_dir():
+        raise InputError(f"{output.parent}: there is no such directory; make it first")
+    states = read_result_states(path)
+    if output.exists() and output.samefile(path):
+        raise InputError(f"{output}: is what is to be exported; give another path")
+    total = len(states.stamp_ns)
+    with whole_file(output) as unfinished, named(path):
+        _write(settings, form, states, unfinished, lambda k: report("writing", k, total))
+    figures = [
+        Figure("job", "export", section=Section.TITLE),
+        Figure("result", settings.result.name or str(settings.result), section=Section.TITLE),
+        Figure("file", str(output)),
+        Figure("format", form),
+        Figure("states", total, label="states written"),
+        Figure("states_failed", states.left_out, label="states without a pose, left out"),
+    ]
+    lost = told.get("lost_epochs")
+    if isinstance(lost, int):
+        figures.append(Figure("lost_epochs", lost, label="states lost, of which there is no row"))
+    if "verdict" in told:
+        figures.append(
+            Figure("result_verdict", str(told["verdict"]), label="verdict of the result")
+        )
+    return Figures(*figures)
+
+
+def _source(result: Path) -> tuple[Path, dict[str, object]]:
+    """Return the table of a result, and its report as far as there is one."""
+    if not result.is_dir():
+        if result.suffix not in (".parquet", ".csv"):
+            raise InputError(
+                f"{result}: is no result; give the directory that a job wrote, or a table of states"
+                " (.parquet, .csv)"
+            )
+        return result, {}
+    try:
+        told = json.loads((result / "report.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        told = {}
+    told = told if isinstance(told, dict) else {}
+    table = result / "trajectory.parquet"
+    if not table.is_file():
+        if told.get("verdict") == "failed":
+            raise InputError(
+                f"{result}: its verdict is failed, so that there is no trajectory to export; its"
+                " report.json says why"
+            )
+        raise InputError(
+            f"{result}: holds no trajectory.parquet; give the result of smooth, fix or navigate"
+        )
+    return table, told
+
+
+def _write(
+    settings: ExportSettings,
+    form: Format,
+    states: ResultStates,
+    path: Path,
+    report: Callable[[int], None],
+) -> None:
+    if form == "csv":
+        from magfusion.files.result_states import write_csv
+
+        write_csv(states, path)
+    elif form == "kitti":
+        from magfusion.files.result_states import write_kitti
+
+        write_kitti(states, path)
+    elif form == "tum":
+        from magfusion.files.tum import write_tum
+
+        write_tum(states.trajectory, path, int(states.stamp_ns[0]))
+    else:
+        from magfusion.files.odometry_bag import Frames, write_bag
+
+        frames = Frames(settings.frame, settings.child, settings.namespace)
+        write_bag(states, path, form, frames, report)
+
+
+COMMAND = Command(
+    ExportSettings,
+    run_export,
+    output_required=True,
+    output_help="File to write, which is replaced",
+    example="magfusion export run -o run.mcap --frame map --child base_link",
+)
