@@ -125,10 +125,15 @@ def application() -> typer.Typer:
     app = typer.Typer(
         cls=_Jobs,
         help="Navigation from magnetic beacons and inertial sensors where there is no GNSS.",
+        epilog=_example("magfusion demo"),
         pretty_exceptions_enable=False,
     )
     app.callback()(_options)
-    groups = {name: typer.Typer(cls=_Jobs, help=text) for name, text in GROUPS.items()}
+    groups = {
+        name: typer.Typer(cls=_Jobs, help=text, epilog=_example(f"magfusion {name} {first} --help"))
+        for name, text in GROUPS.items()
+        for first in [next(path.split()[1] for path in JOBS if path.startswith(f"{name} "))]
+    }
     for path, (_, text) in JOBS.items():
         group, _, name = path.rpartition(" ")
         (groups[group] if group else app).command(name, help=text)(lambda: None)
@@ -143,16 +148,25 @@ def _command(path: str) -> Any:
     name = path.split()[-1]
     only = typer.Typer(add_completion=False)
     command: Command = import_module(f"magfusion.jobs.{module}").COMMAND
-    epilog = f"Example: {command.example}" if command.example else None
-    only.command(name, help=text, epilog=epilog)(_callback(path, command))
+    only.command(name, help=text, epilog=_example(command.example))(_callback(path, command))
     return get_command(only)
+
+
+def _example(command: str) -> str:
+    """Return the end of a help; what typer would take for its markup is escaped."""
+    return f"Example: {command}".replace("[", "\\[")
 
 
 def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import version
 
-        sys.stdout.write(f"magfusion {version('magfusion')}\n")
+        from magfusion.files.commit import commit
+
+        known = commit()
+        sys.stdout.write(
+            f"magfusion {version('magfusion')}{f' (commit {known})' if known else ''}\n"
+        )
         raise typer.Exit
 
 
@@ -160,7 +174,7 @@ def _options(
     _version: Annotated[
         bool,
         typer.Option(
-            "--version", is_eager=True, callback=_print_version, help="Print the version."
+            "--version", is_eager=True, callback=_print_version, help="Print version and commit."
         ),
     ] = False,
     _debug: Annotated[

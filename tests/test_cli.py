@@ -285,4 +285,4 @@ def test_help_and_version_are_told(capfd: pytest.CaptureFixture[str]) -> None:
         run_command(*arguments)
         assert "Usage: magfusion" in capfd.readouterr().out
     run_command("--version")
-    assert re.fullmatch(r"magfusion \d+\.\d+\.\d+\n", capfd.readouterr().out)
+    assert re.fullmatch(r"magfusion \d+\.\d+\.\d+( \(commit .+\))?\n", capfd.readouterr().out)

@@ -259,4 +259,8 @@ def _windows(
     return centre, np.full(len(centre), length)
 
 
-COMMAND = Command(DatabaseSettings, run_attitude_database)
+COMMAND = Command(
+    DatabaseSettings,
+    run_attitude_database,
+    example="magfusion calibrate attitude-database log -o database",
+)

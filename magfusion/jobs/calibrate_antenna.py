@@ -370,4 +370,9 @@ def _of_size(coil: Coil, kappa: Array | None) -> Coil:
     return replace(coil, radius=radius, length=length)
 
 
-COMMAND = Command(AntennaSettings, run_calibrate_antenna, output="antenna")
+COMMAND = Command(
+    AntennaSettings,
+    run_calibrate_antenna,
+    output="antenna",
+    example="magfusion calibrate antenna survey --site site.yaml -o antenna",
+)

@@ -345,4 +345,9 @@ def _refined_site(site: Site, found: list[_Calibrated], path: Path) -> Site:
     )
 
 
-COMMAND = Command(BeaconSettings, run_calibrate_beacon, output="beacon")
+COMMAND = Command(
+    BeaconSettings,
+    run_calibrate_beacon,
+    output="beacon",
+    example="magfusion calibrate beacon survey --site site.yaml -o beacon",
+)

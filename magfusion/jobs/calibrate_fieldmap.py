@@ -238,4 +238,9 @@ def _figures(fit: MapFit) -> Figures:
     )
 
 
-COMMAND = Command(MapSettings, run_calibrate_fieldmap, output="field_map")
+COMMAND = Command(
+    MapSettings,
+    run_calibrate_fieldmap,
+    output="field_map",
+    example="magfusion calibrate fieldmap survey --site site.yaml -o mapped",
+)

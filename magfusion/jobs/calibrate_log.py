@@ -343,4 +343,9 @@ def _transfer_figures(transfer: Transfer) -> Figures:
     return Figures(*figures, apart)
 
 
-COMMAND = Command(LogCalibrationSettings, run_calibrate_log, output="calibration")
+COMMAND = Command(
+    LogCalibrationSettings,
+    run_calibrate_log,
+    output="calibration",
+    example="magfusion calibrate log log --cross-validate 2 -o calibration",
+)

@@ -304,4 +304,9 @@ def _remarks(found: LogCalibration) -> Iterator[Finding]:
         )
 
 
-COMMAND = Command(MagnetometerSettings, run, output="magnetometer")
+COMMAND = Command(
+    MagnetometerSettings,
+    run,
+    output="magnetometer",
+    example="magfusion calibrate magnetometer log -o magnetometer",
+)

@@ -115,4 +115,9 @@ def _of_compasses(look: Look) -> Figures:
     return figures
 
 
-COMMAND = Command(CheckSettings, run_check, output_optional=True)
+COMMAND = Command(
+    CheckSettings,
+    run_check,
+    output_optional=True,
+    example="magfusion check log --site site.yaml",
+)

@@ -181,4 +181,9 @@ def _write_points(path: Path, found: Coverage) -> None:
     write_table(columns, path)
 
 
-COMMAND = Command(CoverageSettings, run_coverage, output="coverage")
+COMMAND = Command(
+    CoverageSettings,
+    run_coverage,
+    output="coverage",
+    example="magfusion coverage site.yaml --extra-beacon -o coverage",
+)

@@ -60,4 +60,5 @@ COMMAND = Command(
     run_demo,
     output="magfusion_demo",
     after=_show,
+    example="magfusion demo",
 )

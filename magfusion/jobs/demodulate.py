@@ -72,7 +72,4 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     return figures
 
 
-COMMAND = Command(
-    DemodulateSettings,
-    run_demodulate,
-)
+COMMAND = Command(DemodulateSettings, run_demodulate, example="magfusion demodulate log -o phasors")

@@ -230,4 +230,9 @@ def _progress(tasks: list[WorldTask], report: Report | None) -> Iterator[None]:
         thread.join()
 
 
-COMMAND = Command(DriftSettings, run_drift, output="drift")
+COMMAND = Command(
+    DriftSettings,
+    run_drift,
+    output="drift",
+    example="magfusion drift --hours 0.5 --estimator ekf -o drift",
+)

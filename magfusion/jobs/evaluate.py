@@ -57,7 +57,4 @@ def _read_truth(settings: EvaluateSettings) -> tuple[Trajectory, int]:
     return log.truth, log.epoch_ns
 
 
-COMMAND = Command(
-    EvaluateSettings,
-    run_evaluate,
-)
+COMMAND = Command(EvaluateSettings, run_evaluate, example="magfusion evaluate run log")

@@ -278,7 +278,4 @@ def run_published_fix(job: Job, settings: FixSettings) -> Figures:
     return figures
 
 
-COMMAND = Command(
-    FixSettings,
-    run,
-)
+COMMAND = Command(FixSettings, run, example="magfusion fix log -o fixes")

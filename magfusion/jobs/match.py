@@ -309,4 +309,4 @@ def _true_angles(world_from_body: Array, given: Array, angles: tuple[int, ...]) 
     return angles_about(world_from_body, float(given[2]), None if 1 in angles else float(given[1]))
 
 
-COMMAND = Command(MatchSettings, run_match)
+COMMAND = Command(MatchSettings, run_match, example="magfusion match log --yaw-deg 30 -o matched")

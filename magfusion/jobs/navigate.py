@@ -292,4 +292,8 @@ def _save(run: NavigateRun, position: int, elapsed: float) -> None:
     save(run.navigator, position, Kept(run.rows.settle(), elapsed), run.place, run.key)
 
 
-COMMAND = Command(NavigateSettings, run)
+COMMAND = Command(
+    NavigateSettings,
+    run,
+    example="magfusion navigate log --estimator ekf -o navigated",
+)

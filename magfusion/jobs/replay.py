@@ -156,4 +156,9 @@ def run(settings: ReplaySettings) -> None:
         run_replay(found, sink, settings.form, settings.realtime)
 
 
-COMMAND = Command(ReplaySettings, run, reports=False)
+COMMAND = Command(
+    ReplaySettings,
+    run,
+    reports=False,
+    example="magfusion replay log --end 12 | magfusion navigate - --site site.yaml",
+)

@@ -129,4 +129,5 @@ COMMAND = Command(
     SimulateSettings,
     run,
     output_required=True,
+    example="magfusion simulate --site site.yaml --duration 60 -o log",
 )

@@ -257,7 +257,4 @@ def _save_fixes_instead(
     return reason
 
 
-COMMAND = Command(
-    SmoothSettings,
-    run,
-)
+COMMAND = Command(SmoothSettings, run, example="magfusion smooth log --site site.yaml -o run")

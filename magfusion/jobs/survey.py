@@ -258,4 +258,8 @@ def _figures(log: Log, site: Site, survey: Survey, dropped: dict[str, int]) -> F
     return figures | dropped_figures(dropped, "epochs")
 
 
-COMMAND = Command(SurveySettings, run_survey)
+COMMAND = Command(
+    SurveySettings,
+    run_survey,
+    example="magfusion survey log --points epochs -o survey",
+)

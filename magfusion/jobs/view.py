@@ -34,8 +34,4 @@ def run_view(settings: ViewSettings) -> None:
     open_viewer(path)
 
 
-COMMAND = Command(
-    ViewSettings,
-    run_view,
-    reports=False,
-)
+COMMAND = Command(ViewSettings, run_view, reports=False, example="magfusion view run")
