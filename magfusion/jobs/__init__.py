@@ -14,6 +14,10 @@ JOBS = {
         "check",
         "Check a log in seconds: what its streams, fields and first fixes say against it.",
     ),
+    "init": (
+        "init",
+        "Write a commented site file: from options, the tones of a recording, or questions.",
+    ),
     "navigate": (
         "navigate",
         "Navigate online: along a log, or by records on standard input (-).",

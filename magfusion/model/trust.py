@@ -19,6 +19,7 @@ CODES = {
     "ambiguous": "another pose, or place of a beacon, explains the measurements nearly as well",
     "angle_convention": "the attitudes of beacons follow another convention",
     "angle_units": "the attitudes of beacons are in another unit",
+    "assumed": "something that nobody said was assumed",
     "beacon_clock": "a beacon's clock is not as declared",
     "beacon_excluded": "a beacon contradicts the others and was left out, where it does",
     "beacon_fault": "the field of a beacon is false, for a while or altogether",

@@ -83,6 +83,20 @@ class Line:
     amplitude: float
 
 
+def still_field(log: Log, site: Site | None) -> Array:
+    """Return the field of a waveform in axes that stand still, shape (n, 3) (T).
+
+    Without a site nobody knows how magnetometer and gyroscope are mounted: the axes are the body's.
+    """
+    field = field_body(log, site)
+    if log.waveform is None or site is None or len(log.imu) < 2:
+        return field
+    imu, offset = log.imu, site.platform.imu.time_offset
+    turns = attitude_from_gyro(imu.time, imu.gyro_body)
+    at = attitude_at(turns, imu.time, imu.gyro_body, log.waveform.time - offset)
+    return np.asarray(at.apply(field))
+
+
 def spectrum(log: Log, site: Site | None) -> Spectrum | None:
     """Return the mean spectrum of a waveform in axes that stand still; None of a short one."""
     wave = log.waveform
@@ -94,11 +108,7 @@ def spectrum(log: Log, site: Site | None) -> Spectrum | None:
     count = int(duration / step) + 1
     if 2 * count // length - 1 < LEAST_SEGMENTS:
         return None
-    field = field_body(log, site)
-    if site is not None and len(log.imu) > 1:
-        imu, offset = log.imu, site.platform.imu.time_offset
-        turns = attitude_from_gyro(imu.time, imu.gyro_body)
-        field = attitude_at(turns, imu.time, imu.gyro_body, wave.time - offset).apply(field)
+    field = still_field(log, site)
     if np.max(np.abs(np.diff(wave.time) - step)) > 1e-3 * step:
         even = wave.time[0] + step * np.arange(count)
         field = np.stack([np.interp(even, wave.time, c) for c in field.T], axis=1)
@@ -157,7 +167,7 @@ def mains_of(frequency_hz: float, rate_hz: float) -> tuple[float, int] | None:
 def named_lines(found: Spectrum, site: Site | None) -> tuple[Line, ...]:
     """Return tones and undeclared lines, without what motion makes of the tones of a site."""
     tones = [] if site is None else [f for _, f in _tones(site)]
-    return tuple(line for line in lines(found) if not _sideband(found, line, tones))
+    return tuple(line for line in lines(found) if not is_sideband(found, line, tones))
 
 
 def undeclared(found: Spectrum, site: Site) -> tuple[Line, ...]:
@@ -168,12 +178,12 @@ def undeclared(found: Spectrum, site: Site) -> tuple[Line, ...]:
         apart = [abs(line.frequency_hz - f) for f in tones]
         if min(apart, default=np.inf) < TELLABLE * found.resolution_hz:
             continue
-        if not _sideband(found, line, tones):
+        if not is_sideband(found, line, tones):
             out.append(line)
     return tuple(out)
 
 
-def _sideband(found: Spectrum, line: Line, tones: list[float]) -> bool:
+def is_sideband(found: Spectrum, line: Line, tones: list[float]) -> bool:
     """Tell whether a line is what motion makes of a tone: its mirror is there too."""
     own = found.peak(line.frequency_hz)
     for tone in tones:

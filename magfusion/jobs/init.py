@@ -1,0 +1,323 @@
+"""The job that writes a site's file: from options, a recording's tones, or questions."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from magfusion.errors import InputError
+from magfusion.jobs.settings import Command, TopicSettings, option
+from magfusion.results.figures import Figure, Figures, Section, heading
+
+if TYPE_CHECKING:
+    from magfusion.estimation.integrity.tones import Tone, Transmitted
+    from magfusion.files.site_draft import BeaconDraft
+    from magfusion.files.site_text import SiteDraft
+    from magfusion.model.site import Site
+    from magfusion.model.trust import Finding
+
+NEAR_HZ = 0.5  # of a declared frequency, a line is that beacon
+
+
+@dataclass(frozen=True, kw_only=True)
+class InitSettings(TopicSettings):
+    """What is said of an installation; on a terminal, what nobody said is asked."""
+
+    beacon: tuple[str, ...] = option(
+        (),
+        "A beacon, in the keys of a site; again for each",
+        metavar="'NAME KEY=VALUE ...'",
+        note="frequency_hz, and position_m, rpy_deg, moment_a_m2, axes, radius_m, synchronised",
+    )
+    log: Path | None = option(
+        None, "Recording in which to find the tones of the beacons", note="default: none"
+    )
+    imu: str | None = option(None, "Inertial sensor, of those that --list-imus names")
+    magnetometer: str | None = option(
+        None, "Magnetometer, of those that --list-magnetometers names"
+    )
+    lever: str | None = option(None, "Magnetometer from the IMU, in its axes, m", metavar="X,Y,Z")
+    mounting: str | None = option(
+        None, "Magnetometer against the IMU, degrees", metavar="ROLL,PITCH,YAW"
+    )
+    location: str | None = option(
+        None, "Place, for gravity and the Earth's field", metavar="LAT,LON,HEIGHT,DATE"
+    )
+    list_imus: bool = option(False, "List the inertial sensors that are known by name")
+    list_magnetometers: bool = option(False, "List the magnetometers that are known by name")
+
+    @property
+    def described(self) -> bool:
+        """Whether anything was said of the installation itself."""
+        said = (self.imu, self.magnetometer, self.lever, self.mounting, self.location)
+        return bool(self.beacon) or any(one is not None for one in said)
+
+
+def run_init(settings: InitSettings, output: Path) -> Figures | None:
+    """Write a commented site file; what nobody said is marked in it.
+
+    Parameters
+    ----------
+    output : Path
+        File to write; one that is there is kept.
+
+    Raises
+    ------
+    InputError
+    """
+    if settings.list_imus or settings.list_magnetometers:
+        _list(settings)
+        return None
+    if output.exists() or output.is_symlink():
+        raise InputError(f"{output}: is there already; name another file with -o, or remove it")
+    from magfusion.files.site_text import site_text, to_do
+    from magfusion.model.trust import Finding, Trust
+    from magfusion.results.verdict import trust_figures
+
+    heard = _heard(settings)
+    settings, heard = _asked(settings, heard)
+    draft, findings = _draft(settings, heard)
+    _write(site_text(draft), output)
+    findings += [Finding("assumed", f"{sentence}.") for sentence in to_do(draft)]
+    return (
+        heading("init", output.name)
+        | trust_figures(Trust(tuple(findings)))
+        | _figures(draft, heard)
+    )
+
+
+def _heard(settings: InitSettings) -> Transmitted | None:
+    """Return what transmits in the recording, if there is one."""
+    if settings.log is None:
+        return None
+    from magfusion.estimation.integrity.mending import mended
+    from magfusion.estimation.integrity.tones import transmitted
+    from magfusion.files.open import open_log
+    from magfusion.jobs.inputs import topics_option
+
+    log = open_log(settings.log, topics=topics_option(settings.topics))
+    if log.waveform is None:
+        raise InputError(
+            f"{settings.log}: holds no magnetometer samples to find tones in; leave --log out, and"
+            " give frequency_hz with each --beacon"
+        )
+    site = _bare_site(settings)
+    found = transmitted(mended(log, site), site if settings.mounting is not None else None)
+    if found is None:
+        raise InputError(
+            f"{settings.log}: is too short for a spectrum; record ten seconds at least, or leave"
+            " --log out"
+        )
+    if not found.tones and not settings.beacon:
+        others = f" ({'; '.join(found.others)})" if found.others else ""
+        raise InputError(
+            f"{settings.log}: no tone stands out of the magnetometer's spectrum{others}; switch the"
+            " beacons on, or describe them with --beacon"
+        )
+    return found
+
+
+def _asked(
+    settings: InitSettings, heard: Transmitted | None
+) -> tuple[InitSettings, Transmitted | None]:
+    """Ask for what nobody said, where there is somebody to ask."""
+    if settings.described:
+        return settings, heard
+    if sys.stdin is not None and sys.stdin.isatty():
+        from magfusion.jobs.init_questions import answered, recording
+
+        if settings.log is None:
+            settings = replace(settings, log=recording())
+            heard = _heard(settings)
+        return answered(settings, () if heard is None else heard.tones), heard
+    if heard is None:
+        raise InputError(
+            "nothing is described; give --beacon, --log or --imu (see magfusion init --help), or"
+            " run it on a terminal, where it asks"
+        )
+    return settings, heard
+
+
+def _draft(settings: InitSettings, heard: Transmitted | None) -> tuple[SiteDraft, list[Finding]]:
+    from magfusion.files.instruments import UNNAMED, named_imu, named_magnetometer
+    from magfusion.files.site_draft import beacon_draft, numbers, place_of
+    from magfusion.files.site_text import SiteDraft
+    from magfusion.model.physics.earth import gravity
+
+    beacons = [beacon_draft(text) for text in settings.beacon]
+    names = [beacon.name for beacon in beacons]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"--beacon {name}: is given twice; give each beacon its own name")
+    beacons, findings = _with_tones(beacons, heard)
+    place = None if settings.location is None else place_of(settings.location)
+    lever, mounting = settings.lever, settings.mounting
+    return SiteDraft(
+        tuple(beacons),
+        named_imu(settings.imu or UNNAMED),
+        named_magnetometer(settings.magnetometer or UNNAMED),
+        place,
+        None if place is None else round(gravity(place.latitude_deg, place.height_m), 4),
+        None if lever is None else numbers("--lever", lever, (3,)),
+        None if mounting is None else numbers("--mounting", mounting, (3,)),
+    ), findings
+
+
+def _with_tones(
+    beacons: list[BeaconDraft], heard: Transmitted | None
+) -> tuple[list[BeaconDraft], list[Finding]]:
+    """Return the beacons with the tones of the recording, and what the two say of each other."""
+    from magfusion.files.site_draft import BeaconDraft
+    from magfusion.model.trust import Finding
+
+    silent = [beacon.name for beacon in beacons if beacon.frequency_hz is None]
+    if heard is None:
+        if silent:
+            raise InputError(
+                f"--beacon {silent[0]}: frequency_hz is missing; give it in Hz, or a recording with"
+                " --log, in which to find it"
+            )
+        return beacons, []
+    declared = [f for beacon in beacons for f in beacon.frequency_hz or ()]
+    free = [t for t in heard.tones if all(abs(t.frequency_hz - f) > NEAR_HZ for f in declared)]
+    findings = [
+        Finding(
+            "silent_beacon",
+            f"beacon {beacon.name} is not heard at {f:g} Hz in the recording: it is switched off,"
+            f" far away, or its frequency is another ({_listed(free) or 'no other stands out'}).",
+        )
+        for beacon in beacons
+        for f in beacon.frequency_hz or ()
+        if all(abs(tone.frequency_hz - f) > NEAR_HZ for tone in heard.tones)
+    ]
+    if silent and (len(silent) > 1 or len(free) != 1):
+        raise InputError(
+            f"--beacon {silent[0]}: frequency_hz is missing, and the recording does not tell it:"
+            f" {_listed(free) or 'no other tone'} stands out; give frequency_hz"
+        )
+    if not beacons:
+        tones = zip(_names(), heard.tones, strict=False)
+        return [_of_tone(BeaconDraft(name), tone) for name, tone in tones], findings
+    if silent:
+        return [_of_tone(b, free[0]) if b.frequency_hz is None else b for b in beacons], findings
+    findings += [
+        Finding(
+            "undeclared_line",
+            f"{_listed([tone])} transmits in the recording, and no --beacon has this frequency.",
+        )
+        for tone in free
+    ]
+    return beacons, findings
+
+
+def _names() -> list[str]:
+    letters = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+    return [*letters, *(first + second for first in letters for second in letters)]
+
+
+def _of_tone(beacon: BeaconDraft, tone: Tone) -> BeaconDraft:
+    axes = beacon.axes or ("xy" if tone.rotating else "x")
+    return replace(beacon, frequency_hz=(tone.meant_hz,), axes=axes)
+
+
+def _listed(tones: list[Tone]) -> str:
+    return ", ".join(
+        f"{tone.meant_hz:g} Hz ({1e9 * tone.amplitude:.3g} nT,"
+        f" {'two coils' if tone.rotating else 'one coil'})"
+        for tone in tones
+    )
+
+
+def _bare_site(settings: InitSettings) -> Site:
+    """Return the platform alone: how magnetometer and gyroscope are mounted."""
+    import tempfile
+
+    from magfusion.files.site import load_site
+    from magfusion.files.site_text import site_text
+
+    draft, _ = _draft(replace(settings, beacon=()), None)
+    with tempfile.TemporaryDirectory() as directory:
+        path = Path(directory) / "site.yaml"
+        path.write_text(site_text(replace(draft, place=None)), encoding="utf-8")
+        return load_site(path, without=True)
+
+
+def _write(text: str, output: Path) -> None:
+    """Write a site's file, once it is known that it can be read.
+
+    Raises
+    ------
+    InputError
+    """
+    from magfusion.files.atomic import whole_file
+    from magfusion.files.site import load_site
+
+    with whole_file(output) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
+        try:
+            load_site(unfinished, unknown=True, without=True)
+        except InputError as error:
+            said = str(error).replace(f"{unfinished}: ", "")
+            raise InputError(f"what is described can be no site: {said}") from error
+
+
+def _figures(draft: SiteDraft, heard: Transmitted | None) -> Figures:
+    figures = Figures(
+        Figure("beacons", len(draft.beacons)),
+        Figure("imu", draft.imu.name),
+        Figure("magnetometer", draft.magnetometer.name),
+    )
+    for beacon in draft.beacons:
+        assert beacon.frequency_hz is not None
+        figures |= Figures(
+            Figure("frequency_{beacon}_hz", beacon.frequency_hz[0], "Hz", beacon=beacon.name)
+        )
+    if heard is not None:
+        found = [
+            f"{tone.frequency_hz:.5f} ± {tone.sigma_hz:.5f} Hz, {1e9 * tone.amplitude:.3g} nT,"
+            f" axes 1:{1.0 / max(tone.roundness, 1e-3):.3g}"
+            for tone in heard.tones
+        ]
+        figures |= Figures(
+            Figure("tones", found, label="tones in the recording"),
+            Figure("other_lines", list(heard.others), section=Section.REPORT),
+        )
+    return figures
+
+
+def _list(settings: InitSettings) -> None:
+    """Print the instruments that are known by name."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from magfusion.files.instruments import imus, magnetometers
+
+    console = Console(highlight=False, emoji=False)
+    if settings.list_imus:
+        table = Table("IMU", "gyro", "accel", "gyro walk", "accel walk", "source", box=None)
+        for name, sheet in imus().items():
+            imu = sheet.model
+            densities = (imu.gyro_noise, imu.accel_noise, imu.gyro_bias_walk, imu.accel_bias_walk)
+            table.add_row(name, *(f"{value:.3g}" for value in densities), sheet.source)
+        console.print(table)
+        console.print(
+            "gyro rad/s/sqrt(Hz), accel m/s^2/sqrt(Hz), walks per sqrt(s); magfusion allan LOG"
+            " measures yours"
+        )
+    if settings.list_magnetometers:
+        table = Table("magnetometer", "nT/sqrt(Hz)", "source", box=None)
+        for name, one in magnetometers().items():
+            table.add_row(name, f"{1e9 * one.noise_density:.3g}", one.source)
+        console.print(table)
+
+
+COMMAND = Command(
+    InitSettings,
+    run_init,
+    output="site.yaml",
+    output_help="File to write; one that is there is kept",
+    example="magfusion init --imu BMI088 --magnetometer RM3100 --beacon 'A position_m=0,0,1"
+    " rpy_deg=0,0,90 frequency_hz=25 moment_a_m2=220 axes=xy' -o new_site.yaml",
+)
