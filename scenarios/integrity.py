@@ -227,7 +227,7 @@ def figures(outcome: Outcome, config: Config, risk: Risk | None = None) -> Figur
     faulted, clean = outcome.faulted, ~outcome.faulted
     unseen = int(np.sum(outcome.beyond & ~outcome.alarm & faulted))
     alarms = int(np.sum(outcome.alarm & clean))
-    limit = _upper(unseen, int(np.sum(faulted)))
+    limit = upper_limit(unseen, int(np.sum(faulted)))
     known = np.isfinite(outcome.ratio)
     return Figures(
         epochs=len(faulted),
@@ -236,14 +236,14 @@ def figures(outcome: Outcome, config: Config, risk: Risk | None = None) -> Figur
         unseen_limit=limit,
         hazard_limit=limit * config.beacons * risk.fault,
         false_alarm_rate=alarms / int(np.sum(clean)),
-        false_alarm_limit=_upper(alarms, int(np.sum(clean))),
+        false_alarm_limit=upper_limit(alarms, int(np.sum(clean))),
         detected=float(np.mean(outcome.alarm[faulted])),
         median_ratio=float(np.median(outcome.ratio[known & clean])),
         finite=float(np.mean(known[clean])),
     )
 
 
-def _upper(count: int, of: int) -> float:
+def upper_limit(count: int, of: int) -> float:
     """Return the upper confidence limit of a probability (C. Clopper and E. Pearson, 1934)."""
     return float(beta.ppf(CONFIDENCE, count + 1, of - count)) if count < of else 1.0
 

@@ -209,6 +209,7 @@ def _among_iron(site: Site, spheres: Spheres, seed: int, path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_map_learnt_along_true_poses_mends_another_walk_among_the_same_iron(
     tmp_path: Path,
 ) -> None:

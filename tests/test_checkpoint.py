@@ -161,6 +161,7 @@ def _ends_alike(log: Path, uninterrupted: Path, output: Path, moments: list[floa
     return kills
 
 
+@pytest.mark.slow
 def test_a_run_killed_twice_ends_as_if_it_had_not_been(
     phasors: Path, uninterrupted: Path, tmp_path: Path
 ) -> None:

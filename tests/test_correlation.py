@@ -214,6 +214,7 @@ def nees_of_fixes(drawn: Site, told: Site) -> float:
     return float(np.mean(found))
 
 
+@pytest.mark.slow
 def test_a_fix_among_beacons_that_are_off_together_is_off_with_them() -> None:
     site = moved_together(demo_site(coil_radius=None))
     low, high = average_nees_bounds(6, RUNS, 0.999)
@@ -222,6 +223,7 @@ def test_a_fix_among_beacons_that_are_off_together_is_off_with_them() -> None:
     assert nees_of_fixes(site, replace(site, correlation=None)) > high
 
 
+@pytest.mark.slow
 def test_the_smoother_is_as_unsure_of_the_world_as_its_beacons_are_together() -> None:
     """Four independent beacons would tell twice as well where they all stand."""
     site = moved_together(demo_site(coil_radius=None))

@@ -27,6 +27,7 @@ from spoiled_log import (
 
 from magfusion.estimation.integrity.compasses import still_means
 from magfusion.estimation.integrity.first_look import first_look
+from magfusion.estimation.integrity.recording import recorded
 from magfusion.estimation.integrity.samples import clipped
 from magfusion.estimation.integrity.spectrum import aliased, mains_of
 from magfusion.estimation.integrity.stamps import timing
@@ -175,6 +176,17 @@ def test_compasses_know_gravity_and_field_without_a_beacon() -> None:
     assert size == pytest.approx(np.linalg.norm(earth), rel=0.01)
     dip = np.arccos(earth[2] / np.linalg.norm(earth))
     assert np.median(means.angle) == pytest.approx(dip, abs=0.03)
+
+
+@pytest.mark.parametrize("motion", ["walk", "turn"])
+def test_the_vertical_of_the_estimate_tells_whose_sign_is_reversed(motion: str) -> None:
+    wrong = {
+        "earth_field": _earth(good(motion)),
+        "gravity_sign": imu(accel=lambda f: -f)(good(motion)),
+    }
+    for code, one in wrong.items():
+        found = recorded(one.log, one.site, estimated=one.log.truth)
+        assert {finding.code for finding in found} == {code}
 
 
 def test_mains_are_known_where_sampling_folds_them_back() -> None:

@@ -138,6 +138,7 @@ def test_slopes_are_those_of_the_settled_part() -> None:
     np.testing.assert_allclose(static_48h.slopes(COARSE, error), [0.02, -0.5], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_scenario_draws_and_ends_with_one_json_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

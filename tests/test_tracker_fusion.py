@@ -32,6 +32,7 @@ def _check(fused: moving.Fused) -> None:
     assert fused.filtered_mm < fused.snapshot_mm / 3.0
 
 
+@pytest.mark.slow
 def test_with_an_imu_a_turning_head_is_known_three_times_better_than_by_the_closed_form() -> None:
     fused = moving.fuse(moving.Config(duration=4.5), 500.0)
     assert fused.rate_deg_s > 70.0
@@ -145,6 +146,7 @@ def test_the_ordinary_commands_read_a_slotted_tracker(tmp_path: Path, carrier_hz
     assert smoothed["inside_3_sigma"] > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("carrier_hz", [0.0, 2e3])
 def test_raw_slots_navigate_as_well_as_the_phasors_of_the_whole_log(
     tmp_path: Path, carrier_hz: float

@@ -40,6 +40,7 @@ def test_the_printed_table_has_these_ratios(name: str, ratio: float) -> None:
     assert tracker_table1.printed_ratios()[name][2] == pytest.approx(ratio, abs=0.01)
 
 
+@pytest.mark.slow
 def test_rigid_calibration_does_not_help_independent_errors(independent: dict[str, Row]) -> None:
     assert independent["U"].attitude_deg == pytest.approx(0.89, abs=0.07)
     assert independent["P1"].ratio == pytest.approx(1.03, abs=0.06)
@@ -143,6 +144,7 @@ def _last_line(
     return dict(json.loads(capsys.readouterr().out.splitlines()[-1]))
 
 
+@pytest.mark.slow
 def test_table_1_ends_with_one_json_line_and_draws(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,6 +154,7 @@ def test_table_1_ends_with_one_json_line_and_draws(
     assert (tmp_path / "out" / "tracker_table1.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_near_field_ends_with_one_json_line_and_draws(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -147,6 +147,7 @@ def test_an_imu_that_comes_loose_is_noticed(walk: OnlineLog, estimator: str) -> 
     assert navigator.summary.trust.verdict is not Verdict.TRUSTWORTHY
 
 
+@pytest.mark.slow
 def test_a_navigator_that_is_lost_goes_on_from_its_checkpoint_to_the_last_bit(
     walk: OnlineLog,
 ) -> None:
@@ -204,6 +205,7 @@ def test_in_a_pipe_a_loss_gives_no_pose(walk: OnlineLog, tmp_path: Path) -> None
     assert all(line["verdict"] is None and line["reasons"] == [] for line in waiting)
 
 
+@pytest.mark.slow
 def test_a_loss_that_was_found_again_makes_the_whole_doubtful(
     walk: OnlineLog, tmp_path: Path
 ) -> None:

@@ -152,8 +152,10 @@ def navigated(
         (s)
     """
     site, settings = navigator.site, navigator.settings
-    trust = navigator.summary.trust | Trust(recorded(log, site, BRIDGED, beacons=True))
-    trust = with_cause(trust, log, site, settings.lockin)
+    trusted = _part(rows, _chosen(rows, navigator.summary.trust, lagged=False), site)
+    poses = None if trusted is None or settings.earth else trusted.states
+    heard = recorded(log, site, BRIDGED, estimated=poses, beacons=True)
+    trust = with_cause(navigator.summary.trust | Trust(heard), log, site, settings.lockin)
     own = _chosen(rows, trust, lagged=False)
     current, lagged = _part(rows, own, site), None
     assert current is not None

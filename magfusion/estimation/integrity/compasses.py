@@ -29,6 +29,7 @@ STEADY = 0.15  # relative scatter of what is gravity in another unit
 NEAR = 1.0  # s; as near in time a pose must be
 LEVEL_FIELD = 0.05  # of the field's size across the vertical; with less it has no heading
 TILT = 0.05  # rad; of the mean vertical where motion is fast
+CLEAR = 0.5  # cosine; beyond which a vertical points up or down
 UNITS_OF_FORCE = (
     ("g", 1.0 / STANDARD_GRAVITY),
     ("mg", 1e3 / STANDARD_GRAVITY),
@@ -103,7 +104,10 @@ def _angle(a: Array, b: Array) -> Array:
 
 
 def wrong_compasses(
-    log: Log, site: Site | None, poses: Trajectory | None = None
+    log: Log,
+    site: Site | None,
+    poses: Trajectory | None = None,
+    estimated: Trajectory | None = None,
 ) -> Iterator[Finding]:
     """Yield what gravity and the steady field say against the accelerometer and the site.
 
@@ -113,6 +117,8 @@ def wrong_compasses(
     ----------
     poses : Trajectory, optional
         By the beacons: they tell whether vertical or field is wrong, where both disagree.
+    estimated : Trajectory, optional
+        By an estimator that used gravity too: of a reversed vertical they tell whose it is.
     """
     means = still_means(log, site)
     if len(means) == 0:
@@ -129,7 +135,8 @@ def wrong_compasses(
         return
     yield from wrong_size(means, site)
     if here is None:
-        yield from wrong_dip(means, site, mounted=agrees(log, site))
+        upright = None if estimated is None else _upright(means, estimated)
+        yield from wrong_dip(means, site, mounted=agrees(log, site), upright=upright)
     elif not tilted:
         yield from wrong_field(here, site)
 
@@ -212,13 +219,17 @@ def wrong_size(means: StillMeans, site: Site) -> Iterator[Finding]:
     )
 
 
-def wrong_dip(means: StillMeans, site: Site, *, mounted: bool = False) -> Iterator[Finding]:
+def wrong_dip(
+    means: StillMeans, site: Site, *, mounted: bool = False, upright: bool | None = None
+) -> Iterator[Finding]:
     """Yield an angle between vertical and field that is not the Earth's, as declared.
 
     Parameters
     ----------
     mounted : bool
         Whether gyroscope and field agree, so that the mounting is as declared.
+    upright : bool, optional
+        Whether the accelerometer's vertical points up by the poses; None where that is not known.
     """
     assert site.earth_field_world is not None
     declared = float(_angle(np.array([0.0, 0.0, 1.0]), site.earth_field_world))
@@ -231,7 +242,7 @@ def wrong_dip(means: StillMeans, site: Site, *, mounted: bool = False) -> Iterat
         f" ({abs(angle - declared) / sigma:.0f} sigma)"
     )
     if abs(np.pi - angle - declared) < LIMIT * sigma:
-        code, cause = _reversed(means, mounted=mounted)
+        code, cause = _reversed(means, mounted=mounted, upright=upright)
     else:
         cause = (
             "the mounting of magnetometer or inertial sensor is not as declared or axes of one are"
@@ -241,15 +252,26 @@ def wrong_dip(means: StillMeans, site: Site, *, mounted: bool = False) -> Iterat
     yield Finding(code, f"{said}: {cause}.", Verdict.DOUBTFUL, abs(angle - declared) / sigma)
 
 
-def _reversed(means: StillMeans, *, mounted: bool) -> tuple[str, str]:
+def _upright(means: StillMeans, poses: Trajectory) -> bool | None:
+    """Tell whether the accelerometer's vertical points up by the poses, where it does either."""
+    here = _at(means, poses)
+    if here is None:
+        return None
+    up = float(np.median(here.up[:, 2] / np.linalg.norm(here.up, axis=1)))
+    return up > 0.0 if abs(up) > CLEAR else None
+
+
+def _reversed(means: StillMeans, *, mounted: bool, upright: bool | None) -> tuple[str, str]:
     """Return code and cause of a vertical that points the other way."""
     level = float(np.median(means.force_body[:, 2])) > 0.7 * STANDARD_GRAVITY
     of_sign = "the accelerometer's sign is reversed (at rest, level, it has +g on z)"
     of_earth = "earth_field_t is of the other hemisphere (its z is up)"
     of_mounting = "magnetometer or inertial sensor is mounted upside down"
-    if level and mounted:
+    if upright:
+        return "earth_field", of_earth
+    if level and mounted and upright is None:
         return "earth_field", f"{of_earth}, or {of_sign}"
-    if level:
+    if level and upright is None:
         return "mounting", f"{of_mounting}, or {of_earth}"
     return "gravity_sign", f"{of_sign}, or {of_earth}{'' if mounted else f', or {of_mounting}'}"
 

@@ -37,7 +37,8 @@ def judged(result: Smoothed, log: Log) -> tuple[Smoothed, Trust]:
         Of which the result is: its raw streams are witnesses too.
     """
     alone = result.earth_residual is None
-    heard = recorded(log, result.declared.site, BRIDGED, beacons=alone)
+    states = result.states if alone else None  # else the Earth field has had its say in them
+    heard = recorded(log, result.declared.site, BRIDGED, estimated=states, beacons=alone)
     trust = Trust((*tuned_noise(result.noise), *heard))
     pose_cov = result.states.pose_cov
     if pose_cov is None:
@@ -48,8 +49,8 @@ def judged(result: Smoothed, log: Log) -> tuple[Smoothed, Trust]:
         trust |= Trust(said.findings, said.unverified)
         factor = factor if said.factor is None else np.maximum(factor, said.factor)
         spread = spread if said.spread is None else spread + said.spread
-    states = replace(result.states, pose_cov=factor[:, None, None] * pose_cov + spread)
-    return replace(result, states=states), trust
+    widened = replace(result.states, pose_cov=factor[:, None, None] * pose_cov + spread)
+    return replace(result, states=widened), trust
 
 
 def _heard(case: Case) -> Iterator[Testimony]:

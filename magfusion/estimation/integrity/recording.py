@@ -46,6 +46,7 @@ def recorded(
     bridged: Collection[str] = frozenset(),
     poses: Trajectory | None = None,
     *,
+    estimated: Trajectory | None = None,
     beacons: bool = False,
     hearing: Heard | None = None,
 ) -> tuple[Finding, ...]:
@@ -57,6 +58,8 @@ def recorded(
         Codes of what the estimator copes with.
     poses : Trajectory, optional
         By the beacons: they tell whose compass is wrong.
+    estimated : Trajectory, optional
+        By an estimator that used gravity too: of a reversed vertical they tell whose it is.
     beacons : bool
         Whether the result hangs on the beacons: then it is said how each is heard, and what else
         transmits.
@@ -67,7 +70,7 @@ def recorded(
     log = beginning(log)
     found += turned_otherwise(log, site)
     if not any(finding.code in UNSTEADY for finding in found):
-        found += wrong_compasses(log, site, poses)
+        found += wrong_compasses(log, site, poses, estimated)
         if site is not None and log.waveform is not None:
             found += iron_on_body(still_means(log, site, IRON_SPAN), site)
     if beacons and site is not None and site.beacons:

@@ -1,0 +1,260 @@
+"""Are good logs believed?  Logs of many kinds, each declared as it is.
+
+Of every log a room, one to eight beacons, their survey (exact, or by hand), the motion and its
+speed are drawn; calibration, noise and motion are simulated as the site declares them.  `smooth`
+runs as a job, so that ``report.json`` is judged.
+
+1. Where the Cramér-Rao bound of single epochs says that the pose is determined, at most 2 % of the
+   logs are doubtful and none has failed.
+2. Elsewhere a result is doubtful or failed, or its errors are what it claims.
+3. None is trusted with a mean NEES above 20.
+
+The workers of a ``--cluster`` need this directory on their PYTHONPATH.
+"""
+
+import json
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from harness import Scale, chosen_scale, conclude, scenario_parser
+from mistake_case import with_magnetometer, with_sigma
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import EstimationError, InputError
+from magfusion.files.log import write_log
+from magfusion.files.site import save_site
+from magfusion.jobs import smooth
+from magfusion.model.site import Site
+from magfusion.results.coverage import coverage
+from magfusion.simulation.demo_site import demo_site
+from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
+from magfusion.simulation.monte_carlo import run_many
+from magfusion.units import DEGREE, Array
+
+MOST_BEACONS = 8
+FREQUENCIES_HZ = 15.0 + 5.0 * np.arange(MOST_BEACONS)
+WINDOW = 0.4  # s
+DETERMINED_M = 0.3  # the bound of a single epoch, in nine of ten
+SILENT_NEES = 20.0
+
+
+@dataclass(frozen=True)
+class Config:
+    """How many logs."""
+
+    logs: int = 200
+    duration: float = 40.0
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A site and what happens there."""
+
+    site: Site
+    config: SimulationConfig
+    rough: bool
+
+
+@dataclass(frozen=True)
+class Row:
+    """What `smooth` said of a log."""
+
+    beacons: int
+    rough: bool
+    motion: str
+    speed: float
+    room_m: float
+    bound_m: float
+    exit: int
+    verdict: str
+    codes: tuple[str, ...]
+    text: str
+    error_m: float | None
+    error_deg: float | None
+    nees: float | None
+
+    @property
+    def determined(self) -> bool:
+        """Whether the bound says that the pose is."""
+        return self.bound_m < DETERMINED_M
+
+    @property
+    def silent(self) -> bool:
+        """Whether a wrong result is trusted."""
+        return self.verdict == "trustworthy" and (self.nees or 0.0) > SILENT_NEES
+
+
+def draw(config: Config, rng: np.random.Generator) -> Drawn:
+    """Return a site, declared as it is, and a motion in it."""
+    count = int(rng.integers(1, MOST_BEACONS + 1))
+    size = np.array([1.0, 0.8, 0.4]) * rng.uniform(4.0, 12.0)  # m
+    base = demo_site(coil_radius=None, synchronised=bool(rng.random() < 0.7))
+    beacons = tuple(
+        replace(
+            base.beacons[0],
+            name=f"B{i + 1}",
+            position_world=place,
+            world_from_beacon=Rotation.random(random_state=rng).as_matrix(),
+            frequency_hz=float(FREQUENCIES_HZ[i]),
+        )
+        for i, place in enumerate(_places(size, count, rng))
+    )
+    rough = bool(rng.random() < 0.5)
+    site = replace(base, beacons=beacons)
+    if rough:
+        site = replace(
+            site, beacons=tuple(with_sigma(b, 0.05, 2.0 * DEGREE, 0.03) for b in beacons)
+        )
+        sigma = replace(
+            site.platform.magnetometer.sigma,
+            matrix=np.full((3, 3), 0.01),
+            offset=np.full(3, 4e-8),
+            rotation_sensor=np.full(3, 1.0 * DEGREE),
+        )
+        site = with_magnetometer(site, sigma=sigma)
+    motion: Literal["walk", "turn"] = "walk" if rng.random() < 0.6 else "turn"
+    box = np.array([0.25 * size, 0.75 * size])
+    speed = float(rng.uniform(0.1, 1.0))
+    what = SimulationConfig(box, duration=config.duration, motion=motion, speed=speed)
+    return Drawn(site, what, rough)
+
+
+def _places(size: Array, count: int, rng: np.random.Generator) -> Array:
+    """Return places near the walls of a room, as far apart as chance allows."""
+    found: list[Array] = []
+    while len(found) < count:
+        tried = rng.uniform(0.0, 1.0, (20, 3))
+        wall = rng.integers(0, 3, 20)
+        tried[np.arange(20), wall] = rng.integers(0, 2, 20)
+        place = tried * size
+        apart = [min((float(np.linalg.norm(p - q)) for q in found), default=1.0) for p in place]
+        found.append(place[int(np.argmax(apart))])
+    return np.array(found)
+
+
+def bound(drawn: Drawn, made: SimulatedLog) -> float:
+    """Return what nine of ten single epochs determine the position to, at least (m)."""
+    truth = made.log.truth
+    assert truth is not None
+    path = truth.position_world[:: max(1, len(truth.time) // 50)]
+    sigma = coverage(drawn.site, path, WINDOW).position_sigma
+    return float(np.quantile(np.where(np.isfinite(sigma), sigma, np.inf), 0.9, method="higher"))
+
+
+def judge(config: Config, rng: np.random.Generator) -> Row:
+    """Simulate a log, smooth it and return what was said."""
+    drawn = draw(config, rng)
+    made = simulate_log(drawn.site, drawn.config, rng)
+    code, said = 0, ""
+    with tempfile.TemporaryDirectory(prefix="clean_") as name:
+        log, output = Path(name) / "log", Path(name) / "out"
+        write_log(made.log, log)
+        save_site(drawn.site, log / "site.yaml")
+        try:
+            smooth.run(smooth.SmoothSettings(log=log), output)
+        except InputError as error:
+            code, said = 2, str(error)
+        except EstimationError as error:
+            code, said = 1, str(error)
+        place = output / "report.json"
+        report = json.loads(place.read_text()) if place.is_file() else {}
+    reasons = report.get("reasons", [])
+    return Row(
+        beacons=len(drawn.site.beacons),
+        rough=drawn.rough,
+        motion=drawn.config.motion,
+        speed=drawn.config.speed,
+        room_m=float(np.ptp(drawn.config.box_world[:, 0]) * 2.0),
+        bound_m=bound(drawn, made),
+        exit=code,
+        verdict=report.get("verdict", "failed" if code else "trustworthy"),
+        codes=tuple(reason["code"] for reason in reasons),
+        text=reasons[0]["text"] if reasons else said,
+        error_m=report.get("ate_m"),
+        error_deg=report.get("attitude_rmse_deg"),
+        nees=report.get("nees_mean"),
+    )
+
+
+def run(config: Config, scale: Scale | None = None) -> list[Row]:
+    """Return what was said of all logs."""
+    return run_many(judge, [config] * config.logs, seed=config.seed, **(scale or {}))
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What it comes to."""
+
+    logs: int
+    determined: int
+    doubtful: int  # of the determined
+    failed: int
+    silent: int  # of all
+    trusted_elsewhere: int
+    nees_median: float
+
+
+def figures(rows: Sequence[Row]) -> Figures:
+    """Return what it comes to."""
+    good = [row for row in rows if row.determined]
+    nees = [row.nees for row in good if row.nees is not None]
+    return Figures(
+        logs=len(rows),
+        determined=len(good),
+        doubtful=sum(row.verdict == "doubtful" for row in good),
+        failed=sum(row.verdict == "failed" for row in good),
+        silent=sum(row.silent for row in rows),
+        trusted_elsewhere=sum(r.verdict == "trustworthy" for r in rows if not r.determined),
+        nees_median=float(np.median(nees)) if nees else float("nan"),
+    )
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Return what a reader sees: the logs that were not believed, and the sums."""
+    lines = [
+        f"{'log':>4}{'beacons':>8} {'survey':7}{'motion':7}{'m/s':>5}{'room m':>7}{'bound cm':>9}"
+        f"  {'verdict':12}{'error cm':>9}{'deg':>7}{'NEES':>7}  first reason"
+    ]
+    for i, row in enumerate(rows):
+        if row.verdict == "trustworthy" and not row.silent:
+            continue
+        lines.append(
+            f"{i:4}{row.beacons:8} {'rough' if row.rough else 'exact':7}{row.motion:7}"
+            f"{row.speed:5.2f}{row.room_m:7.1f}{100 * row.bound_m:9.2g}  {row.verdict:12}"
+            f"{_number(row.error_m, 100.0):>9}{_number(row.error_deg):>7}{_number(row.nees):>7}"
+            f"  {row.text[:120]}"
+        )
+    found = figures(rows)
+    return "\n".join(
+        (
+            *lines,
+            f"{found.logs} logs, {found.determined} of them with a pose that the bound determines:",
+            f"  doubtful {found.doubtful}, failed {found.failed}; median of the mean NEES"
+            f" {found.nees_median:.2g} (6 is due)",
+            f"  trusted with a mean NEES above {SILENT_NEES:g}, of all: {found.silent}",
+            f"  trusted although the bound of single epochs is open: {found.trusted_elsewhere}",
+        )
+    )
+
+
+def _number(value: float | None, scale: float = 1.0) -> str:
+    return "-" if value is None else f"{scale * value:.3g}"
+
+
+def main() -> None:
+    """Print the table and one JSON line."""
+    parser = scenario_parser(__doc__, Config.seed, "ten logs", output=None, parallel=True)
+    parser.add_argument("--logs", type=int, default=Config.logs)
+    given = parser.parse_args()
+    config = Config(logs=10 if given.quick else given.logs, seed=given.seed)
+    rows = run(config, chosen_scale(given))
+    conclude(table(rows), {"figures": figures(rows), "rows": [asdict(row) for row in rows]})
+
+
+if __name__ == "__main__":
+    main()
