@@ -20,7 +20,7 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from magfusion.errors import EstimationError, InputError
+from magfusion.errors import EstimationError, InputError, InputErrors
 from magfusion.files.standard_streams import binary_output, occupy_closed, until_closed
 from magfusion.jobs import GROUPS, JOBS
 from magfusion.jobs.settings import Command, Option, options
@@ -57,7 +57,7 @@ def main(arguments: list[str] | None = None) -> None:
         if debug:
             traceback.print_exc()
         status, sentence = _said(error)
-        _fail(status, sentence)
+        _fail(status, sentence, isinstance(error, InputErrors))
     raise SystemExit(status)
 
 
@@ -105,8 +105,9 @@ def _file_refusal(error: OSError) -> str:
     return f"{place}: cannot be read or written ({error.strerror or error}); {remedy}"
 
 
-def _fail(status: int, sentence: str) -> NoReturn:
-    sys.stderr.write(f"magfusion: {' '.join(sentence.split())}\n")
+def _fail(status: int, sentence: str, in_lines: bool = False) -> NoReturn:
+    lines = sentence.splitlines() if in_lines else [" ".join(sentence.split())]
+    sys.stderr.write("magfusion: {}\n".format("\n".join(lines)))
     raise SystemExit(status) from None
 
 
@@ -153,8 +154,13 @@ def _command(path: str) -> Any:
 
 
 def _example(command: str) -> str:
-    """Return the end of a help; what typer would take for its markup is escaped."""
-    return f"Example: {command}".replace("[", "\\[")
+    """Return the end of a help."""
+    return _plain(f"Example: {command}")
+
+
+def _plain(text: str) -> str:
+    """Return a text in which brackets are no markup."""
+    return text.replace("[", r"\[")
 
 
 def _print_version(wanted: bool) -> None:
@@ -215,7 +221,8 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
                 raise
         if figures is not None:
             _show_result(figures, output, as_json)
-            _refuse_failed(figures)
+            if command.fails:
+                _refuse_failed(figures)
         if command.after is not None:
             command.after(settings, output)
 
@@ -256,11 +263,11 @@ def _parameter(field: Field[Any], option: Option, hint: Any) -> inspect.Paramete
     if default is None:
         hint = hint | None
     if option.positional:
-        info = typer.Argument(help=option.sentence)
+        info = typer.Argument(help=_plain(option.sentence))
     else:
         name = option.name or field.name.replace("_", "-")
         switch = f"--{name}/--no-{name}" if default is True else f"--{name}"
-        info = typer.Option(switch, help=option.sentence, metavar=option.metavar)
+        info = typer.Option(switch, help=_plain(option.sentence), metavar=option.metavar)
     default = inspect.Parameter.empty if default is MISSING else default
     return _keyword(field.name, Annotated[hint, info], default)
 

@@ -1,6 +1,5 @@
-"""Import of ROS 2 bags, SQLite or MCAP, without ROS."""
+"""Import of bags of ROS 2, SQLite or MCAP, and of ROS 1, without ROS."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.files.messages import IMU, ROWS, USUAL, refuse_absent, stamp_ns
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
@@ -19,11 +19,7 @@ from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, IntArray
 
-BAG_SUFFIXES = (".mcap", ".db3")
-_IMU = "sensor_msgs/msg/Imu"
-_FIELD = "sensor_msgs/msg/MagneticField"
-_ODOMETRY = "nav_msgs/msg/Odometry"
-_POSE = "geometry_msgs/msg/PoseStamped"
+BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 
 
 @dataclass(frozen=True)
@@ -50,14 +46,14 @@ class _Stream:
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path is a ROS 2 bag: a directory with its metadata, or a single file."""
+    """Return whether a path is a bag: a directory with its metadata, or a single file."""
     return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix in BAG_SUFFIXES
 
 
 def read_bag(
     path: Path, start: float | None = None, end: float | None = None, topics: Topics | None = None
 ) -> Log:
-    """Read inertial samples, magnetometer and truth of a ROS 2 bag.
+    """Read inertial samples, magnetometer and truth of a bag.
 
     Times are those of the messages' headers, and the first inertial one is the log's epoch. Poses
     are taken for those of the IMU's axes in the world; the twist of an odometry is in body axes.
@@ -65,7 +61,7 @@ def read_bag(
     Parameters
     ----------
     path : Path
-        Directory of a bag, or its file (``.mcap``, ``.db3``).
+        Directory of a bag, or its file (``.mcap``, ``.db3``, ``.bag`` of ROS 1).
     start, end : float, optional
         Seconds since the first inertial sample.
 
@@ -83,34 +79,29 @@ def read_bag(
     chosen = topics or Topics()
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            imu = _read(reader, path, chosen.imu, "imu", {_IMU: _imu_row})
-            field = _read(reader, path, chosen.magnetometer, "magnetometer", {_FIELD: _field_row})
-            poses: dict[str, _Row] = {_ODOMETRY: _odometry_row, _POSE: _pose_row}
-            truth = _read(reader, path, chosen.truth, "truth", poses)
+            imu = _read(reader, path, chosen.imu, "imu")
+            field = _read(reader, path, chosen.magnetometer, "magnetometer")
+            truth = _read(reader, path, chosen.truth, "truth")
     except InputError:
         raise
     except Exception as error:  # a damaged bag makes the library fail in any way whatever
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{path}: cannot be read ({reason}); record the bag again.") from error
     if imu is None:
-        raise InputError(f"{path}: holds no messages of {_IMU}; record the inertial sensor.")
+        raise InputError(f"{path}: holds no messages of {IMU}; record the inertial sensor.")
     span = Span(int(imu.time_ns[0]), start, end)
     return Log(
         name=path.resolve().stem,
         epoch_ns=span.epoch_ns,
-        source="ROS 2 bag: " + ", ".join(s.place for s in (imu, field, truth) if s is not None),
+        source="bag: " + ", ".join(s.place for s in (imu, field, truth) if s is not None),
         imu=_imu(imu.within(span), span),
         waveform=None if field is None else _waveform(field.within(span), span),
         truth=None if truth is None else _trajectory(truth.within(span), span),
     )
 
 
-_Row = Callable[[Any], list[float]]
-
-
-def _read(
-    reader: AnyReader, path: Path, topic: str | None, role: str, rows: dict[str, _Row]
-) -> _Stream | None:
+def _read(reader: AnyReader, path: Path, topic: str | None, role: str) -> _Stream | None:
+    rows = ROWS[role]
     connections = _chosen(reader, path, topic, role, tuple(rows))
     if not connections:
         return None
@@ -119,8 +110,8 @@ def _read(
     stamps, values = [], []
     for _, _, raw in reader.messages(connections):
         message: Any = reader.deserialize(raw, msgtype)
-        _refuse_absent(message, place)
-        stamps.append(message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec)
+        refuse_absent(message, place)
+        stamps.append(stamp_ns(message.header))
         values.append(row(message))
     if not stamps:
         raise InputError(f"{place}: holds no messages; record it, or leave it out.")
@@ -132,6 +123,8 @@ def _chosen(
 ) -> list[Connection]:
     """Return the connections of the one topic that plays a role."""
     fitting = [c for c in reader.connections if c.msgtype in msgtypes]
+    if topic is None:
+        fitting = [c for c in fitting if c.msgtype in USUAL] or fitting
     names = sorted({c.topic for c in fitting})
     if topic is None and len(names) > 1:
         raise InputError(
@@ -164,35 +157,6 @@ def _sorted(place: str, msgtype: str, stamps: IntArray, values: Array) -> _Strea
             stamp = stamps[np.argmax(wrong)]
             raise InputError(f"{place}: the message stamped {stamp} ns {remedy}.")
     return _Stream(place, msgtype, stamps, values)
-
-
-def _refuse_absent(message: Any, place: str) -> None:
-    """Refuse what the publisher marked as not measured (sensor_msgs/Imu: covariance of -1)."""
-    for part in ("angular_velocity", "linear_acceleration"):
-        cov = getattr(message, f"{part}_covariance", None)
-        if cov is not None and cov[0] == -1.0:
-            raise InputError(f"{place}: {part} is marked as not measured; record a full IMU.")
-
-
-def _vector(value: Any) -> list[float]:
-    return [value.x, value.y, value.z]
-
-
-def _imu_row(message: Any) -> list[float]:
-    return _vector(message.angular_velocity) + _vector(message.linear_acceleration)
-
-
-def _field_row(message: Any) -> list[float]:
-    return _vector(message.magnetic_field)
-
-
-def _pose_row(message: Any) -> list[float]:
-    pose = message.pose
-    return [*_vector(pose.position), *_vector(pose.orientation), pose.orientation.w]
-
-
-def _odometry_row(message: Any) -> list[float]:
-    return _pose_row(message.pose) + _vector(message.twist.twist.linear)
 
 
 def _imu(stream: _Stream, span: Span) -> ImuSamples:

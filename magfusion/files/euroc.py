@@ -5,6 +5,7 @@ their place: the headers' wording differs between the data sets that share the f
 """
 
 import csv
+import re
 from pathlib import Path
 
 from magfusion.errors import InputError
@@ -48,7 +49,7 @@ def read_euroc(path: Path, start: float | None = None, end: float | None = None)
     """
     streams = path / "mav0"
     imu = streams / "imu0" / "data.csv"
-    field = find_table(streams / "mag0", "data")
+    field = find_magnetometer(path)
     truth = find_table(streams / "state_groundtruth_estimate0", "data")
     span = Span(_first_stamp(imu), start, end)
     samples, of_imu = read_imu(imu, span, _IMU)
@@ -62,6 +63,26 @@ def read_euroc(path: Path, start: float | None = None, end: float | None = None)
         truth=read_if_there(truth, _read_truth, span),
         noticed=(*of_imu, *of_waveform),
     )
+
+
+def find_magnetometer(path: Path) -> Path | None:
+    """Return the magnetometer's table of a EuRoC folder, whatever its folder is called.
+
+    Raises
+    ------
+    InputError
+        Where there are several.
+    """
+    found = [
+        table
+        for folder in sorted((path / "mav0").iterdir())
+        if re.match(r"mag|compass|field|fluxgate", folder.name, re.I)
+        and (table := find_table(folder, "data")) is not None
+    ]
+    if len(found) > 1:
+        names = ", ".join(table.parent.name for table in found)
+        raise InputError(f"{path / 'mav0'}: holds several magnetometers: {names}; keep one.")
+    return found[0] if found else None
 
 
 def _read_truth(path: Path, span: Span) -> Trajectory:

@@ -15,7 +15,7 @@ def open_log(
     end: float | None = None,
     topics: Topics | None = None,
 ) -> Log:
-    """Read a log, an EuRoC folder or a ROS 2 bag, whichever the path is.
+    """Read a log, an EuRoC folder or a bag, whichever the path is.
 
     Parameters
     ----------
@@ -38,9 +38,8 @@ def open_log(
         return read_euroc(path, start, end)
     if is_bag(path):
         return read_bag(path, start, end, topics)
-    if path.suffix == ".bag":
-        raise InputError(f"{path}: is a ROS 1 bag; convert it with rosbags-convert.")
     raise InputError(
         f"{path}: is no log: found neither {HEADER}, nor mav0/imu0/data.csv (EuRoC), nor"
-        " metadata.yaml, .mcap or .db3 (ROS 2 bag); give the path of one of them."
+        " metadata.yaml, .mcap, .db3 or .bag (bags of ROS); give the path of one of them, or bring"
+        " tables of other names into a log by magfusion import."
     )

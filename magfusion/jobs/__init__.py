@@ -10,6 +10,10 @@ JOBS = {
         "fix",
         "Fix the pose at every epoch on its own, with every hypothesis that survives.",
     ),
+    "import": (
+        "import_log",
+        "Import tables of any names and units, a bag or a EuRoC folder: a log, and its check.",
+    ),
     "check": (
         "check",
         "Check a log in seconds: what its streams, fields and first fixes say against it.",

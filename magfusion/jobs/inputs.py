@@ -72,6 +72,7 @@ _WRITTEN = {
     "fix": _RESULT | {"fixes.parquet"},
     "navigate": _RESULT | {"lagged.parquet"} | _UNFINISHED["navigate"],
     "drift": {"drift.png", "stability.png", "run.rrd", "report.json"} | _UNFINISHED["drift"],
+    "import": {"log.yaml", *_TABLES, "report.json"},
     "simulate": _LOG,
     "demodulate": _LOG,
     "survey": {"survey.parquet", "survey.png", "report.json"},

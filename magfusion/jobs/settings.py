@@ -148,6 +148,8 @@ class Command:
         Whether it makes a report, which ``--json`` prints.
     output_help : str
         What ``--output`` is; `magfusion.cli` adds its default.
+    fails : bool
+        Whether a verdict that is failed ends it with exit code 1.
     after : callable, optional
         Called with settings and output when the result has been shown.
     example : str
@@ -161,6 +163,7 @@ class Command:
     output_optional: bool = False
     reports: bool = True
     output_help: str = "Directory of the results"
+    fails: bool = True
     after: Callable[[Any, Path], None] | None = None
     example: str = ""
 
@@ -181,7 +184,7 @@ class TopicSettings(Settings):
 class PartSettings(TopicSettings):
     """Which log, and which part of it."""
 
-    log: Path = argument("Log: a directory, a EuRoC folder, or a ROS 2 bag")
+    log: Path = argument("Log: a directory, a EuRoC folder, or a bag of ROS")
     start: float | None = option(
         None, "Use the log from here", unit="s since its epoch", common=True
     )

@@ -1,0 +1,248 @@
+"""Tables that are arrays: NPY, NPZ, WAV, MATLAB, HDF5, Parquet."""
+
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+
+from magfusion.errors import InputError
+from magfusion.files.foreign.source import ROWS, Column, Part, Source
+from magfusion.files.foreign.units import Raw
+from magfusion.units import AnyArray
+
+MOST_COLUMNS = 64  # of an array that is a table
+HDF5_MARK = b"\x89HDF"
+ARRAYS = (".npy", ".npz", ".wav", ".mat", ".h5", ".hdf5", ".hdf", ".parquet")
+
+
+@dataclass(frozen=True, eq=False)
+class _Field:
+    """One column of an array: how its values are taken of some rows."""
+
+    column: Column
+    array: Any
+    rows: int
+    block: Callable[[Any, int, int], AnyArray]
+    take: Callable[[AnyArray], AnyArray]
+
+
+def array_source(path: Path) -> Source:
+    """Return a table whose file holds arrays; the suffix says which format it is.
+
+    Raises
+    ------
+    InputError
+        Where it cannot be read or holds no numbers.
+    """
+    opened = {
+        ".npy": _npy,
+        ".npz": _npz,
+        ".wav": _wav,
+        ".mat": _mat,
+        ".parquet": _parquet,
+    }.get(path.suffix.lower(), _hdf5)
+    try:
+        source = opened(path)
+    except InputError:
+        raise
+    except Exception as error:  # a damaged file makes the libraries fail in any way whatever
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{path}: cannot be read ({reason}); write the file again.") from error
+    if not source.columns:
+        raise InputError(f"{path}: holds no columns of numbers; write arrays of one or two axes.")
+    return source
+
+
+def _rows(array: Any, begin: int, end: int) -> AnyArray:
+    return np.asarray(array[begin:end])
+
+
+def _turned_rows(array: Any, begin: int, end: int) -> AnyArray:
+    return np.asarray(array[:, begin:end]).T
+
+
+def _numeric(dtype: np.dtype[Any]) -> bool:
+    return np.issubdtype(dtype, np.number) or np.issubdtype(dtype, np.datetime64)
+
+
+def _part(name: str) -> Callable[[AnyArray], AnyArray]:
+    return lambda block: np.asarray(block[name])
+
+
+def _component(k: int) -> Callable[[AnyArray], AnyArray]:
+    return lambda block: block[:, k]
+
+
+def fields_of(name: str, array: Any, unit: str = "", by_column: bool = False) -> list[_Field]:
+    """Return the columns of an array: none where it is no table of numbers.
+
+    Parameters
+    ----------
+    array
+        What has ``shape`` and ``dtype`` and is sliced, as an array or a data set of HDF5.
+    by_column : bool
+        Whether the array was written column after column, as MATLAB does.
+    """
+    shape, dtype = array.shape, array.dtype
+    if dtype.names and len(shape) == 1:
+        return [
+            _Field(
+                Column(f"{name}:{part}" if name else part, unit),
+                *(array, shape[0], _rows, _part(part)),
+            )
+            for part in dtype.names
+            if _numeric(dtype[part]) and not dtype[part].shape
+        ]
+    if not _numeric(dtype) or len(shape) not in (1, 2):
+        return []
+    if len(shape) == 1 or 1 in shape:
+        if max(shape) < 2:
+            return []
+        lone = len(shape) == 2 and shape[0] == 1
+        block = _turned_rows if lone else _rows
+        return [_Field(Column(name or "0", unit), array, max(shape), block, np.ravel)]
+    turned = shape[0] < shape[1] if not by_column else shape[0] <= MOST_COLUMNS
+    rows, width = (shape[1], shape[0]) if turned else shape
+    if width > MOST_COLUMNS:
+        return []
+    return [
+        _Field(
+            Column(f"{name}:{k}" if name else str(k), unit),
+            *(array, rows, _turned_rows if turned else _rows),
+            _component(k),
+        )
+        for k in range(width)
+    ]
+
+
+def _source(
+    place: str, fields: list[_Field], rate_hz: float | None = None, form: str = ""
+) -> Source:
+    def read(wanted: Sequence[int], texts: Collection[int]) -> Iterator[Part]:  # noqa: ARG001
+        chosen = [fields[k] for k in wanted]
+        for begin in range(0, max((f.rows for f in chosen), default=0), ROWS):
+            blocks: dict[int, AnyArray] = {}
+            columns: list[Raw] = []
+            for one in chosen:
+                if id(one.array) not in blocks:
+                    blocks[id(one.array)] = one.block(one.array, begin, begin + ROWS)
+                columns.append(one.take(blocks[id(one.array)]))
+            yield Part(columns, begin + np.arange(len(columns[0])))
+
+    lengths = tuple(f.rows for f in fields)
+    return Source(place, tuple(f.column for f in fields), read, rate_hz, lengths, form)
+
+
+def _npy(path: Path) -> Source:
+    return _source(str(path), fields_of("", np.load(path, mmap_mode="r", allow_pickle=False)))
+
+
+def _npz(path: Path) -> Source:
+    with np.load(path, allow_pickle=False) as arrays:
+        fields = [one for name in arrays.files for one in fields_of(name, arrays[name])]
+    return _source(str(path), fields)
+
+
+def _wav(path: Path) -> Source:
+    from scipy.io import wavfile
+
+    rate, samples = wavfile.read(path, mmap=True)
+    if samples.ndim == 1:
+        samples = samples[:, np.newaxis]
+    middle = 128 if samples.dtype == np.uint8 else 0
+    full = 1.0 if samples.dtype.kind == "f" else float(2 ** (8 * samples.dtype.itemsize - 1))
+
+    def share(k: int) -> Callable[[AnyArray], AnyArray]:
+        return lambda block: (block[:, k].astype(np.float64) - middle) / full
+
+    fields = [
+        _Field(Column(str(k)), samples, len(samples), _rows, share(k))
+        for k in range(samples.shape[1])
+    ]
+    form = f"{rate} Hz, samples as shares of full scale"
+    return _source(str(path), fields, float(rate), form)
+
+
+def _mat(path: Path) -> Source:
+    with path.open("rb") as stream:
+        later = b"MATLAB 7.3" in stream.read(128) or _is_hdf5(path)
+    if later:
+        return _hdf5(path, by_column=True)
+    from scipy.io import loadmat
+
+    content = loadmat(path, simplify_cells=True)
+    fields = [one for name, array in _flat(content) for one in fields_of(name, array)]
+    return _source(str(path), fields)
+
+
+def _flat(content: Mapping[str, Any], lead: str = "") -> Iterator[tuple[str, AnyArray]]:
+    for name, value in content.items():
+        if name.startswith("__"):
+            continue
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{lead}{name}.")
+        elif isinstance(value, np.ndarray):
+            yield f"{lead}{name}", value
+
+
+def _is_hdf5(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return stream.read(4) == HDF5_MARK
+
+
+def _hdf5(path: Path, by_column: bool = False) -> Source:
+    try:
+        import h5py
+    except ImportError as error:
+        raise InputError(
+            f"{path}: is HDF5, which the package h5py reads; install it with"
+            " pip install 'magfusion[import]'."
+        ) from error
+    file = h5py.File(path, "r")
+    fields: list[_Field] = []
+
+    def visit(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and not name.startswith("#refs#"):
+            unit = item.attrs.get("units", item.attrs.get("unit", ""))
+            unit = unit.decode() if isinstance(unit, bytes) else str(unit)
+            known = re.sub(r"/", ".", name) if by_column else name
+            fields.extend(fields_of(known, item, unit, by_column))
+
+    file.visititems(visit)
+    return _source(str(path), fields)
+
+
+def _parquet(path: Path) -> Source:
+    file = pa.parquet.ParquetFile(path, memory_map=True)
+    schema = file.schema_arrow
+
+    def read(wanted: Sequence[int], texts: Collection[int]) -> Iterator[Part]:
+        names = [schema.names[k] for k in wanted]
+        row = 0
+        for batch in file.iter_batches(ROWS, columns=names):
+            columns: list[Raw] = []
+            for k in wanted:
+                column = batch.column(batch.schema.get_field_index(schema.names[k]))
+                stays = k in texts and not pa.types.is_floating(column.type)
+                if stays and pa.types.is_integer(column.type):
+                    columns.append(_integers(column))
+                elif stays:
+                    columns.append(column)
+                else:
+                    columns.append(column.cast(pa.float64()).to_numpy(zero_copy_only=False))
+            yield Part(columns, row + np.arange(len(batch)))
+            row += len(batch)
+
+    columns = tuple(
+        Column(field.name, ((field.metadata or {}).get(b"unit", b"")).decode()) for field in schema
+    )
+    return Source(str(path), columns, read)
+
+
+def _integers(column: pa.Array) -> AnyArray:
+    return np.asarray(column.cast(pa.int64()).to_numpy(zero_copy_only=False))

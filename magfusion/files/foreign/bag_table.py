@@ -1,0 +1,292 @@
+"""Topics of a bag as tables with the columns of a log's streams."""
+
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.files.foreign.columns import STREAMS, TIME, VELOCITY, Entry, Term
+from magfusion.files.foreign.plan import Findings, Plan, Terms
+from magfusion.files.foreign.source import ROWS, Column, Part, Source
+from magfusion.files.foreign.units import Unit, accepted, parse_unit
+from magfusion.files.messages import (
+    FORMER_TRANSFORMS,
+    ODOMETRY,
+    TRANSFORMS,
+    USUAL,
+    refuse_absent,
+    stamp_ns,
+    transform_row,
+)
+from magfusion.files.messages import (
+    ROWS as MESSAGES,
+)
+from magfusion.units import Array
+
+_POSE = ("position_x", "position_y", "position_z", "qx", "qy", "qz", "qw")
+_COLUMNS = {
+    "imu": tuple(STREAMS["imu"])[1:],
+    "magnetometer": tuple(STREAMS["magnetometer"])[1:],
+    "truth": (*_POSE, *VELOCITY),
+}
+_SI = {"imu": ("rad/s", "m/s^2"), "magnetometer": ("T",), "truth": ("m", "1", "m/s")}
+_TRANSFORMS = (TRANSFORMS, FORMER_TRANSFORMS)
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic that plays a role.
+
+    Parameters
+    ----------
+    frames : tuple of str, optional
+        Parent and child, of a topic of transforms.
+    unit : str
+        Of a magnetometer's field, where the publisher does not keep to tesla.
+    """
+
+    name: str
+    msgtype: str
+    frames: tuple[str, str] | None = None
+    unit: str = ""
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[AnyReader]:
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
+            yield reader
+    except InputError:
+        raise
+    except Exception as error:  # a damaged bag makes the library fail in any way whatever
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{path}: cannot be read ({reason}); record the bag again.") from error
+
+
+def first_stamp(path: Path, topic: str) -> int:
+    """Return the stamp of the first message of a topic (ns); without a header, its arrival.
+
+    Raises
+    ------
+    InputError
+        Where the bag has no such topic.
+    """
+    with _opened(path) as reader:
+        connections = [c for c in reader.connections if c.topic == topic]
+        for _, arrived, raw in reader.messages(connections):
+            message: Any = reader.deserialize(raw, connections[0].msgtype)
+            header = getattr(message, "header", None)
+            return int(arrived) if header is None else stamp_ns(header)
+        names = ", ".join(sorted({c.topic for c in reader.connections}))
+    raise InputError(f"{path}: has no message of {topic} for --epoch (found {names}).")
+
+
+def plan_bag(
+    path: Path,
+    entries: Mapping[str, Sequence[Entry]],
+    others: Collection[str],
+    told: Findings,
+) -> list[Plan]:
+    """Return how the topics of a bag become streams; what is undecided is added to ``told``.
+
+    Parameters
+    ----------
+    entries : mapping of sequence of Entry
+        What the user says of each stream: a topic, and frames or a unit behind it.
+    others : collection of str
+        Streams that come from elsewhere.
+
+    Raises
+    ------
+    InputError
+        Where the bag cannot be read.
+    """
+    plans = []
+    with _opened(path) as reader:
+        found = sorted({(c.topic, c.msgtype) for c in reader.connections})
+        for role in STREAMS:
+            if role in others:
+                continue
+            topic = _chosen(path, role, entries.get(role, ()), found, reader, told)
+            if topic is not None:
+                unit = parse_unit(topic.unit or "T", STREAMS["magnetometer"]["field_x"])
+                if unit is None:
+                    told.problems.append(
+                        f"{path}: --map '{role}={topic.name}[{topic.unit}]': write one of"
+                        f" {accepted(STREAMS['magnetometer']['field_x'])}."
+                    )
+                else:
+                    plans.append(_plan(path, role, topic, unit))
+    return plans
+
+
+def _chosen(
+    path: Path,
+    role: str,
+    entries: Sequence[Entry],
+    found: Sequence[tuple[str, str]],
+    reader: AnyReader,
+    told: Findings,
+) -> Topic | None:
+    for entry in entries:
+        if entry.column:
+            told.problems.append(
+                f"{path}: --map '{entry}': a bag's columns are known; name the topic, as"
+                f" {role}=/topic."
+            )
+            return None
+    fitting = [(name, kind) for name, kind in found if kind in MESSAGES[role]]
+    if entries:
+        return _asked(path, role, entries[0], found, reader, told)
+    fitting = [one for one in fitting if one[1] in USUAL] or fitting
+    if len(fitting) > 1:
+        names = ", ".join(name for name, _ in fitting)
+        told.problems.append(f"{path}: several topics may be {role}: {names}; name one.")
+        told.proposals.append(f"{role}={fitting[0][0]}")
+        return None
+    if not fitting:
+        if role != "truth":
+            names = ", ".join(f"{name} ({kind})" for name, kind in found) or "none"
+            kinds = " or ".join(MESSAGES[role])
+            told.problems.append(f"{path}: no topic is of {kinds}, for {role} (found {names}).")
+        return None
+    return Topic(*fitting[0])
+
+
+def _asked(
+    path: Path,
+    role: str,
+    entry: Entry,
+    found: Sequence[tuple[str, str]],
+    reader: AnyReader,
+    told: Findings,
+) -> Topic | None:
+    read = re.fullmatch(
+        r"(?P<name>[^:\[\]]+?)(:(?P<parent>.+?)->(?P<child>.+?))?(\[(?P<unit>.*)\])?", entry.value
+    )
+    name = entry.value if read is None else read["name"]
+    kind = next((kind for topic, kind in found if topic == name), None)
+    if read is None or kind is None:
+        names = ", ".join(topic for topic, _ in found)
+        told.problems.append(f"{path}: has no topic {name} for {role} (found {names}).")
+        return None
+    if role == "truth" and kind in _TRANSFORMS:
+        pairs = _pairs(reader, name)
+        frames = (read["parent"] or "", read["child"] or "")
+        if frames not in pairs:
+            shown = ", ".join(f"{a}->{b}" for a, b in pairs)
+            told.problems.append(
+                f"{path}: topic {name} has no transform {'->'.join(frames)} (found {shown});"
+                " write world and body as truth=TOPIC:PARENT->CHILD."
+            )
+            told.proposals += [f"{role}={name}:{a}->{b}" for a, b in pairs[:5]]
+            return None
+        return Topic(name, kind, frames)
+    if kind not in MESSAGES[role]:
+        told.problems.append(
+            f"{path}: topic {name} is of {kind}, which is none of {', '.join(MESSAGES[role])} for"
+            f" {role}; name another."
+        )
+        return None
+    if read["unit"] and role != "magnetometer":
+        told.problems.append(f"{path}: --map '{entry}': messages of {kind} are in SI units.")
+        return None
+    return Topic(name, kind, None, read["unit"] or "")
+
+
+def _pairs(reader: AnyReader, name: str) -> list[tuple[str, str]]:
+    connections = [c for c in reader.connections if c.topic == name]
+    found: dict[tuple[str, str], None] = {}
+    for count, (_, _, raw) in enumerate(reader.messages(connections)):
+        message: Any = reader.deserialize(raw, connections[0].msgtype)
+        found |= dict.fromkeys(
+            (_frame(t.header.frame_id), _frame(t.child_frame_id)) for t in message.transforms
+        )
+        if count > ROWS:
+            break
+    return list(found)
+
+
+def _frame(name: str) -> str:
+    return name.lstrip("/")
+
+
+def _plan(path: Path, role: str, topic: Topic, field_unit: Unit) -> Plan:
+    place = f"{path} topic {topic.name}"
+    columns = _COLUMNS[role]
+
+    def read(wanted: Sequence[int], texts: Collection[int]) -> Iterator[Part]:  # noqa: ARG001
+        row = 0
+        for stamps, values in _rows(path, place, role, topic):
+            table = [stamps, *values.T]
+            yield Part([table[k] for k in wanted], row + np.arange(len(stamps)))
+            row += len(stamps)
+
+    usual: Terms = {TIME: (Term(0, _unit("ns", role, TIME)),)}
+    for k, name in enumerate(columns, start=1):
+        si = next(s for s in _SI[role] if parse_unit(s, STREAMS[role][name]) is not None)
+        unit = field_unit if role == "magnetometer" else _unit(si, role, name)
+        usual[name] = (Term(k, unit),)
+    if role == "truth" and not _moves(path, place, topic):
+        usual = {name: terms for name, terms in usual.items() if name not in VELOCITY}
+    source = Source(place, (Column(TIME), *map(Column, columns)), read, form=topic.msgtype)
+    return Plan(role, source, usual)
+
+
+def _unit(name: str, role: str, target: str) -> Unit:
+    return Unit(name, STREAMS[role][target])
+
+
+def _moves(path: Path, place: str, topic: Topic) -> bool:
+    """Return whether an odometry has a twist: many publishers leave it unfilled."""
+    if topic.msgtype != ODOMETRY:
+        return False
+    return any(values[:, len(_POSE) :].any() for _, values in _rows(path, place, "truth", topic))
+
+
+def _rows(
+    path: Path, place: str, role: str, topic: Topic
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield stamps (ns) and values of the messages of a topic."""
+    stamps: list[int] = []
+    values: list[list[float]] = []
+    row = MESSAGES[role].get(topic.msgtype)
+    with _opened(path) as reader:
+        connections = [c for c in reader.connections if c.topic == topic.name]
+        for _, _, raw in reader.messages(connections):
+            message: Any = reader.deserialize(raw, topic.msgtype)
+            if row is not None:
+                refuse_absent(message, place)
+                stamps.append(stamp_ns(message.header))
+                values.append(row(message))
+            else:
+                for one in message.transforms:
+                    frames = (_frame(one.header.frame_id), _frame(one.child_frame_id))
+                    if frames == topic.frames:
+                        stamps.append(stamp_ns(one.header))
+                        values.append(transform_row(one))
+            if len(stamps) >= ROWS:
+                yield np.array(stamps), _complete(role, np.array(values))
+                stamps, values = [], []
+    if stamps:
+        yield np.array(stamps), _complete(role, np.array(values))
+
+
+def _complete(role: str, values: Array) -> Array:
+    """Return rows with a velocity in world axes behind a truth's pose."""
+    if role != "truth":
+        return values
+    velocity = np.zeros((len(values), 3))
+    if values.shape[1] > len(_POSE):
+        turn = values[:, 3:7].copy()
+        turn[~(np.linalg.norm(turn, axis=1) > 0.0)] = [0.0, 0.0, 0.0, 1.0]
+        velocity = Rotation.from_quat(turn).apply(values[:, len(_POSE) :])
+    return np.hstack([values[:, : len(_POSE)], velocity])

@@ -1,0 +1,233 @@
+"""What a log's streams are made of, and how a user says it: ``imu.gyro_x=-GyrY[deg/s]``."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+
+from magfusion.errors import InputError
+from magfusion.files.foreign.source import Column
+from magfusion.files.foreign.units import Dimension, Unit, accepted, parse_unit
+
+TIME = "time"
+_AXES = "xyz"
+
+
+def _vector(stem: str, dimension: Dimension) -> dict[str, Dimension]:
+    return {f"{stem}_{axis}": dimension for axis in _AXES}
+
+
+QUATERNION = ("qw", "qx", "qy", "qz")
+VELOCITY = ("velocity_x", "velocity_y", "velocity_z")
+STREAMS: dict[str, dict[str, Dimension]] = {
+    "imu": {
+        TIME: Dimension.TIME,
+        **_vector("gyro", Dimension.RATE),
+        **_vector("accel", Dimension.FORCE),
+    },
+    "magnetometer": {TIME: Dimension.TIME, **_vector("field", Dimension.FIELD)},
+    "truth": {
+        TIME: Dimension.TIME,
+        **_vector("position", Dimension.LENGTH),
+        **dict.fromkeys(QUATERNION, Dimension.NUMBER),
+        **_vector("velocity", Dimension.SPEED),
+    },
+}
+OPTIONAL = frozenset(VELOCITY)
+# What stands for several columns.
+GROUPS = {
+    **{stem: tuple(f"{stem}_{a}" for a in _AXES) for stem in ("gyro", "accel", "field")},
+    **{stem: tuple(f"{stem}_{a}" for a in _AXES) for stem in ("position", "velocity")},
+    "quaternion": QUATERNION,
+}
+ORDERS = {"wxyz": (0, 1, 2, 3), "xyzw": (3, 0, 1, 2)}  # where w, x, y and z stand
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One ``STREAM.COLUMN=NAME[unit]``, or ``STREAM=TOPIC`` with an empty column.
+
+    Parameters
+    ----------
+    value : str
+        What is behind the equals sign.
+    """
+
+    stream: str
+    column: str
+    value: str
+
+    def __str__(self) -> str:
+        column = f".{self.column}" if self.column else ""
+        return f"{self.stream}{column}={self.value}"
+
+
+@dataclass(frozen=True)
+class Term:
+    """A column of the file with sign and unit.
+
+    Parameters
+    ----------
+    place : int
+        Of the column in the file.
+    """
+
+    place: int
+    unit: Unit
+    sign: float = 1.0
+
+
+class Undecided(ValueError):
+    """Why an entry cannot be resolved, and what could stand in its place.
+
+    Parameters
+    ----------
+    place : int, optional
+        The column that is meant, where only its unit is open.
+    sign : float
+        Of it.
+    """
+
+    def __init__(self, reason: str, place: int | None = None, sign: float = 1.0) -> None:
+        super().__init__(reason)
+        self.place, self.sign = place, sign
+
+
+def parse_entry(text: str) -> list[Entry]:
+    """Read one option; what stands for several columns becomes several entries.
+
+    Raises
+    ------
+    InputError
+        Where it is none, or names an unknown stream or column.
+    """
+    name, equals, value = (part.strip() for part in text.partition("="))
+    stream, _, column = name.partition(".")
+    if not equals or not value or not name:
+        raise InputError(
+            f"--map {text!r}: write TABLE.COLUMN=NAME[unit], as 'imu.gyro_x=GyrX[deg/s]', or"
+            " TABLE=TOPIC"
+        )
+    if stream not in STREAMS:
+        raise InputError(f"--map {text!r}: {stream} is no table; write one of {', '.join(STREAMS)}")
+    if not column or column in STREAMS[stream]:
+        return [Entry(stream, column, value)]
+    if column not in GROUPS or GROUPS[column][0] not in STREAMS[stream]:
+        known = [*STREAMS[stream]]
+        known += [group for group, names in GROUPS.items() if names[0] in known]
+        raise InputError(
+            f"--map {text!r}: {column} is no column of {stream}; write one of {', '.join(known)}"
+        )
+    return _split(stream, column, value, text)
+
+
+def _split(stream: str, group: str, value: str, text: str) -> list[Entry]:
+    found = re.fullmatch(r"(?P<names>.*?)\s*(?P<unit>\[[^\[\]]*\])?", value)
+    assert found is not None
+    unit, targets = found["unit"] or "", GROUPS[group]
+    names = [name.strip() for name in found["names"].split(",")]
+    order: Sequence[int] = range(len(targets))
+    if group == "quaternion":
+        if unit.strip("[]") not in ORDERS:
+            raise InputError(
+                f"--map {text!r}: say the order of the quaternion, as"
+                f" '{stream}.quaternion={found['names']}[wxyz]' or [xyzw]"
+            )
+        order, unit = ORDERS[unit.strip("[]")], "[1]"
+    if len(names) == 1:
+        names = [f"{names[0]}:{k}" for k in range(len(targets))]
+    if len(names) != len(targets):
+        raise InputError(
+            f"--map {text!r}: {group} takes {len(targets)} names, or that of one array; found"
+            f" {len(names)}"
+        )
+    return [
+        Entry(stream, target, f"{names[k]}{unit}") for target, k in zip(targets, order, strict=True)
+    ]
+
+
+def resolve(entry: Entry, columns: Sequence[Column]) -> tuple[Term, ...]:
+    """Return the columns of the file that an entry means; stamps may be a sum of several.
+
+    Raises
+    ------
+    Undecided
+        With the reason, for a column that is not there or a unit that is not said.
+    """
+    dimension = STREAMS[entry.stream][entry.column]
+    parts = [entry.value]
+    if dimension is Dimension.TIME and _found(entry.value, columns) is None:
+        parts = re.split(r"(?<=\])\s*\+\s*", entry.value)
+    return tuple(_term(part.strip(), columns, dimension, entry) for part in parts)
+
+
+def _term(text: str, columns: Sequence[Column], dimension: Dimension, entry: Entry) -> Term:
+    for sign, lead in ((1.0, ""), (1.0, "+"), (-1.0, "-")):
+        if not text.startswith(lead):
+            continue
+        bare = text[len(lead) :].strip()
+        place = _found(bare, columns)
+        if place is not None:
+            return Term(place, _own_unit(columns[place], place, dimension, sign), sign)
+        tagged = re.fullmatch(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]", bare)
+        place = None if tagged is None else _found(tagged["name"], columns)
+        if tagged is not None and place is not None:
+            unit = parse_unit(tagged["unit"], dimension)
+            if unit is None:
+                raise Undecided(
+                    f"{tagged['unit']!r} is no unit of {dimension}; write one of"
+                    f" {accepted(dimension)}",
+                    *(place, sign),
+                )
+            return Term(place, unit, sign)
+    raise Undecided(_not_there(text, columns, entry))
+
+
+def _found(name: str, columns: Sequence[Column]) -> int | None:
+    """Return the place of the column that a name means, or None."""
+    exact = [k for k, column in enumerate(columns) if column.name == name]
+    bare = [k for k, c in enumerate(columns) if _loose(c.name) == _loose(name)]
+    untagged = [k for k, c in enumerate(columns) if _loose(_untagged(c.name)) == _loose(name)]
+    for found in (exact, bare, untagged):
+        if len(found) > 1:
+            places = ", ".join(map(str, found))
+            raise Undecided(
+                f"column {name} is there {len(found)} times; name it by its place (counted from"
+                f" 0), one of #{places.replace(', ', ', #')}"
+            )
+        if found:
+            return found[0]
+    number = re.fullmatch(r"#?(\d+)", name)
+    if number and int(number[1]) < len(columns):
+        return int(number[1])
+    return None
+
+
+def _loose(name: str) -> str:
+    return re.sub(r"\s", "", name).strip("/").casefold()
+
+
+def _untagged(name: str) -> str:
+    return re.sub(r"\s*[\[(][^\[\]()]*[\])]\s*$", "", name)
+
+
+def _own_unit(column: Column, place: int, dimension: Dimension, sign: float) -> Unit:
+    """Return the unit that the file names; a number has none."""
+    tag = re.search(r"[\[(]([^\[\]()]*)[\])]\s*$", column.name)
+    said = column.unit or (tag[1] if tag else "")
+    unit = parse_unit(said, dimension) if said or dimension is Dimension.NUMBER else None
+    if unit is None and dimension is Dimension.NUMBER:
+        unit = parse_unit("1", dimension)
+    if unit is None:
+        said = f" ({said!r} is none)" if said else ""
+        raise Undecided(f"the unit of column {column.name} is not said{said}", place, sign)
+    return unit
+
+
+def _not_there(text: str, columns: Sequence[Column], entry: Entry) -> str:
+    names = [column.name for column in columns]
+    bare = re.sub(r"\s*\[[^\[\]]*\]$", "", text).lstrip("+-")
+    near = get_close_matches(bare, names, 1, 0.6)
+    hint = f"; is it {near[0]}?" if near else ""
+    shown = ", ".join(names[:30]) + (", ..." if len(names) > 30 else "")
+    return f"there is no column {bare} for {entry.column} (found {shown}){hint}"

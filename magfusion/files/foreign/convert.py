@@ -1,0 +1,222 @@
+"""A mapped table becomes a table of a log, part by part, and everything left out is counted."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+
+from magfusion.errors import InputError
+from magfusion.files.foreign.columns import QUATERNION, TIME, Term
+from magfusion.files.foreign.plan import Plan
+from magfusion.files.foreign.source import Part
+from magfusion.files.foreign.units import NO_STAMP, Raw, to_nanoseconds
+from magfusion.files.inertial_tables import MOST_MISSING, MOST_TWICE
+from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, LONGEST_GAP, ROWS_PER_GROUP
+from magfusion.files.table import TIME as TIME_NS
+from magfusion.units import NANOSECOND, AnyArray, Array, BoolArray, IntArray
+
+MOST_BACK = 1.0  # s; further back, a clock was set or wrapped around
+LEAST_QUATERNION = 1e-6  # of its length; trackers write zeros where they see nothing
+
+
+@dataclass
+class Counts:
+    """What became of the rows of a table.
+
+    Parameters
+    ----------
+    missing : int
+        Rows written with NaN: samples that were not taken.
+    left_out : dict
+        Rows that were not written, by the reason.
+    unsorted : int
+        Rows that were before the row above, and were put in their place.
+    first, last : int
+        Stamps (ns).
+    """
+
+    read: int = 0
+    written: int = 0
+    missing: int = 0
+    unsorted: int = 0
+    left_out: dict[str, int] = field(default_factory=dict)
+    first: int = LARGEST_TIME_NS
+    last: int = -LARGEST_TIME_NS
+
+    def leave_out(self, reason: str, count: int) -> None:
+        """Count rows that are not written."""
+        if count:
+            self.left_out[reason] = self.left_out.get(reason, 0) + count
+
+
+def write_stream(plan: Plan, path: Path) -> Counts:
+    """Write the table of a stream as Parquet, sorted by time.
+
+    Raises
+    ------
+    InputError
+        Naming file, column and row, where the table is no recording of one clock.
+    """
+    counts = Counts()
+    names = [name for name in plan.terms if name != TIME]
+    schema = pa.schema([(TIME_NS, pa.int64()), *((name, pa.float64()) for name in names)])
+    places = sorted({term.place for terms in plan.terms.values() for term in terms})
+    texts = {term.place for term in plan.terms.get(TIME, ())}
+    options = {"compression": "zstd", "write_page_checksum": True}
+    with pa.parquet.ParquetWriter(path, schema, **options) as writer:
+        for part in plan.source.read(places, texts):
+            for reason, count in part.left_out.items():
+                counts.leave_out(reason, count)
+            raw = dict(zip(places, part.columns, strict=True))
+            stamps = _stamps(plan, raw, part)
+            values = _values(plan, raw, names, len(part.rows))
+            stamps, values = _kept(plan, names, stamps, values, part.rows, counts)
+            columns = [stamps, *values.T]
+            writer.write_table(
+                pa.table(dict(zip(schema.names, columns, strict=True))),
+                row_group_size=ROWS_PER_GROUP,
+            )
+    if counts.unsorted:
+        _sort(path, counts)
+    _check(plan, counts)
+    return counts
+
+
+def _stamps(plan: Plan, raw: dict[int, Raw], part: Part) -> IntArray:
+    if plan.rate is not None:
+        start = round(plan.rate.start_s * 10**9)
+        step = float(10**9 / plan.rate.hz)
+        return start + np.rint(part.rows * step).astype(np.int64)
+    total = np.zeros(len(part.rows), dtype=np.int64)
+    absent = np.zeros(len(part.rows), dtype=bool)
+    for term in plan.terms[TIME]:
+        try:
+            stamps = to_nanoseconds(raw[term.place], term.unit)
+        except ValueError as found:
+            name = plan.source.columns[term.place].name
+            raise InputError(
+                f"{plan.source.place}: column {name}: found {str(found)!r}, which is no time in"
+                f" {term.unit}; name another unit by --map '{plan.stream}.time={name}[unit]'"
+                " (iso for dates as 2024-05-01T12:00:00.5)."
+            ) from None
+        absent |= stamps == NO_STAMP
+        total += np.where(absent, 0, int(term.sign) * stamps)
+    return np.where(absent, NO_STAMP, total)
+
+
+def _values(plan: Plan, raw: dict[int, Raw], names: list[str], rows: int) -> Array:
+    values = np.empty((rows, len(names)))
+    for k, name in enumerate(names):
+        (term,) = plan.terms[name]
+        values[:, k] = _si(raw[term.place], term)
+    values[~(np.abs(values) < LARGEST_NUMBER)] = np.nan
+    return values
+
+
+def _si(raw: Raw, term: Term) -> AnyArray:
+    if isinstance(raw, pa.Array | pa.ChunkedArray):
+        raw = raw.cast(pa.float64()).to_numpy(zero_copy_only=False)
+    return np.asarray(raw, dtype=np.float64) * (term.sign * term.unit.si)
+
+
+def _kept(
+    plan: Plan,
+    names: list[str],
+    stamps: IntArray,
+    values: Array,
+    rows: IntArray,
+    counts: Counts,
+) -> tuple[IntArray, Array]:
+    """Return the rows to write, and count the others."""
+    counts.read += len(stamps)
+    keep: BoolArray = stamps != NO_STAMP
+    counts.leave_out("without a time", int(np.sum(~keep)))
+    missing: BoolArray = np.isnan(values).any(axis=1)
+    if plan.stream == "truth":
+        # A truth has no use for rows that hold no pose; a stream of samples knows that one is lost.
+        counts.leave_out("without a pose", int(np.sum(keep & missing)))
+        keep &= ~missing
+        length = np.linalg.norm(values[:, [names.index(q) for q in QUATERNION]], axis=1)
+        none = keep & (length < LEAST_QUATERNION)
+        counts.leave_out("with a quaternion of zeros", int(np.sum(none)))
+        keep &= ~none
+    stamps, values, rows, missing = stamps[keep], values[keep], rows[keep], missing[keep]
+    if not len(stamps):
+        return stamps, values
+    _refuse_jumps(plan, stamps, rows, counts)
+    before = counts.last if counts.written else int(stamps[0]) - 1
+    # Out of order within what was sent together; doubles are then found when all is sorted.
+    highest = np.maximum.accumulate(np.concatenate([[before], stamps]))[:-1]
+    counts.unsorted += int(np.sum(stamps < highest))
+    twice: BoolArray = np.diff(stamps, prepend=before) == 0
+    counts.leave_out("with the stamp of another", int(np.sum(twice)))
+    stamps, values = stamps[~twice], values[~twice]
+    counts.missing += int(np.sum(missing[~twice]))
+    counts.written += len(stamps)
+    if len(stamps):
+        counts.first = min(counts.first, int(stamps.min()))
+        counts.last = max(counts.last, int(stamps.max()))
+    return stamps, values
+
+
+def _refuse_jumps(plan: Plan, stamps: IntArray, rows: IntArray, counts: Counts) -> None:
+    before = counts.last if counts.written else int(stamps[0])
+    steps = np.diff(stamps.astype(np.float64), prepend=float(before)) * NANOSECOND
+    far = np.abs(stamps) > LARGEST_TIME_NS
+    for bad, what in (
+        (far, "is beyond any clock: another unit of time is probably meant"),
+        (
+            steps < -MOST_BACK,
+            "goes back by {size:.6g} s: the clock was set or a counter wrapped around; correct"
+            " the times, or import the parts one by one",
+        ),
+        (
+            steps > LONGEST_GAP,
+            "is {size:.6g} s after the row above: the clock jumped; correct the times, or import"
+            " the parts one by one",
+        ),
+    ):
+        if bad.any():
+            k = int(np.argmax(bad))
+            raise InputError(
+                f"{plan.source.place}: {plan.stream}.time, row {rows[k]} of the data (counted from"
+                f" 0): {stamps[k] * NANOSECOND:.9g} s {what.format(size=abs(steps[k]))}."
+            )
+
+
+def _sort(path: Path, counts: Counts) -> None:
+    table = pa.parquet.read_table(path)
+    stamps = table[TIME_NS].to_numpy()
+    order = np.argsort(stamps, kind="stable")
+    twice = np.diff(stamps[order], prepend=stamps[order][:1] - 1) == 0
+    counts.leave_out("with the stamp of another", int(np.sum(twice)))
+    counts.written -= int(np.sum(twice))
+    pa.parquet.write_table(
+        table.take(order[~twice]),
+        path,
+        compression="zstd",
+        row_group_size=ROWS_PER_GROUP,
+        write_page_checksum=True,
+    )
+
+
+def _check(plan: Plan, counts: Counts) -> None:
+    place, stream = plan.source.place, plan.stream
+    if not counts.written:
+        reasons = ", ".join(f"{n} {reason}" for reason, n in counts.left_out.items())
+        found = f"none of {counts.read} rows can be used ({reasons})" if counts.read else "no rows"
+        raise InputError(f"{place}: {found} for {stream}; record it again, or map other columns.")
+    twice = counts.left_out.get("with the stamp of another", 0)
+    if twice > MOST_TWICE * counts.read:
+        raise InputError(
+            f"{place}: {twice} of {counts.read} rows have the stamp of another: the times are"
+            f" coarser than the sampling; map a finer column to {stream}.time, or give --rate-hz"
+            f" {stream}=HZ."
+        )
+    if counts.missing > MOST_MISSING * counts.written:
+        raise InputError(
+            f"{place}: {counts.missing} of {counts.written} rows lack a number of {stream}: map"
+            " other columns, or leave out rows that are of another sensor."
+        )

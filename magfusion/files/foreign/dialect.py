@@ -1,0 +1,209 @@
+"""How a table of text is written: delimiter, decimal sign, encoding, and where its rows begin."""
+
+import codecs
+import csv
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from magfusion.errors import InputError
+from magfusion.files.foreign.source import Column
+from magfusion.files.foreign.units import MISSING, Dimension, parse_unit
+
+HEAD = 1 << 18  # bytes that are looked at
+SAMPLE = 100  # lines
+SPACES = " "  # runs of them
+DELIMITERS = (",", ";", "\t", "|", SPACES)
+WORDS = {"comma": ",", "semicolon": ";", "tab": "\t", "pipe": "|", "space": SPACES}
+COMMENTS = ("#", "%", "//", "!")
+LEAST_SCORE = 0.5
+_NUMBER = {
+    sign: re.compile(
+        rf"[-+]?(\d+{re.escape(sign)}?\d*|{re.escape(sign)}\d+)([eE][-+]?\d+)?|[-+]?inf"
+    )
+    for sign in ".,"
+}
+_DATE = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[-+]\d\d:?\d\d)?)?")
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How a table of text is written.
+
+    Parameters
+    ----------
+    delimiter : str
+        A space means runs of spaces and tabulators.
+    offset : int
+        Of the first row of data in the file (bytes).
+    line : int
+        The same as a line, counted from 1.
+    """
+
+    delimiter: str
+    decimal: str
+    encoding: str
+    offset: int
+    line: int
+    columns: tuple[Column, ...]
+
+    def __str__(self) -> str:
+        words = {sign: word for word, sign in WORDS.items()}
+        parts = [f"delimiter {words.get(self.delimiter, self.delimiter)}"]
+        parts += ["decimal comma"] if self.decimal == "," else []
+        parts += [self.encoding] if self.encoding != "utf-8" else []
+        return ", ".join([*parts, f"data from line {self.line}"])
+
+
+def find_dialect(path: Path, delimiter: str | None = None) -> Dialect:
+    """Return how a file of text is written.
+
+    Parameters
+    ----------
+    delimiter : str, optional
+        One of `WORDS` or a character; found where it is not given.
+
+    Raises
+    ------
+    InputError
+        Where no table is found in it.
+    """
+    content = _head(path)
+    encoding, mark = _encoding(content, path)
+    text = codecs.getincrementaldecoder(encoding)("replace").decode(content[mark:])
+    lines = re.findall(r"[^\r\n]*(?:\r\n|\n|\r)|[^\r\n]+$", text)
+    if len(content) == HEAD and len(lines) > 1:
+        lines.pop()  # cut
+    bare = [line.strip() for line in lines]
+    asked = None if delimiter is None else WORDS.get(delimiter, delimiter)
+    if asked is not None and len(asked) != 1:
+        raise InputError(
+            f"--delimiter {delimiter!r}: write one character, or one of {', '.join(WORDS)}"
+        )
+    sign, decimal, width = _way_of_writing(bare, DELIMITERS if asked is None else (asked,), path)
+    begin = next(k for k, line in enumerate(bare) if _is_data(line, sign, decimal, width))
+    offset = mark + len("".join(lines[:begin]).encode(encoding))
+    names, units = _header(bare[:begin], sign, width)
+    columns = tuple(
+        Column(name or str(k), unit)
+        for k, (name, unit) in enumerate(zip(names, units, strict=True))
+    )
+    return Dialect(sign, decimal, encoding, offset, begin + 1, columns)
+
+
+def _head(path: Path) -> bytes:
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(HEAD)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); allow it.") from error
+    if not content.strip():
+        raise InputError(f"{path}: is empty; record it again, or leave it out.")
+    return content
+
+
+def _encoding(content: bytes, path: Path) -> tuple[str, int]:
+    """Return the encoding and the length of its mark."""
+    for mark, name in (
+        (codecs.BOM_UTF8, "utf-8"),
+        (codecs.BOM_UTF16_LE, "utf-16-le"),
+        (codecs.BOM_UTF16_BE, "utf-16-be"),
+    ):
+        if content.startswith(mark):
+            return name, len(mark)
+    if b"\0" in content:
+        raise InputError(
+            f"{path}: is no text; name a binary table by its suffix: .npy, .npz, .wav, .h5, .hdf5,"
+            " .mat or .parquet."
+        )
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(content, final=len(content) < HEAD)
+    except UnicodeDecodeError:
+        return "cp1252", 0
+    return "utf-8", 0
+
+
+def cells_of(line: str, delimiter: str) -> list[str]:
+    """Return the cells of a line."""
+    if delimiter == SPACES:
+        return line.split()
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
+
+
+def _is_number(cell: str, decimal: str) -> bool:
+    return bool(_NUMBER[decimal].fullmatch(cell) or cell in MISSING or _DATE.fullmatch(cell))
+
+
+def _way_of_writing(
+    lines: Sequence[str], delimiters: Sequence[str], path: Path
+) -> tuple[str, str, int]:
+    """Return delimiter, decimal sign and number of columns that make most cells numbers."""
+    sample = [line for line in lines if line and not line.startswith(COMMENTS)][-SAMPLE:]
+    best, found = 0.0, None
+    for sign in delimiters:
+        rows = [cells_of(line, sign) for line in sample]
+        width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
+        if width < 2:
+            continue
+        for decimal in ".," if sign != "," else ".":
+            cells = [cell for row in rows if len(row) == width for cell in row]
+            numbers = sum(_is_number(cell, decimal) for cell in cells)
+            score = numbers / sum(map(len, rows))
+            if score > best:
+                best, found = score, (sign, decimal, width)
+    if found is None or best < LEAST_SCORE:
+        shown = next((line for line in lines if line), "")[:60]
+        raise InputError(
+            f"{path}: holds no table of numbers (first line: {shown!r}); write a row of names and"
+            " rows of numbers, or name the --delimiter."
+        )
+    return found
+
+
+def _is_data(line: str, sign: str, decimal: str, width: int) -> bool:
+    if not line or line.startswith(COMMENTS):
+        return False
+    cells = cells_of(line, sign)
+    numbers = sum(_is_number(cell, decimal) and cell not in MISSING for cell in cells)
+    return len(cells) == width and 2 * numbers >= max(1, sum(c not in MISSING for c in cells))
+
+
+def _header(lines: Sequence[str], sign: str, width: int) -> tuple[list[str], list[str]]:
+    """Return names and units of the columns, empty where the file has none."""
+    none = [""] * width
+    rows: list[list[str]] = []
+    for line in reversed([line for line in lines if line]):
+        row = _row_of_names(line, sign, width)
+        if row is None or len(rows) == 2:
+            break
+        rows.append(row)
+    if not rows:
+        return none, none
+    units = [_unbracketed(cell) for cell in rows[0]]
+    if len(rows) == 2 and all(map(_is_unit, units)) and any(units):
+        return rows[1], units
+    return rows[0], none
+
+
+def _row_of_names(line: str, sign: str, width: int) -> list[str] | None:
+    bare = re.sub(r"^(#|%|//|!)+\s*", "", line)
+    for cells in (
+        cells_of(bare, sign),
+        re.split(r"\s*[,;\t|]\s*|\s+", bare) if line != bare else [],
+    ):
+        if len(cells) == width - 1:
+            cells = [*cells, ""]
+        if len(cells) == width and any(cells):
+            return cells
+    return None
+
+
+def _unbracketed(cell: str) -> str:
+    found = re.fullmatch(r"[\[(](.*)[\])]", cell)
+    return found[1].strip() if found else cell
+
+
+def _is_unit(text: str) -> bool:
+    return text in ("", "-") or any(parse_unit(text, dimension) for dimension in Dimension)

@@ -1,0 +1,208 @@
+"""From what lies on the disk to the plans of a log's streams, every problem told at once."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from magfusion.errors import InputError
+from magfusion.files.bag import is_bag
+from magfusion.files.euroc import find_magnetometer, is_euroc
+from magfusion.files.foreign.arrays import ARRAYS, array_source
+from magfusion.files.foreign.bag_table import plan_bag
+from magfusion.files.foreign.columns import STREAMS, TIME, Term
+from magfusion.files.foreign.guess import streams_of
+from magfusion.files.foreign.map_file import Asked
+from magfusion.files.foreign.plan import Findings, Plan, Terms, plan_stream
+from magfusion.files.foreign.source import Source
+from magfusion.files.foreign.text import text_source
+from magfusion.files.foreign.units import Dimension, Unit, parse_unit
+from magfusion.files.log import is_log
+from magfusion.files.table import find_table
+
+TEXTS = (".csv", ".tsv", ".txt", ".tum", ".dat", ".asc")
+_TUM = ("position_x", "position_y", "position_z", "qx", "qy", "qz", "qw")
+_SI = {
+    Dimension.TIME: "ns",
+    Dimension.RATE: "rad/s",
+    Dimension.FORCE: "m/s^2",
+    Dimension.FIELD: "T",
+    Dimension.LENGTH: "m",
+    Dimension.SPEED: "m/s",
+    Dimension.NUMBER: "1",
+}
+
+
+@dataclass(eq=False)
+class Gathered:
+    """Streams of one recording.
+
+    Parameters
+    ----------
+    bags : list of Path
+    stamped : bool
+        Whether the formats have their own convention of an epoch: the first inertial sample.
+    """
+
+    told: Findings
+    plans: dict[str, Plan] = field(default_factory=dict)
+    bags: list[Path] = field(default_factory=list)
+    stamped: bool = False
+    opened: dict[Path, Source] = field(default_factory=dict)
+
+    def add(self, plan: Plan | None) -> None:
+        """Add a stream, of which there may be one."""
+        if plan is not None and plan.stream in self.plans:
+            places = f"{self.plans[plan.stream].source.place} and {plan.source.place}"
+            self.told.problems.append(
+                f"{places} both hold the {plan.stream}; name one by --{plan.stream} FILE."
+            )
+        elif plan is not None:
+            self.plans[plan.stream] = plan
+
+
+def gather(paths: Sequence[Path], wanted: Asked, told: Findings) -> Gathered:
+    """Return how files become the streams of a log; ``told`` has what stands against it."""
+    found = Gathered(told)
+    attempted = set(wanted.files)
+    for stream, path in wanted.files.items():
+        if (source := _opened(path, wanted, found)) is not None:
+            found.add(_table(stream, path, source, wanted, told))
+    for path in paths:
+        try:
+            attempted |= _add(path, wanted, found)
+        except InputError as error:
+            told.problems.append(str(error))
+            attempted |= set(STREAMS)
+    for stream in ("imu", "magnetometer"):
+        if stream not in attempted:
+            told.problems.append(f"No table is given for the {stream}; give --{stream} FILE.")
+    for stream in wanted.entries:
+        if stream not in attempted:
+            told.problems.append(
+                f"--map '{wanted.entries[stream][0]}': no file is given for {stream}; give"
+                f" --{stream} FILE."
+            )
+    return found
+
+
+def _add(path: Path, wanted: Asked, found: Gathered) -> set[str]:
+    """Add a positional source; return the streams that were looked for in it."""
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file or directory; give the path of a source.")
+    if path.is_dir() and is_log(path):
+        raise InputError(f"{path}: is a log of magfusion already; nothing is to import.")
+    if is_bag(path):
+        return _add_bag(path, wanted, found)
+    if path.is_dir() and is_euroc(path):
+        return _add_euroc(path, wanted, found)
+    files = _tables_in(path) if path.is_dir() else [path]
+    if not files:
+        raise InputError(
+            f"{path}: holds no table ({', '.join((*TEXTS, *ARRAYS))}), no bag and no mav0/imu0;"
+            " give the path of a source."
+        )
+    return {stream for file in files for stream in _add_table(file, wanted, found, path.is_dir())}
+
+
+def _add_bag(path: Path, wanted: Asked, found: Gathered) -> set[str]:
+    found.bags.append(path)
+    found.stamped = True
+    entries = {s: e for s, e in wanted.entries.items() if s not in wanted.files}
+    for plan in plan_bag(path, entries, tuple(wanted.files), found.told):
+        found.add(plan)
+    return set(STREAMS)
+
+
+def _add_table(file: Path, wanted: Asked, found: Gathered, among_others: bool) -> set[str]:
+    source = _opened(file, wanted, found)
+    if source is None:
+        return set(STREAMS)
+    streams = {"truth"} if file.suffix.lower() == ".tum" else streams_of(source.columns)
+    for stream in sorted(streams - set(wanted.files)):
+        found.add(_table(stream, file, source, wanted, found.told))
+    if streams or among_others:
+        return streams
+    names = ", ".join(column.name for column in source.columns[:30])
+    found.told.problems.append(
+        f"{file}: its columns do not say what they are (found {names}); say whose table it is by"
+        " --imu, --magnetometer or --truth."
+    )
+    return set(STREAMS)
+
+
+def _tables_in(directory: Path) -> list[Path]:
+    return sorted(
+        path
+        for path in directory.iterdir()
+        if path.is_file() and path.suffix.lower() in (*TEXTS, *ARRAYS)
+    )
+
+
+def _opened(path: Path, wanted: Asked, found: Gathered) -> Source | None:
+    if path in found.opened:
+        return found.opened[path]
+    try:
+        if not path.is_file():
+            what = "is a directory" if path.is_dir() else "there is no such file"
+            raise InputError(f"{path}: {what}; give the path of a table.")
+        if path.suffix.lower() in ARRAYS:
+            source = array_source(path)
+        else:
+            source = text_source(path, wanted.delimiter)
+    except InputError as error:
+        found.told.problems.append(str(error))
+        return None
+    found.opened[path] = source
+    return source
+
+
+def _table(stream: str, path: Path, source: Source, wanted: Asked, told: Findings) -> Plan | None:
+    usual = None
+    if path.suffix.lower() == ".tum" and stream == "truth":
+        usual = _by_place(stream, (TIME, *_TUM), source, {Dimension.TIME: "s"})
+    entries, rate = wanted.entries.get(stream, ()), wanted.rates.get(stream)
+    return plan_stream(stream, source, entries, rate, told, usual)
+
+
+def _by_place(
+    stream: str, names: Sequence[str], source: Source, units: dict[Dimension, str] | None = None
+) -> Terms:
+    """Return columns that a format knows by their places, in its units or those of the header."""
+    terms: Terms = {}
+    for place, (name, column) in enumerate(zip(names, source.columns, strict=False)):
+        dimension = STREAMS[stream][name]
+        tag = column.name.partition("[")[2].rstrip("] ")
+        unit = parse_unit(tag, dimension) if tag else None
+        usual = Unit((_SI | (units or {}))[dimension], dimension)
+        terms[name] = (Term(place, unit or usual),)
+    return terms
+
+
+def _euroc_tables(path: Path) -> Iterator[tuple[str, Path]]:
+    yield "imu", path / "mav0" / "imu0" / "data.csv"
+    if (field := find_magnetometer(path)) is not None:
+        yield "magnetometer", field
+    truth = find_table(path / "mav0" / "state_groundtruth_estimate0", "data")
+    if truth is not None:
+        yield "truth", truth
+
+
+def _add_euroc(path: Path, wanted: Asked, found: Gathered) -> set[str]:
+    streams, found.stamped = set(), True
+    for stream, table in _euroc_tables(path):
+        streams.add(stream)
+        if stream in wanted.files or (source := _opened(table, wanted, found)) is None:
+            continue
+        names = [*STREAMS[stream]]
+        usual = _by_place(stream, names, source)
+        if len(usual) < len(names):
+            usual = {name: terms for name, terms in usual.items() if "velocity" not in name}
+        entries, rate = wanted.entries.get(stream, ()), wanted.rates.get(stream)
+        found.add(plan_stream(stream, source, entries, rate, found.told, usual))
+    if "magnetometer" not in streams | set(wanted.files):
+        names = ", ".join(sorted(entry.name for entry in (path / "mav0").iterdir()))
+        found.told.problems.append(
+            f"{path}: mav0 holds no folder of a magnetometer (found {names}); call it mag0, or"
+            " give --magnetometer FILE."
+        )
+    return streams | {"imu", "magnetometer"}

@@ -1,0 +1,207 @@
+"""What the names of columns say of themselves, and which unit would make their values plausible."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.files.foreign.columns import STREAMS, TIME
+from magfusion.files.foreign.source import Column
+from magfusion.files.foreign.units import (
+    ISO,
+    UNITS,
+    Dimension,
+    Raw,
+    Unit,
+    parse_unit,
+)
+from magfusion.units import STANDARD_GRAVITY, Array
+
+# Names without their axis; the short ones only where nothing else is in the name.
+_STEMS = {
+    "gyro": ("gyroscope", "gyro", "gyr", "omega", "angularvelocity", "angvel", "angularrate"),
+    "accel": ("accelerometer", "acceleration", "accelero", "accel", "acc", "specificforce"),
+    "field": ("magnetometer", "magneticfield", "magfield", "bfield", "magneto", "mag", "field"),
+    "position": ("position", "translation", "pos", "prsr"),
+    "velocity": ("linearvelocity", "velocity", "vel", "vrsr"),
+    "q": ("quaternion", "quat", "orientation", "rotation", "qrs", "qwb", "qwxyz"),
+}
+_MORE = {
+    "gyro": ("rotationrate", "rotrate", "wrss", "turnrate"),
+    "accel": ("linearacceleration", "arss"),
+    "field": ("magneticfluxdensity", "fluxdensity"),
+}
+_SHORT = {
+    "gyro": ("w", "g"),
+    "accel": ("a",),
+    "field": ("b", "m", "h"),
+    "position": ("p", "t"),
+    "velocity": ("v",),
+    "q": ("q",),
+}
+_TIMES = ("time", "timestamp", "timestamps", "stamp", "epoch", "clock", "elapsed", "datetime")
+_SHORT_TIMES = ("t", "ts", "utc", "sec", "seconds", "date")
+_NOT_MEASURED = re.compile(r"bias|cov|std|sigma|var(?!io)|temp|offset|status|uncal|error")
+_OF_STREAM = {
+    "imu": re.compile(r"imu|gyr|acc|inertial"),
+    "magnetometer": re.compile(r"mag|field|fgm|flux"),
+    "truth": re.compile(r"truth|gt|ref|mocap|vicon|opti|pose|odom"),
+}
+SURE_RATIO = 3.0  # of a typical size, within which a unit is plausible
+_TYPICAL = {Dimension.FORCE: STANDARD_GRAVITY, Dimension.FIELD: 5e-5}  # SI
+FAST = 8.0  # rad/s; a body that turns so fast on the mean is more likely measured in degrees
+FAR = 500.0  # m
+_RATES_HZ = (5.0, 30_000.0)
+
+
+@dataclass(frozen=True)
+class Named:
+    """A column whose name says what it is.
+
+    Parameters
+    ----------
+    unit : Unit, optional
+        That the name, or the file, says.
+    """
+
+    place: int
+    target: str
+    unit: Unit | None
+
+
+def named_columns(columns: Sequence[Column], stream: str) -> dict[str, list[Named]]:
+    """Return for each column of a stream those of a file whose names say that they are it."""
+    found: dict[str, list[Named]] = {target: [] for target in STREAMS[stream]}
+    for place, column in enumerate(columns):
+        if (one := _named(place, column, stream)) is not None:
+            found[one.target].append(one)
+    return {target: _nearest(named, columns, stream) for target, named in found.items()}
+
+
+def _named(place: int, column: Column, stream: str) -> Named | None:
+    if _NOT_MEASURED.search(column.name.casefold()):
+        return None
+    for name, text in _readings(column):
+        target = _target(name, stream)
+        if target is None:
+            continue
+        dimension = STREAMS[stream][target]
+        unit = parse_unit(text, dimension) if text or dimension is Dimension.NUMBER else None
+        if unit is not None or not text:
+            return Named(place, target, unit)
+        if column.unit or name != column.name:
+            continue
+    bare = _readings(column)[0][0]
+    target = _target(bare, stream)
+    return None if target is None else Named(place, target, None)
+
+
+def _readings(column: Column) -> list[tuple[str, str]]:
+    """Return the ways to part a name from its unit, the surest first."""
+    name = column.name
+    tag = re.fullmatch(r"(.*?)\s*[\[(]([^\[\]()]*)[\])]\s*", name)
+    if column.unit:
+        return [(tag[1] if tag else name, column.unit)]
+    if tag:
+        return [(tag[1], tag[2])]
+    words = re.split(r"[_ ]+", name)
+    cut = [
+        ("_".join(words[:-count]), "_".join(words[-count:]))
+        for count in (3, 2, 1)
+        if len(words) > count
+    ]
+    return [*cut, (name, "")]
+
+
+def _target(name: str, stream: str) -> str | None:
+    indexed = re.sub(r":([012])$", lambda m: "xyz"[int(m[1])], name)
+    norm = re.sub(r"[^a-z0-9]", "", indexed.casefold())
+    if norm in _SHORT_TIMES or norm.endswith(_TIMES):
+        return TIME
+    for stem in _SHORT:
+        axes = "wxyz" if stem == "q" else "xyz"
+        for axis in axes:
+            target = f"q{axis}" if stem == "q" else f"{stem}_{axis}"
+            if target in STREAMS[stream] and _is(norm, stem, axis, stream):
+                return target
+    return None
+
+
+def _is(norm: str, stem: str, axis: str, stream: str) -> bool:
+    if norm in [f"{short}{axis}" for short in _SHORT[stem]]:
+        return True
+    bare = {"magnetometer": "field", "truth": "position"}.get(stream)
+    if stem == bare and norm == axis:
+        return True
+    long = (*_STEMS[stem], *_MORE.get(stem, ()))
+    return norm.endswith(tuple(f"{one}{axis}" for one in long)) or (
+        norm in [f"{axis}{one}" for one in long]
+    )
+
+
+def _nearest(named: list[Named], columns: Sequence[Column], stream: str) -> list[Named]:
+    """Return, of several, the ones whose name says of which stream they are."""
+    if len(named) < 2:
+        return named
+    others = [pattern for name, pattern in _OF_STREAM.items() if name != stream]
+
+    def score(one: Named) -> int:
+        name = columns[one.place].name.casefold()
+        return bool(_OF_STREAM[stream].search(name)) - any(p.search(name) for p in others)
+
+    best = max(map(score, named))
+    return [one for one in named if score(one) == best]
+
+
+def streams_of(columns: Sequence[Column]) -> set[str]:
+    """Return the streams that the names of a file's columns make whole."""
+    found = set()
+    for stream, needed in (
+        ("imu", ("gyro_x", "accel_x")),
+        ("magnetometer", ("field_x",)),
+        ("truth", ("position_x", "qw")),
+    ):
+        named = named_columns(columns, stream)
+        bare = {"field_x": "x"}
+        if all(
+            any(columns[n.place].name.casefold() != bare.get(target) for n in named[target])
+            for target in needed
+        ):
+            found.add(stream)
+    return found
+
+
+def likely_unit(dimension: Dimension, values: Array) -> Unit:
+    """Return the unit in which the sizes of vectors, shape (n,), would be plausible."""
+    known = np.abs(values[np.isfinite(values)])
+    size = float(np.median(known)) if len(known) else 0.0
+    if dimension in _TYPICAL and size > 0.0:
+        typical = _TYPICAL[dimension]
+        names = {name: abs(np.log(size * si / typical)) for name, si in UNITS[dimension].items()}
+        return Unit(min(names, key=lambda name: names[name]), dimension)
+    if dimension is Dimension.RATE:
+        return Unit("deg/s" if np.sqrt(np.mean(known**2)) > FAST else "rad/s", dimension)
+    if dimension is Dimension.LENGTH:
+        return Unit("mm" if size > FAR else "m", dimension)
+    return Unit(next(iter(UNITS[dimension])), dimension)
+
+
+def likely_time_unit(raw: Raw) -> Unit:
+    """Return the unit in which stamps would have a plausible rate."""
+    try:
+        values = np.asarray(
+            raw.to_numpy(zero_copy_only=False) if hasattr(raw, "null_count") else raw
+        )
+        steps = np.diff(values.astype(np.float64))
+    except (ValueError, TypeError):
+        return Unit(ISO, Dimension.TIME)
+    steps = steps[steps > 0]
+    step = float(np.median(steps)) if len(steps) else 0.0
+    for name in ("s", "ms", "us", "ns"):
+        if (
+            step > 0.0
+            and _RATES_HZ[0] <= 1.0 / (step * UNITS[Dimension.TIME][name]) <= _RATES_HZ[1]
+        ):
+            return Unit(name, Dimension.TIME)
+    return Unit("s", Dimension.TIME)

@@ -1,0 +1,113 @@
+"""What an import asks for: tables, maps of columns, rates; by options or a small YAML file."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+
+from magfusion.errors import InputError
+from magfusion.files.foreign.columns import STREAMS, Entry, parse_entry
+from magfusion.files.foreign.plan import Findings, Rate
+from magfusion.files.yaml_files import StrictModel, read_yaml
+
+
+class MapFile(StrictModel):
+    """What the file of ``--map-file`` may hold, by the names of the options."""
+
+    imu: str | None = None
+    magnetometer: str | None = None
+    truth: str | None = None
+    delimiter: str | None = None
+    epoch: str | int | None = None
+    rate_hz: dict[str, float | int | str] = {}  # noqa: RUF012 - a field of pydantic's
+    map: dict[str, str | int] = {}  # noqa: RUF012
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What an import is asked for.
+
+    Parameters
+    ----------
+    files : dict
+        Of streams that are named.
+    entries : dict
+        By stream.
+    """
+
+    files: dict[str, Path]
+    entries: dict[str, list[Entry]]
+    rates: dict[str, Rate] = field(default_factory=dict)
+    delimiter: str | None = None
+    epoch: str | None = None
+
+
+def asked(
+    files: Mapping[str, Path | None],
+    maps: Sequence[str],
+    rates: Sequence[str],
+    delimiter: str | None,
+    epoch: str | None,
+    map_file: Path | None,
+    told: Findings,
+) -> Asked:
+    """Return what options ask for, and what a file asks for beside them.
+
+    Raises
+    ------
+    InputError
+        Where the file is none.
+    """
+    model = MapFile(**{}) if map_file is None else read_yaml(map_file, MapFile)
+    root = Path() if map_file is None else map_file.parent
+    named = {stream: path for stream, path in files.items() if path is not None}
+    for stream in STREAMS:
+        name = getattr(model, stream)
+        if name is not None and stream not in named:
+            named[stream] = root / name
+    entries: dict[str, dict[str, Entry]] = defaultdict(dict)
+    for lines in ([f"{key}={value}" for key, value in model.map.items()], maps):
+        seen: set[tuple[str, str]] = set()
+        for entry in _entries(lines, told):
+            if (entry.stream, entry.column) in seen:
+                told.problems.append(f"--map {entry.stream}.{entry.column} is given twice.")
+            seen.add((entry.stream, entry.column))
+            entries[entry.stream][entry.column] = entry
+    every = [f"{name}={hz}" for name, hz in model.rate_hz.items()] + list(rates)
+    return Asked(
+        named,
+        {stream: list(those.values()) for stream, those in entries.items()},
+        _rates(every, told),
+        model.delimiter if delimiter is None else delimiter,
+        epoch if epoch is not None or model.epoch is None else str(model.epoch),
+    )
+
+
+def _entries(lines: Sequence[str], told: Findings) -> list[Entry]:
+    found = []
+    for line in lines:
+        try:
+            found += parse_entry(line)
+        except InputError as error:
+            told.problems.append(f"{error}.")
+    return found
+
+
+def _rates(lines: Sequence[str], told: Findings) -> dict[str, Rate]:
+    found = {}
+    for line in lines:
+        stream, _, value = (part.strip() for part in line.partition("="))
+        number, _, start = value.partition("@")
+        try:
+            rate = Rate(Fraction(number), Fraction(start or "0"))
+        except (ValueError, ZeroDivisionError):
+            rate = None
+        if stream not in STREAMS or rate is None or rate.hz <= 0:
+            told.problems.append(
+                f"--rate-hz {line!r}: write TABLE=HZ with a table of {', '.join(STREAMS)}, or"
+                " TABLE=HZ@SECONDS where its first row is later than the log's zero."
+            )
+        else:
+            found[stream] = rate
+    return found

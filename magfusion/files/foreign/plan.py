@@ -1,0 +1,267 @@
+"""Which columns of a table make a stream: as the user says, or as their names say for certain."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.files.foreign.columns import (
+    GROUPS,
+    OPTIONAL,
+    STREAMS,
+    TIME,
+    Entry,
+    Term,
+    Undecided,
+    resolve,
+)
+from magfusion.files.foreign.guess import likely_time_unit, likely_unit, named_columns
+from magfusion.files.foreign.source import Source
+from magfusion.files.foreign.units import (
+    ISO,
+    Dimension,
+    Raw,
+    Unit,
+    is_date,
+)
+from magfusion.units import Array
+
+Terms = dict[str, tuple[Term, ...]]
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Stamps of a table that has none.
+
+    Parameters
+    ----------
+    hz : fraction
+    start_s : fraction
+        Of the first row.
+    """
+
+    hz: Fraction
+    start_s: Fraction = Fraction(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """How a table becomes a stream."""
+
+    stream: str
+    source: Source
+    terms: Terms
+    rate: Rate | None = None
+
+    def options(self) -> list[str]:
+        """Return the map as options, in the order of the stream's columns."""
+        return as_options(self.stream, self.source, self.terms)
+
+
+@dataclass(eq=False)
+class Findings:
+    """What stands against an import: sentences, and options that would decide it."""
+
+    problems: list[str] = field(default_factory=list)
+    proposals: list[str] = field(default_factory=list)
+    guessed: list[str] = field(default_factory=list)
+
+
+def shown(source: Source, terms: Sequence[Term]) -> str:
+    """Return terms as they are written in a map."""
+    parts = []
+    for term in terms:
+        name = source.columns[term.place].name
+        known = term.unit.dimension is Dimension.NUMBER or name.endswith(f"[{term.unit}]")
+        unit = "" if known else f"[{term.unit}]"
+        parts.append(f"{'-' if term.sign < 0.0 else ''}{name}{unit}")
+    return "+".join(parts)
+
+
+def as_options(stream: str, source: Source, terms: Terms) -> list[str]:
+    """Return terms as options, the components of a vector in one where that says the same."""
+    options, done = [], set[str]()
+    for target, own in terms.items():
+        if target in done:
+            continue
+        group = next((g for g, names in GROUPS.items() if target == names[0]), "")
+        every = [terms[name][0] for name in GROUPS.get(group, ()) if name in terms]
+        names = [source.columns[term.place].name for term in every]
+        alike = len({term.unit for term in every}) == 1 and "," not in "".join(names)
+        if group and len(every) == len(GROUPS[group]) and alike:
+            done |= set(GROUPS[group])
+            tag = "wxyz" if group == "quaternion" else str(every[0].unit)
+            signed = [("-" if t.sign < 0.0 else "") + n for t, n in zip(every, names, strict=True)]
+            tag = "" if names[-1].endswith(f"[{tag}]") else f"[{tag}]"
+            options.append(f"{stream}.{group}={','.join(signed)}{tag}")
+        else:
+            options.append(f"{stream}.{target}={shown(source, own)}")
+    return options
+
+
+def plan_stream(
+    stream: str,
+    source: Source,
+    entries: Sequence[Entry],
+    rate: Rate | None,
+    told: Findings,
+    usual: Mapping[str, tuple[Term, ...]] | None = None,
+) -> Plan | None:
+    """Return how a table becomes a stream, or None with the reasons in ``told``.
+
+    Parameters
+    ----------
+    entries : sequence of Entry
+        What the user says, of this stream.
+    usual : mapping, optional
+        Columns that the format itself defines.
+    """
+    own = _Planning(stream, source, told, rate)
+    given = {entry.column: entry for entry in entries}
+    named = named_columns(source.columns, stream)
+    velocity = any(name in given for name in OPTIONAL)
+    for target in STREAMS[stream]:
+        if target in given:
+            own.say(given[target])
+        elif usual is not None:
+            own.terms |= {target: usual[target]} if target in usual else {}
+        elif target != TIME or rate is None:
+            own.guess(target, named[target], target in OPTIONAL and not velocity)
+    return own.plan(velocity)
+
+
+class _Planning:
+    """One stream while its columns are looked for."""
+
+    def __init__(self, stream: str, source: Source, told: Findings, rate: Rate | None) -> None:
+        self.stream, self.source, self.told, self.rate = stream, source, told, rate
+        self.terms: Terms = {}
+        self.open: dict[str, tuple[int, float, str]] = {}
+        self.absent: list[str] = []
+        self.guessed: list[str] = []
+        self.failed = False
+
+    def problem(self, text: str) -> None:
+        self.failed = True
+        self.told.problems.append(f"{self.source.place}: {text}.")
+
+    def say(self, entry: Entry) -> None:
+        if entry.column == TIME and self.rate is not None:
+            self.problem(f"{self.stream}.time and --rate-hz {self.stream} are given; keep one")
+            return
+        try:
+            self.terms[entry.column] = resolve(entry, self.source.columns)
+        except Undecided as reason:
+            if reason.place is None or "is no unit" in str(reason):
+                self.problem(f"--map '{entry}': {reason}")
+            if reason.place is not None:
+                said = "" if "is no unit" in str(reason) else "is not said"
+                self.open[entry.column] = (reason.place, reason.sign, said)
+
+    def guess(self, target: str, named: Sequence, optional: bool) -> None:  # type: ignore[type-arg]
+        if not named:
+            if target == TIME and self.source.rate_hz is not None:
+                self.rate = Rate(Fraction(self.source.rate_hz))
+            elif not optional:
+                self.absent.append(target)
+            return
+        if len(named) > 1:
+            if not optional:
+                names = " and ".join(self.source.columns[n.place].name for n in named)
+                self.problem(f"columns {names} may both be {self.stream}.{target}; name one")
+                first = named[0]
+                term = self._likely(target, first.place, 1.0)
+                term = term if first.unit is None else Term(first.place, first.unit)
+                self.told.proposals += as_options(self.stream, self.source, {target: (term,)})
+            return
+        (one,) = named
+        unit = one.unit
+        if unit is None and target == TIME and is_date(_sample(self.source, one.place, True)):
+            unit = Unit(ISO, Dimension.TIME)
+        if unit is not None:
+            self.terms[target] = (Term(one.place, unit),)
+            self.guessed.append(target)
+        elif not optional:
+            self.open[target] = (one.place, 1.0, "is not said")
+
+    def plan(self, velocity: bool) -> Plan | None:
+        self._tell_absent()
+        self._tell_open()
+        parts = [name for name in OPTIONAL if name in self.terms]
+        if len(parts) not in (0, len(OPTIONAL)):
+            if velocity:
+                self.problem("a velocity takes velocity_x, velocity_y and velocity_z; map all")
+            for name in parts:
+                del self.terms[name]
+        self._check_lengths()
+        ordered = {t: self.terms[t] for t in STREAMS[self.stream] if t in self.terms}
+        plan = Plan(self.stream, self.source, ordered, self.rate)
+        sure = {target: self.terms[target] for target in self.guessed if target in self.terms}
+        self.told.guessed += as_options(self.stream, self.source, sure)
+        return None if self.failed else plan
+
+    def _tell_absent(self) -> None:
+        if not self.absent:
+            return
+        names = ", ".join(column.name for column in self.source.columns[:30])
+        what = f"no column is found for {', '.join(f'{self.stream}.{t}' for t in self.absent)}"
+        remedy = f"name it by --map '{self.stream}.{self.absent[0]}=NAME[unit]'"
+        if self.absent == [TIME]:
+            remedy += f", or give --rate-hz {self.stream}=HZ"
+        self.problem(f"{what} (found {names}); {remedy}")
+
+    def _tell_open(self) -> None:
+        groups: dict[str, list[str]] = defaultdict(list)
+        for target, (_, _, said) in self.open.items():
+            if said:
+                groups[target.rpartition("_")[0] or target].append(target)
+        for stem, targets in groups.items():
+            names = [self.source.columns[self.open[t][0]].name for t in targets]
+            lead = "columns" if len(names) > 1 else "column"
+            self.problem(
+                f"the unit of {lead} {', '.join(names)} is not said, for {self.stream}.{stem}"
+            )
+        terms: Terms = {t: (self._likely(t, p, sign),) for t, (p, sign, _) in self.open.items()}
+        self.told.proposals += as_options(self.stream, self.source, terms)
+
+    def _likely(self, target: str, place: int, sign: float) -> Term:
+        dimension = STREAMS[self.stream][target]
+        stem = target.rpartition("_")[0]
+        places = [p for t, (p, _, _) in self.open.items() if t.rpartition("_")[0] == stem]
+        if dimension is Dimension.TIME:
+            unit = likely_time_unit(_sample(self.source, place, True))
+        else:
+            unit = likely_unit(dimension, _size(self.source, places or [place]))
+        return Term(place, unit, sign)
+
+    def _check_lengths(self) -> None:
+        lengths = self.source.lengths
+        found = {
+            lengths[term.place]: self.source.columns[term.place].name
+            for terms in self.terms.values()
+            for term in terms
+            if lengths
+        }
+        if len(found) > 1:
+            rows = ", ".join(f"{name} has {count} rows" for count, name in found.items())
+            self.problem(f"columns of {self.stream} are not of one length: {rows}; map others")
+
+
+def _sample(source: Source, place: int, as_written: bool) -> Raw:
+    """Return the first values of a column; none where they cannot be read."""
+    try:
+        part = next(source.read([place], {place} if as_written else ()), None)
+    except InputError:
+        part = None
+    return np.zeros(0) if part is None else part.columns[0]
+
+
+def _size(source: Source, places: Sequence[int]) -> Array:
+    """Return lengths of the vectors that columns make."""
+    samples = [np.asarray(_sample(source, place, False), dtype=np.float64) for place in places]
+    if len({len(sample) for sample in samples}) != 1:
+        return np.zeros(0)
+    return np.asarray(np.sqrt(np.sum(np.square(samples), axis=0)))

@@ -1,0 +1,72 @@
+"""A table of any format: named columns, read in parts."""
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+
+from magfusion.files.foreign.units import Raw
+from magfusion.units import IntArray
+
+ROWS = 1 << 17  # of a part
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table.
+
+    Parameters
+    ----------
+    name : str
+        As it stands in the file; its place, counted from 0, where it has none.
+    unit : str
+        That the file names outside of the name: in a row of units, or as an attribute.
+    """
+
+    name: str
+    unit: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Some rows: the columns that were asked for, in that order.
+
+    Parameters
+    ----------
+    rows : ndarray of int, shape (n,)
+        Places of the rows in the table, counted from 0 at the first row of data.
+    left_out : dict
+        Rows that could not be read, by the reason, since the part before.
+    """
+
+    columns: list[Raw]
+    rows: IntArray
+    left_out: dict[str, int] = field(default_factory=dict)
+
+
+Read = Callable[[Sequence[int], Collection[int]], Iterator[Part]]
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A table.
+
+    Parameters
+    ----------
+    place : str
+        What a refusal calls it.
+    read : callable
+        Takes the places of the columns to read and, of these, the ones that hold stamps and are
+        given as they are written; yields `Part`.
+    rate_hz : float, optional
+        That the format itself declares.
+    lengths : tuple of int
+        Rows of each column where they may differ, else empty.
+    form : str
+        How the table was understood, for the report.
+    """
+
+    place: str
+    columns: tuple[Column, ...]
+    read: Read
+    rate_hz: float | None = None
+    lengths: tuple[int, ...] = ()
+    form: str = ""

@@ -1,0 +1,281 @@
+"""Units as people write them, and stamps of any unit as whole nanoseconds."""
+
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from magfusion.units import (
+    DEGREE,
+    NANOSECOND,
+    STANDARD_GRAVITY,
+    AnyArray,
+    Array,
+    BoolArray,
+    IntArray,
+)
+
+ISO = "iso"
+MOST_EXACT = 1e14  # ns; a day, up to which a double resolves a hundredth of a nanosecond
+NO_STAMP = np.iinfo(np.int64).min
+Raw = Any  # an array of NumPy, or of Arrow
+
+
+class Dimension(StrEnum):
+    """What a column measures."""
+
+    TIME = "time"
+    RATE = "angular rate"
+    FORCE = "specific force"
+    FIELD = "field"
+    LENGTH = "length"
+    SPEED = "speed"
+    NUMBER = "number"
+
+
+UNITS: dict[Dimension, dict[str, float]] = {
+    Dimension.TIME: {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0},
+    Dimension.RATE: {
+        **{"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": DEGREE, "mdeg/s": 1e-3 * DEGREE},
+        **{"deg/h": DEGREE / 3600.0, "rpm": np.pi / 30.0},
+    },
+    Dimension.FORCE: {
+        **{"m/s^2": 1.0, "cm/s^2": 1e-2, "mm/s^2": 1e-3},
+        **{"g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY, "ug": 1e-6 * STANDARD_GRAVITY},
+    },
+    Dimension.FIELD: {
+        **{"T": 1.0, "mT": 1e-3, "uT": 1e-6, "nT": 1e-9, "pT": 1e-12},
+        **{"gauss": 1e-4, "mG": 1e-7, "uG": 1e-10},
+    },
+    Dimension.LENGTH: {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3, "ft": 0.3048},
+    Dimension.SPEED: {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6},
+    Dimension.NUMBER: {"1": 1.0},
+}
+# Other spellings, when case, spaces, dots and carets are left out.
+_SPELLINGS = {
+    Dimension.TIME: {
+        **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
+        **dict.fromkeys(("msec", "millis", "millisecond", "milliseconds"), "ms"),
+        **dict.fromkeys(("usec", "micros", "microsecond", "microseconds"), "us"),
+        **dict.fromkeys(("nsec", "nsecs", "nanos", "nanosec", "nanosecond", "nanoseconds"), "ns"),
+        **dict.fromkeys(("iso8601", "utc", "datetime", "date"), ISO),
+    },
+    Dimension.RATE: {
+        **dict.fromkeys(("rads", "radps", "rad_s", "rads-1", "radsec", "rad/sec"), "rad/s"),
+        **dict.fromkeys(("dps", "degs", "degps", "deg_s", "degs-1", "deg/sec"), "deg/s"),
+        **dict.fromkeys(("mdps", "mdegs"), "mdeg/s"),
+    },
+    Dimension.FORCE: {
+        **dict.fromkeys(("m/s2", "m/s/s", "mps2", "ms2", "m_s2", "m_s_2", "ms-2"), "m/s^2"),
+        **dict.fromkeys(("gee", "g0", "gs"), "g"),
+    },
+    Dimension.FIELD: {
+        **dict.fromkeys(("tesla",), "T"),
+        **dict.fromkeys(("millitesla",), "mT"),
+        **dict.fromkeys(("microtesla",), "uT"),
+        **dict.fromkeys(("nanotesla", "gamma"), "nT"),
+        **dict.fromkeys(("g", "gs"), "gauss"),
+        **dict.fromkeys(("mgauss", "milligauss"), "mG"),
+        **dict.fromkeys(("ugauss", "microgauss"), "uG"),
+    },
+    Dimension.LENGTH: {**dict.fromkeys(("meter", "metre", "meters", "metres"), "m")},
+    Dimension.SPEED: {**dict.fromkeys(("mps", "m_s", "ms", "ms-1", "m/sec"), "m/s")},
+    Dimension.NUMBER: {"": "1", "-": "1"},
+}
+_SCALED = re.compile(r"(?P<factor>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?)\*(?P<unit>.*)", re.I)
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit, perhaps with a factor before it: ``0.5*nT``.
+
+    Parameters
+    ----------
+    name : str
+        As in `UNITS`; `ISO` for stamps that are dates.
+    factor : str
+        As it was written, so that stamps can be scaled without rounding.
+    """
+
+    name: str
+    dimension: Dimension
+    factor: str = "1"
+
+    @property
+    def si(self) -> float:
+        """Size in SI units."""
+        return float(self.factor) * UNITS[self.dimension][self.name]
+
+    def __str__(self) -> str:
+        return self.name if self.factor == "1" else f"{self.factor}*{self.name}"
+
+
+def parse_unit(text: str, dimension: Dimension) -> Unit | None:
+    """Return the unit that a text names, or None."""
+    plain = text.strip().translate({0x00B5: "u", 0x03BC: "u", 0x00B2: "^2", 0x00B0: "deg"})
+    plain = (
+        plain.replace("_per_", "/")
+        .replace(" ", "")
+        .replace("degree", "deg")
+        .replace("degs/", "deg/")
+    )
+    scaled = _SCALED.fullmatch(plain)
+    factor, plain = (scaled["factor"], scaled["unit"]) if scaled else ("1", plain)
+    if float(factor) == 0.0:
+        return None
+    known = UNITS[dimension]
+    if plain in known:
+        return Unit(plain, dimension, factor)
+    folded = {name.casefold(): name for name in known}
+    short = plain.casefold().replace("^", "").replace("*", "").replace("·", "")
+    found = folded.get(plain.casefold()) or _SPELLINGS[dimension].get(short)
+    if dimension is Dimension.TIME and short == ISO:
+        found = ISO
+    return None if found is None else Unit(found, dimension, factor)
+
+
+def accepted(dimension: Dimension) -> str:
+    """Return the units of a dimension in words."""
+    names = [*UNITS[dimension], *([ISO] if dimension is Dimension.TIME else [])]
+    return f"{', '.join(names)}, or a factor before one of them, as 0.5*{next(iter(names))}"
+
+
+def to_nanoseconds(raw: Raw, unit: Unit) -> IntArray:
+    """Return stamps as whole nanoseconds, `NO_STAMP` where there is none.
+
+    Integers and decimal fractions are scaled without rounding on the way: a double resolves the
+    seconds since 1970 to a quarter of a microsecond.
+
+    Raises
+    ------
+    ValueError
+        With the text that is no stamp.
+    """
+    if unit.name == ISO:
+        return _dates(raw)
+    scale = Fraction(unit.factor) * _NANOSECONDS[unit.name]
+    if isinstance(raw, pa.Array | pa.ChunkedArray):
+        return _decimals(raw, scale)
+    values: AnyArray = np.asarray(raw)
+    if values.dtype.kind in "iu":
+        return _scaled_integers(values.astype(np.int64), scale)
+    return _scaled_floats(values.astype(np.float64), scale)
+
+
+_NANOSECONDS = {
+    "s": Fraction(10**9),
+    "ms": Fraction(10**6),
+    "us": Fraction(10**3),
+    "ns": Fraction(1),
+    "min": Fraction(60 * 10**9),
+    "h": Fraction(3600 * 10**9),
+}
+
+
+def _scaled_integers(values: IntArray, scale: Fraction) -> IntArray:
+    most = float(np.max(np.abs(values.astype(np.float64)), initial=0.0))
+    if most * scale.numerator < 2.0**62:
+        return np.asarray((values * scale.numerator + scale.denominator // 2) // scale.denominator)
+    return _rounded(values.astype(np.float64) * float(scale))
+
+
+def _scaled_floats(values: Array, scale: Fraction) -> IntArray:
+    whole = np.floor(values)
+    present = np.isfinite(values)
+    integers = np.where(present & (np.abs(whole) < 2.0**62), whole, 0.0).astype(np.int64)
+    far = ~(np.abs(values) * float(scale) < 2.0**62)
+    rest = np.where(present, values - whole, 0.0)
+    if scale.denominator != 1:
+        return np.where(far, NO_STAMP, _rounded(np.where(far, 0.0, values) * float(scale)))
+    stamps = _scaled_integers(np.where(far, 0, integers), scale)
+    return np.where(far, NO_STAMP, stamps + _rounded(rest * float(scale)))
+
+
+def _rounded(values: Array) -> IntArray:
+    return np.rint(values).astype(np.int64)
+
+
+def _decimals(raw: pa.Array, scale: Fraction) -> IntArray:
+    """Return decimal texts as stamps, their fractions apart where a double is too coarse."""
+    text = pc.utf8_trim_whitespace(raw)
+    text = pc.if_else(_missing(text), pa.scalar(None, pa.string()), text)
+    text = pc.replace_substring(text, ",", ".")
+    try:
+        values = pc.cast(text, pa.float64())
+    except pa.ArrowInvalid:
+        good = pc.match_substring_regex(text, r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+        bad = pc.filter(text, pc.invert(pc.fill_null(good, True)))
+        raise ValueError(bad[0].as_py() if len(bad) else "what is no number") from None
+    numbers = values.to_numpy(zero_copy_only=False)
+    present: BoolArray = np.isfinite(numbers)
+    if float(np.max(np.abs(numbers[present]), initial=0.0)) * float(scale) < MOST_EXACT:
+        return _scaled_floats(numbers, scale)
+    parts = pc.extract_regex(text, r"^(?P<whole>[-+]?\d+)(?P<rest>\.\d*)?$")
+    if parts.null_count > text.null_count:  # in exponents, or as .5
+        return _scaled_floats(numbers, scale)
+    whole = (
+        pc.cast(pc.struct_field(parts, "whole"), pa.int64())
+        .fill_null(0)
+        .to_numpy(zero_copy_only=False)
+    )
+    rest = pc.binary_join_element_wise("0", pc.struct_field(parts, "rest"), "")
+    rest = pc.cast(rest, pa.float64()).fill_null(0.0).to_numpy(zero_copy_only=False)
+    stamps = _scaled_integers(whole, scale)
+    stamps = stamps + np.where(numbers < 0.0, -1, 1) * _rounded(rest * float(scale))
+    return np.where(present, stamps, NO_STAMP)
+
+
+def _dates(raw: Raw) -> IntArray:
+    if not isinstance(raw, pa.Array | pa.ChunkedArray):
+        dates: AnyArray = np.asarray(raw)
+        if not np.issubdtype(dates.dtype, np.datetime64):
+            raise ValueError(str(dates[0]) if len(dates) else "a number")
+        ticks = dates.astype("datetime64[ns]").astype(np.int64)
+        return np.where(np.isnat(dates), NO_STAMP, ticks)
+    if pa.types.is_timestamp(raw.type):
+        return _of_timestamps(pc.cast(raw, pa.timestamp("ns", raw.type.tz), safe=False))
+    text = pc.utf8_trim_whitespace(raw)
+    text = pc.if_else(_missing(text), pa.scalar(None, pa.string()), text)
+    text = pc.replace_substring(text, ",", ".")
+    for zone in (None, "UTC"):
+        try:
+            return _of_timestamps(pc.cast(text, pa.timestamp("ns", zone)))
+        except pa.ArrowInvalid as error:
+            found = re.search(r"'(.*)' as a scalar", str(error))
+    raise ValueError(found[1] if found else "what is no date")
+
+
+def _of_timestamps(stamps: pa.Array) -> IntArray:
+    return np.asarray(
+        pc.cast(stamps, pa.int64()).fill_null(NO_STAMP).to_numpy(zero_copy_only=False)
+    )
+
+
+MISSING = ("", "nan", "NaN", "NAN", "na", "NA", "N/A", "n/a", "null", "NULL", "None", "none", "-")
+
+
+def _missing(text: pa.Array) -> pa.Array:
+    return pc.is_in(text, value_set=pa.array(MISSING))
+
+
+def seconds_apart(stamps: IntArray) -> float:
+    """Return the median step of stamps (s), NaN of fewer than two."""
+    known = stamps[stamps != NO_STAMP]
+    steps = np.diff(known)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) * NANOSECOND if len(steps) else float("nan")
+
+
+def is_date(raw: Raw) -> bool:
+    """Return whether stamps are dates."""
+    if isinstance(raw, pa.Array | pa.ChunkedArray) and not pa.types.is_string(raw.type):
+        return bool(pa.types.is_timestamp(raw.type))
+    if not isinstance(raw, pa.Array | pa.ChunkedArray):
+        return np.issubdtype(np.asarray(raw).dtype, np.datetime64)
+    known = raw.drop_null()
+    return len(known) > 0 and re.match(r"\s*\d{4}-\d\d-\d\d[T ]", known[0].as_py()) is not None

@@ -1,0 +1,83 @@
+"""Messages of ROS, 1 and 2, as rows of numbers."""
+
+from collections.abc import Callable
+from typing import Any
+
+from magfusion.errors import InputError
+
+IMU = "sensor_msgs/msg/Imu"
+FIELD = "sensor_msgs/msg/MagneticField"
+ODOMETRY = "nav_msgs/msg/Odometry"
+POSE = "geometry_msgs/msg/PoseStamped"
+USUAL = (IMU, FIELD, ODOMETRY, POSE)  # taken before others that play the same role
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+# ROS 1 had it in a package of its own before.
+FORMER_TRANSFORMS = "tf/msg/tfMessage"
+
+Row = Callable[[Any], list[float]]
+
+
+def _vector(value: Any) -> list[float]:
+    return [value.x, value.y, value.z]
+
+
+def _imu_row(message: Any) -> list[float]:
+    return _vector(message.angular_velocity) + _vector(message.linear_acceleration)
+
+
+def _field_row(message: Any) -> list[float]:
+    return _vector(message.magnetic_field)
+
+
+def _pose(pose: Any) -> list[float]:
+    return [*_vector(pose.position), *_vector(pose.orientation), pose.orientation.w]
+
+
+def _pose_row(message: Any) -> list[float]:
+    return _pose(message.pose)
+
+
+def _sure_pose_row(message: Any) -> list[float]:
+    return _pose(message.pose.pose)
+
+
+def _odometry_row(message: Any) -> list[float]:
+    return _pose(message.pose.pose) + _vector(message.twist.twist.linear)
+
+
+def transform_row(message: Any) -> list[float]:
+    """Return translation and quaternion, x first, of a stamped transform."""
+    turn = message.transform.rotation
+    return [*_vector(message.transform.translation), *_vector(turn), turn.w]
+
+
+# By role and type: a pose's quaternion has x first; of an odometry the velocity follows, in body
+# axes.
+ROWS: dict[str, dict[str, Row]] = {
+    "imu": {IMU: _imu_row},
+    "magnetometer": {FIELD: _field_row},
+    "truth": {
+        ODOMETRY: _odometry_row,
+        POSE: _pose_row,
+        "geometry_msgs/msg/PoseWithCovarianceStamped": _sure_pose_row,
+        "geometry_msgs/msg/TransformStamped": transform_row,
+    },
+}
+
+
+def stamp_ns(header: Any) -> int:
+    """Return the stamp of a header (ns)."""
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def refuse_absent(message: Any, place: str) -> None:
+    """Refuse what the publisher marked as not measured (sensor_msgs/Imu: covariance of -1).
+
+    Raises
+    ------
+    InputError
+    """
+    for part in ("angular_velocity", "linear_acceleration"):
+        cov = getattr(message, f"{part}_covariance", None)
+        if cov is not None and cov[0] == -1.0:
+            raise InputError(f"{place}: {part} is marked as not measured; record a full IMU.")

@@ -1,0 +1,270 @@
+"""The job that imports recordings of any names and units: a log, with the verdict of its check."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from magfusion.errors import InputError, InputErrors
+from magfusion.jobs.settings import Command, Settings, option
+from magfusion.model.progress import Report, quiet
+from magfusion.results.figures import Figure, Figures, Section, heading
+
+if TYPE_CHECKING:
+    from magfusion.files.foreign.convert import Counts
+    from magfusion.files.foreign.gather import Gathered
+    from magfusion.files.foreign.plan import Findings, Plan
+
+FIRST = "first"
+LATE = 1e8  # s; stamps that count from 1970, or from another day
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportSettings(Settings):
+    """Which files become which streams of a log."""
+
+    sources: tuple[str, ...] = option(
+        (), "Bag, EuRoC folder, tables, or a directory of tables", positional=True
+    )
+    imu: Path | None = option(
+        None,
+        "Table of the inertial sensor",
+        note="csv, tsv, txt, parquet, npy, npz, wav, mat, h5; one table may be given for several",
+        metavar="FILE",
+    )
+    magnetometer: Path | None = option(None, "Table of the magnetometer", metavar="FILE")
+    truth: Path | None = option(None, "Table of true poses, or a TUM file", metavar="FILE")
+    map: tuple[str, ...] = option(
+        (),
+        "Which column of the file is which of the log, in which unit",
+        note="e.g. 'imu.gyro_x=-GyrY[deg/s]', 'truth.quaternion=qx,qy,qz,qw[xyzw]'; columns"
+        " without names are counted from 0; of a bag e.g. imu=/imu/data, magnetometer=/mag[uT],"
+        " truth=/tf:map->base_link",
+        metavar="TABLE.COLUMN=NAME[UNIT]",
+    )
+    map_file: Path | None = option(
+        None,
+        "YAML file with map: {TABLE.COLUMN: NAME[UNIT]}, imu, magnetometer, ...",
+        metavar="FILE",
+    )
+    rate_hz: tuple[str, ...] = option(
+        (),
+        "Rate of a table without times, from its first row at 0 s or at SECONDS",
+        metavar="TABLE=HZ[@SECONDS]",
+    )
+    delimiter: str | None = option(
+        None,
+        "Character between cells, or comma, semicolon, tab, pipe, space",
+        note="default: found",
+    )
+    epoch: str | None = option(
+        None,
+        "Zero of the log clock, to which drive phases refer: a stamp in ns, first (the first"
+        " inertial sample), or a bag's topic (its first message)",
+        note="default: 0 of the file's own clock, of bags and EuRoC folders first",
+        metavar="NS|TOPIC|first",
+    )
+    site: Path | None = option(None, "Site file to check the log against")
+
+
+def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -> Figures:
+    """Import a recording: a log in ``output``, and what its check says.
+
+    Raises
+    ------
+    InputError
+        With every problem that was found, and options that would decide what is undecided.
+    """
+    from magfusion.files.foreign.convert import write_stream
+    from magfusion.files.foreign.gather import gather
+    from magfusion.files.foreign.map_file import asked
+    from magfusion.files.foreign.plan import Findings
+    from magfusion.jobs.inputs import claim
+    from magfusion.results.report import write_report
+
+    claimed, told = claim(output, "import"), Findings()
+    if settings.site is not None and not settings.site.is_file():
+        told.problems.append(f"{settings.site}: there is no such file; give the path of a site.")
+    files = {"imu": settings.imu, "magnetometer": settings.magnetometer, "truth": settings.truth}
+    if not settings.sources and not any(files.values()) and settings.map_file is None:
+        raise InputError(
+            "nothing to import; give a bag, a folder or tables, or --imu FILE --magnetometer FILE"
+        )
+    wanted = asked(
+        files,
+        settings.map,
+        settings.rate_hz,
+        settings.delimiter,
+        settings.epoch,
+        settings.map_file,
+        told,
+    )
+    found = gather([Path(source) for source in settings.sources], wanted, told)
+    epoch = _epoch(wanted.epoch, found)
+    _refuse(told)
+    with claimed as directory:
+        counts: dict[str, Counts] = {}
+        for k, (stream, plan) in enumerate(found.plans.items()):
+            report(f"importing {stream}", k, len(found.plans) + 1)
+            try:
+                counts[stream] = write_stream(plan, directory / f"{stream}.parquet")
+            except InputError as error:
+                told.problems.append(str(error))
+        _refuse_apart(counts, told)
+        _refuse(told)
+        epoch_ns = counts["imu"].first if epoch == FIRST else int(epoch)
+        _write_header(directory, output, found, epoch_ns)
+        report("checking", len(found.plans), len(found.plans) + 1)
+        figures = _checked(directory, output, found, settings.site)
+        figures = heading("import", output.resolve().name) | figures
+        figures |= _figures(found, counts, epoch_ns, epoch == FIRST)
+        write_report(directory, figures)
+    return figures
+
+
+def _refuse(told: Findings) -> None:
+    """Tell all problems at once, and what would decide them."""
+    problems = list(dict.fromkeys(told.problems))
+    if not problems:
+        return
+    if len(problems) == 1 and not told.proposals:
+        raise InputError(problems[0])
+    count = "1 problem" if len(problems) == 1 else f"{len(problems)} problems"
+    lines = [f"nothing was imported, for {count}:", *(f"  {one}" for one in problems)]
+    if told.guessed:
+        lines += ["recognised by name and unit, and used as they are:"]
+        lines += [f"  --map {_quoted(one)}" for one in dict.fromkeys(told.guessed)]
+    if told.proposals:
+        proposals = list(dict.fromkeys(told.proposals))
+        lines += ["proposed by name and size; check it, and add it to the command:"]
+        lines += [f"  --map {_quoted(one)} \\" for one in proposals[:-1]]
+        lines += [f"  --map {_quoted(proposals[-1])}"]
+    raise InputErrors(*lines)
+
+
+def _quoted(text: str) -> str:
+    import shlex
+
+    return shlex.quote(text)
+
+
+def _epoch(text: str | None, found: Gathered) -> str | int:
+    """Return the epoch (ns), or `FIRST`."""
+    if text is None:
+        return FIRST if found.stamped else 0
+    if text == FIRST:
+        return FIRST
+    try:
+        return int(text)
+    except ValueError:
+        pass
+    if not found.bags:
+        found.told.problems.append(
+            f"--epoch {text!r}: write a stamp in ns, or first; a topic is of a bag."
+        )
+        return 0
+    from magfusion.files.foreign.bag_table import first_stamp
+
+    try:
+        return first_stamp(found.bags[0], text)
+    except InputError as error:
+        found.told.problems.append(str(error))
+        return 0
+
+
+def _refuse_apart(counts: dict[str, Counts], told: Findings) -> None:
+    """Refuse streams whose times have no moment in common: they are of different clocks."""
+    from magfusion.units import NANOSECOND
+
+    if not {"imu", "magnetometer"} <= set(counts):
+        return
+    for name in set(counts) - {"imu"}:
+        one, other = counts["imu"], counts[name]
+        if one.last < other.first or other.last < one.first:
+            spans = [
+                f"{stream} {c.first * NANOSECOND:.9g} to {c.last * NANOSECOND:.9g} s"
+                for stream, c in (("imu", one), (name, other))
+            ]
+            told.problems.append(
+                f"the times of imu and {name} have no moment in common ({', '.join(spans)}): bring"
+                " them to one clock, by the unit of a time or --rate-hz TABLE=HZ@SECONDS."
+            )
+
+
+def _write_header(directory: Path, output: Path, found: Gathered, epoch_ns: int) -> None:
+    from magfusion.files.log import HEADER
+    from magfusion.files.yaml_files import write_yaml
+
+    source = "imported: " + ", ".join(
+        dict.fromkeys(plan.source.place for plan in found.plans.values())
+    )
+    header = {"magfusion_log": 1, "name": output.resolve().name, "epoch_ns": epoch_ns}
+    write_yaml(header | {"source": source}, directory / HEADER)
+
+
+def _checked(directory: Path, output: Path, found: Gathered, site: Path | None) -> Figures:
+    """Return what the check of the log says, of which no reader knows the unfinished name."""
+    from magfusion.jobs.check import CheckSettings, run_check
+
+    try:
+        figures = run_check(CheckSettings(log=directory, site=site))
+    except InputError as error:
+        sentence = str(error)
+        for stream, plan in found.plans.items():
+            sentence = sentence.replace(str(directory / f"{stream}.parquet"), _place(plan))
+        raise InputError(sentence.replace(str(directory), str(output))) from error
+    return Figures(*(f for f in figures.all if f.section is not Section.TITLE))
+
+
+def _place(plan: Plan) -> str:
+    return f"{plan.source.place} as {plan.stream} by {', '.join(plan.options())}"
+
+
+def _figures(found: Gathered, counts: dict[str, Counts], epoch_ns: int, is_first: bool) -> Figures:
+    """Return what was read, what was left out, and what was understood."""
+    figures = Figures(
+        Figure("epoch_ns", epoch_ns, "ns", label="epoch" + (", first sample" * is_first))
+    )
+    for stream, one in counts.items():
+        figures |= Figures(
+            Figure(f"{stream}_rows_read", one.read, label=f"{stream}, rows read"),
+            Figure(f"{stream}_rows_written", one.written, section=Section.REPORT),
+            *_where_some(stream, "missing", one.missing, "missing samples, kept as NaN"),
+            *_where_some(stream, "unsorted", one.unsorted, "put in order of time"),
+            *(
+                Figure(
+                    f"{stream}_dropped_{reason.replace(' ', '_')}",
+                    count,
+                    label=f"{stream}, rows left out {reason}",
+                )
+                for reason, count in one.left_out.items()
+            ),
+        )
+    lines = [f"--map {_quoted(line)}" for plan in found.plans.values() for line in plan.options()]
+    forms = {p.source.place: p.source.form for p in found.plans.values() if p.source.form}
+    lines = [f"{place}: {form}" for place, form in forms.items()] + lines
+    figures |= Figures(Figure("map", lines, section=Section.REMARKS))
+    if not is_first and abs(counts["imu"].first - epoch_ns) * 1e-9 > LATE:
+        begin = (counts["imu"].first - epoch_ns) * 1e-9
+        text = (
+            f"The log begins {begin:.9g} s after its epoch, to which the drive phases refer; if"
+            " they refer to its first sample, import it with --epoch first."
+        )
+        figures |= Figures(Figure("notes", [text], section=Section.NOTES))
+    return figures
+
+
+def _where_some(stream: str, key: str, count: int, words: str) -> list[Figure]:
+    section = Section.SUMMARY if count else Section.REPORT
+    return [Figure(f"{stream}_{key}", count, section=section, label=f"{stream}, {words}")]
+
+
+COMMAND = Command(
+    ImportSettings,
+    run_import,
+    output_required=True,
+    fails=False,
+    example="magfusion import --imu imu.csv --magnetometer mag.csv --map 'imu.time=t[ms]'"
+    " --map 'imu.gyro=GyrX,GyrY,GyrZ[deg/s]' --map 'imu.accel=AccX,AccY,AccZ[g]' -o log",
+)
