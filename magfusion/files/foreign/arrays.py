@@ -67,7 +67,8 @@ def _turned_rows(array: Any, begin: int, end: int) -> AnyArray:
 
 
 def _numeric(dtype: np.dtype[Any]) -> bool:
-    return np.issubdtype(dtype, np.number) or np.issubdtype(dtype, np.datetime64)
+    kinds = (np.integer, np.floating, np.datetime64)
+    return any(np.issubdtype(dtype, kind) for kind in kinds)
 
 
 def _part(name: str) -> Callable[[AnyArray], AnyArray]:

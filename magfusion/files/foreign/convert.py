@@ -133,7 +133,7 @@ def _kept(
     counts.read += len(stamps)
     keep: BoolArray = stamps != NO_STAMP
     counts.leave_out("without a time", int(np.sum(~keep)))
-    missing: BoolArray = np.isnan(values).any(axis=1)
+    missing: BoolArray = np.asarray(np.isnan(values).any(axis=1))
     if plan.stream == "truth":
         # A truth has no use for rows that hold no pose; a stream of samples knows that one is lost.
         counts.leave_out("without a pose", int(np.sum(keep & missing)))

@@ -188,7 +188,8 @@ def _euroc_tables(path: Path) -> Iterator[tuple[str, Path]]:
 
 
 def _add_euroc(path: Path, wanted: Asked, found: Gathered) -> set[str]:
-    streams, found.stamped = set(), True
+    streams: set[str] = set()
+    found.stamped = True
     for stream, table in _euroc_tables(path):
         streams.add(stream)
         if stream in wanted.files or (source := _opened(table, wanted, found)) is None:
@@ -200,9 +201,9 @@ def _add_euroc(path: Path, wanted: Asked, found: Gathered) -> set[str]:
         entries, rate = wanted.entries.get(stream, ()), wanted.rates.get(stream)
         found.add(plan_stream(stream, source, entries, rate, found.told, usual))
     if "magnetometer" not in streams | set(wanted.files):
-        names = ", ".join(sorted(entry.name for entry in (path / "mav0").iterdir()))
+        folders = ", ".join(sorted(entry.name for entry in (path / "mav0").iterdir()))
         found.told.problems.append(
-            f"{path}: mav0 holds no folder of a magnetometer (found {names}); call it mag0, or"
+            f"{path}: mav0 holds no folder of a magnetometer (found {folders}); call it mag0, or"
             " give --magnetometer FILE."
         )
     return streams | {"imu", "magnetometer"}

@@ -192,8 +192,8 @@ def _scaled_floats(values: Array, scale: Fraction) -> IntArray:
     rest = np.where(present, values - whole, 0.0)
     if scale.denominator != 1:
         return np.where(far, NO_STAMP, _rounded(np.where(far, 0.0, values) * float(scale)))
-    stamps = _scaled_integers(np.where(far, 0, integers), scale)
-    return np.where(far, NO_STAMP, stamps + _rounded(rest * float(scale)))
+    exact = _scaled_integers(np.where(far, 0, integers), scale)
+    return np.where(far, NO_STAMP, exact + _rounded(rest * float(scale)))
 
 
 def _rounded(values: Array) -> IntArray:
@@ -225,8 +225,8 @@ def _decimals(raw: pa.Array, scale: Fraction) -> IntArray:
     )
     rest = pc.binary_join_element_wise("0", pc.struct_field(parts, "rest"), "")
     rest = pc.cast(rest, pa.float64()).fill_null(0.0).to_numpy(zero_copy_only=False)
-    stamps = _scaled_integers(whole, scale)
-    stamps = stamps + np.where(numbers < 0.0, -1, 1) * _rounded(rest * float(scale))
+    sign = np.where(np.signbit(numbers), -1, 1)
+    stamps = _scaled_integers(whole, scale) + sign * _rounded(rest * float(scale))
     return np.where(present, stamps, NO_STAMP)
 
 
