@@ -292,6 +292,35 @@ def test_a_saturated_stretch_drops_the_windows_that_hold_it(axis, sign):
     check_drop(kept, full, reasons, spoilt, "magnetometer saturated")
 
 
+def test_held_samples_are_no_saturation():
+    """A magnetometer that is read twice as fast as it measures, and one with coarse steps."""
+    waveform = ordinary()
+    held = waveform.measured_sensor.copy()
+    again = np.random.default_rng(5).random(len(held)) < 0.4
+    for k in np.flatnonzero(again[1:]) + 1:
+        held[k] = held[k - 1]
+    coarse = 1e-6 * np.round(waveform.measured_sensor / 1e-6)
+    for measured in (held, coarse):
+        kept, full, reasons = drops(replace(waveform, measured_sensor=measured), still_imu(8.0))
+        assert reasons == {}
+        assert len(kept) == len(full)
+
+
+def test_noise_that_held_samples_hide_is_not_taken_for_none():
+    """Quantised, held, and with hardly more samples than columns: covariances stay definite."""
+    site, waveform = demo_site(), ordinary()
+    settings = replace(WINDOW, window=0.1, step=0.05, noise_windows=1)
+    few = replace(site, beacons=site.beacons[:1])
+    measured = 1e-6 * np.round(waveform.measured_sensor[::4] / 1e-6)
+    measured[1::2] = measured[::2]
+    slow = Waveform(waveform.time[::4], measured)
+    fields = received(slow, still_imu(8.0), few, settings)
+    least = np.linalg.eigvalsh(fields.phasor_cov)[..., 0]
+    assert np.min(least) > 0.0
+    with pytest.raises(InputError, match="longer window"):
+        received(slow, still_imu(8.0), few, replace(settings, window=0.05))
+
+
 def test_a_single_extreme_sample_is_no_saturation():
     waveform = ordinary()
     measured = waveform.measured_sensor.copy()
@@ -468,7 +497,7 @@ def test_an_imu_that_hardly_spoke_is_refused(count):
 def test_a_log_that_is_spoilt_throughout_is_refused_with_the_reasons():
     waveform = ordinary()
     still = replace(waveform, measured_sensor=np.zeros_like(waveform.measured_sensor))
-    with pytest.raises(InputError, match="magnetometer saturated: 39") as caught:
+    with pytest.raises(InputError, match="magnetometer stands still: 39") as caught:
         choose_windows(still, still_imu(8.0), demo_site(), WINDOW)
     assert is_one_sentence(str(caught.value))
 

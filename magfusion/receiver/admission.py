@@ -11,18 +11,19 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.model.samples import Waveform
+from magfusion.receiver.range_ends import RangeEnds, saturated, still
 from magfusion.units import Array, BoolArray, IntArray
 
 MAGNETOMETER_GAP = "gap in the magnetometer stream"
 TOO_FEW = "too few samples"
+STILL = "magnetometer stands still"
 SATURATED = "magnetometer saturated"
 NO_INERTIAL = "no inertial data"
 INERTIAL_GAP = "gap in the inertial stream"
-REASONS = (MAGNETOMETER_GAP, TOO_FEW, SATURATED, NO_INERTIAL, INERTIAL_GAP)
+REASONS = (MAGNETOMETER_GAP, TOO_FEW, STILL, SATURATED, NO_INERTIAL, INERTIAL_GAP)
 
 MOST_GROWTH = 4.0  # of the variance of a phasor, by missing samples
 LONGEST_GAP = 0.02  # s; of inertial samples: the motion between is a straight line
-SATURATED_RUN = 3  # consecutive samples at the extreme of all until then
 ROUNDING = 1e-6  # of a step; what arithmetic may take from a window
 
 
@@ -145,8 +146,8 @@ class Admission:
         Whether a constant extreme is saturation.
     least_share : float
         Of the samples that a window should hold.
-    extremes : ndarray, shape (2, 3)
-        Least and largest value so far (T).
+    ends : tuple of RangeEnds
+        What is known of each axis's range so far.
     """
 
     magnetometer_step: float
@@ -155,7 +156,7 @@ class Admission:
     imu_margin: float
     clips: bool
     least_share: float
-    extremes: Array = field(default_factory=lambda: np.array([[np.inf] * 3, [-np.inf] * 3]))
+    ends: tuple[RangeEnds, ...] = field(default_factory=lambda: tuple(RangeEnds() for _ in "xyz"))
 
     def verdicts(
         self, grid: Grid, windows: Windows, waveform: Waveform, imu_time: Array, growth: Growth
@@ -192,35 +193,15 @@ class Admission:
         drop(MAGNETOMETER_GAP, lacking)
         drop(TOO_FEW, few)
         if self.clips:
-            drop(SATURATED, self._saturated(waveform.measured_sensor, windows))
+            last = windows.first + windows.count
+            drop(STILL, still(waveform, windows.first, last))
+            drop(SATURATED, saturated(waveform, windows.first, last, self.ends))
         drop(NO_INERTIAL, begin < self.imu_begin - self.imu_margin)
         gap = np.flatnonzero(np.diff(imu_time) > max(3.0 * self.imu_step, LONGEST_GAP))
         silent = np.append(imu_time[gap], imu_time[-1:] + self.imu_margin)
         spoken = np.append(imu_time[gap + 1], np.inf)
         drop(INERTIAL_GAP, _meets(silent, spoken, begin, end - 0.6 * step))
         return found
-
-    def _saturated(self, measured: Array, windows: Windows) -> BoolArray:
-        """Return in which windows an axis stays at the extreme of all its values until then."""
-        first, last = windows.first, windows.first + windows.count
-        spoilt = np.zeros(len(windows), dtype=bool)
-        long = np.flatnonzero(windows.count >= SATURATED_RUN)
-        if len(long) == 0:
-            return spoilt
-        for row, sign in enumerate((-1.0, 1.0)):
-            for axis in range(3):
-                value = sign * measured[: np.max(last), axis]
-                extreme = np.maximum.accumulate(value)
-                level = np.maximum(extreme[last[long] - 1], sign * self.extremes[row, axis])
-                same = value[1:] == value[:-1]
-                run = np.flatnonzero(same[1:] & same[:-1] & (value[2:] == extreme[2:]))
-                # The extreme only grows: of the runs in a window the last is the farthest out.
-                latest = np.searchsorted(run, last[long] - SATURATED_RUN, side="right") - 1
-                at = run[np.maximum(latest, 0)] if len(run) else np.zeros(len(long), dtype=int)
-                inside = (latest >= 0) & (at >= first[long])
-                spoilt[long] |= inside & (value[at] == level)
-                self.extremes[row, axis] = sign * max(extreme[-1], sign * self.extremes[row, axis])
-        return spoilt
 
 
 def _meets(begin: Array, end: Array, window_begin: Array, window_end: Array) -> BoolArray:

@@ -15,7 +15,12 @@ import numpy as np
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.admission import Windows, sample_rate_hz
-from magfusion.receiver.noise import FittedWindows, noise_beside_tones, smoothed_over_windows
+from magfusion.receiver.noise import (
+    FittedWindows,
+    noise_beside_tones,
+    not_below,
+    smoothed_over_windows,
+)
 from magfusion.receiver.turn import on_clock, turn_of
 from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
@@ -41,6 +46,8 @@ class WindowOperator:
         Takes each sample to axes that do not turn with the body.
     measured_from_still : ndarray, shape (windows, 3, 3)
         Takes the fields back at the centre of each window.
+    declared_noise : float
+        Of a sample, one sigma (T).
     """
 
     settings: LockinSettings
@@ -51,6 +58,7 @@ class WindowOperator:
     windows: Windows
     still_from_measured: Array
     measured_from_still: Array
+    declared_noise: float
 
     def apply(self, measured_sensor: Array) -> ComplexArray:
         """Return the phasors of a waveform given at the same sample times.
@@ -97,6 +105,7 @@ class WindowOperator:
         )
         centre, settings = self.windows.centre, self.settings
         smooth = smoothed_over_windows(noise, centre, settings.step, settings.noise_windows)
+        smooth = not_below(smooth, self.declared_noise)
         samples = FieldSamples(
             time=centre,
             window=np.full(len(centre), settings.window),
@@ -159,17 +168,18 @@ def window_operator(
     windows : Windows
         That were admitted.
     """
-    frequencies = channel_frequencies_hz(site)
+    frequencies, nyquist_hz = channel_frequencies_hz(site), sample_rate_hz(waveform) / 2.0
     measured_from_still = turn_of(imu, site)
     return WindowOperator(
         settings=settings,
         channels=site.channels,
         frequencies_hz=frequencies,
-        nuisance_hz=_nuisances_hz(settings, frequencies, sample_rate_hz(waveform) / 2.0),
+        nuisance_hz=_nuisances_hz(settings, frequencies, nyquist_hz),
         time=waveform.time,
         windows=windows,
         still_from_measured=np.asarray(np.linalg.inv(measured_from_still(waveform.time))),
         measured_from_still=measured_from_still(windows.centre),
+        declared_noise=site.platform.magnetometer.noise_density * float(np.sqrt(nyquist_hz)),
     )
 
 
@@ -202,6 +212,24 @@ def unexplained(log: Log, site: Site, settings: LockinSettings) -> Array:
     return operator.unexplained(waveform.measured_sensor - site.platform.magnetometer.offset)
 
 
+def separable(step: float, settings: LockinSettings, frequencies_hz: Array) -> bool:
+    """Return whether the samples of a whole window, ``step`` apart (s), tell its columns apart."""
+    elapsed = _whole_window(step, settings)
+    design = _design(
+        elapsed,
+        settings.window,
+        frequencies_hz,
+        _nuisances_hz(settings, frequencies_hz, 0.5 / step),
+    )[0]
+    enough = design.shape[0] > design.shape[1]
+    return enough and bool(np.linalg.cond(design.T @ design) < WORST_CONDITION)
+
+
+def _whole_window(step: float, settings: LockinSettings) -> Array:
+    """Return the times of a whole window's samples from its centre, shape (1, samples) (s)."""
+    return np.arange(-0.5 * settings.window + 0.5 * step, 0.5 * settings.window, step)[None]
+
+
 def variance_growth(
     windows: Windows, time: Array, step: float, settings: LockinSettings, frequencies_hz: Array
 ) -> Array:
@@ -226,7 +254,7 @@ def variance_growth(
         own = np.diagonal(np.linalg.inv(normal), axis1=-2, axis2=-1)
         return np.where(good[:, None], own[:, 2 : 2 + 2 * len(frequencies_hz)], np.inf)
 
-    whole = np.arange(-0.5 * settings.window + 0.5 * step, 0.5 * settings.window, step)[None]
+    whole = _whole_window(step, settings)
     usual, out = variance(whole, np.ones_like(whole, dtype=bool)), []
     for begin in range(0, len(windows), CHUNK):
         _, weight, elapsed = _padded(windows.rows(slice(begin, begin + CHUNK)), time)

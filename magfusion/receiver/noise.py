@@ -6,6 +6,10 @@ import numpy as np
 
 from magfusion.units import Array, BoolArray
 
+LEFT = 1e-6  # of what probes are, from which what the design left of them counts
+LEAST_SHARE = 0.1  # of the declared noise; held and coarse samples may show none
+LEAST_NOISE = 1e-18  # T; rounding of the Earth's field
+
 
 class FittedWindows(NamedTuple):
     """A design fitted to the samples of n windows, padded to m samples each.
@@ -48,7 +52,8 @@ def noise_beside_tones(frequencies_hz: Array, nuisance_hz: Array, fit: FittedWin
     """Return the covariance per sample of the noise around each tone, in the axes of the fit.
 
     Probe tones are fitted to what the design leaves of the window; the power in them, divided by
-    what the design left of the probes themselves, is unbiased for white noise.
+    what the design left of the probes themselves, is unbiased for white noise.  A short window
+    leaves fewer directions than there are axes: what it says nothing of is taken for as noisy.
 
     Parameters
     ----------
@@ -71,9 +76,33 @@ def noise_beside_tones(frequencies_hz: Array, nuisance_hz: Array, fit: FittedWin
         across, removed = np.swapaxes(probe, -1, -2), np.swapaxes(mixed, -1, -2)
         left = across @ probe - removed @ fit.inverse @ mixed
         power = across @ fit.field - removed @ fit.coefficients
-        degrees = probe.shape[-1]
-        noise[:, tone] = np.swapaxes(power, -1, -2) @ np.linalg.solve(left, power) / degrees
+        value, vector = np.linalg.eigh(left)
+        told = value > LEFT * np.trace(across @ probe, axis1=-2, axis2=-1)[:, None]
+        seen = (
+            np.swapaxes(vector, -1, -2) @ power / np.sqrt(np.where(told, value, np.inf))[..., None]
+        )
+        degrees = np.maximum(np.sum(told, axis=-1), 1)[:, None, None]
+        own = np.swapaxes(seen, -1, -2) @ seen / degrees
+        unseen = (1.0 - degrees / probe.shape[-1]) * np.trace(own, axis1=-2, axis2=-1)[
+            :, None, None
+        ]
+        noise[:, tone] = own + unseen / 3.0 * np.eye(3)
     return noise
+
+
+def not_below(noise_cov: Array, sigma: float) -> Array:
+    """Return noise of which no direction has less than a share of the declared (T), shape as given.
+
+    Held and coarsely quantised samples may be the same all through a window.
+    """
+    least = max(LEAST_SHARE * sigma, LEAST_NOISE) ** 2
+    value, vector = np.linalg.eigh(noise_cov)
+    low = value[..., 0] < least
+    if not np.any(low):
+        return noise_cov
+    value = np.maximum(value, least)
+    raised = vector * value[..., None, :] @ np.swapaxes(vector, -1, -2)
+    return np.where(low[..., None, None], raised, noise_cov)
 
 
 def smoothed_over_windows(noise_cov: Array, centre: Array, step: float, windows: int) -> Array:

@@ -22,7 +22,7 @@ from magfusion.receiver.admission import (
     sample_rate_hz,
     usual_step,
 )
-from magfusion.receiver.lockin import variance_growth, window_operator
+from magfusion.receiver.lockin import separable, variance_growth, window_operator
 from magfusion.receiver.slots import (
     SlotSettings,
     check_carriers,
@@ -294,13 +294,20 @@ class LockinReceiver(Receiver):
     def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
         """Lay windows from the first sample on, as `Receiver.begin`."""
         rate_hz = sample_rate_hz(waveform)
-        highest = float(np.max(channel_frequencies_hz(self.site)))
+        frequencies = channel_frequencies_hz(self.site)
+        highest = float(np.max(frequencies))
         if highest > 0.45 * rate_hz:
             raise InputError(
                 f"magnetometer: sampled at {rate_hz:.4g} Hz, too slow for the tone at {highest:g}"
                 f" Hz; at least {highest / 0.45:.4g} Hz are needed"
             )
         window = self.settings.window
+        if not separable(1.0 / rate_hz, self.settings, frequencies):
+            raise InputError(
+                f"magnetometer: {window * rate_hz:.3g} samples in a window of {window:.3g} s are"
+                " too few to tell tones, drift and steady field apart; choose a longer"
+                f" window (--window), or sample faster than at {rate_hz:.4g} Hz"
+            )
         grid = Grid(
             centre=float(waveform.time[0]) - 0.5 / rate_hz + window / 2.0,
             step=self.settings.step,

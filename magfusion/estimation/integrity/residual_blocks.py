@@ -220,7 +220,7 @@ def _memory(case: Case) -> float:
     flat = by_pose.reshape(len(by_pose), -1, 6)
     information = np.swapaxes(flat, 1, 2) @ flat
     share = np.einsum("nij,nji->n", information, case.pose_cov[fields.epoch]) / 6.0
-    return float(max(1.0, 1.0 / np.median(share)))
+    return float(1.0 / np.clip(np.median(share), 1.0 / len(share), 1.0))
 
 
 def _persistence(residual: Array) -> float:
