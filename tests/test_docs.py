@@ -1,0 +1,59 @@
+"""What the documentation says is there, is all, and happens."""
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from page_blocks import blocks, run_blocks
+
+import magfusion
+from magfusion.jobs import JOBS
+from magfusion.model.trust import CODES
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = {path.relative_to(DOCS).as_posix(): path.read_text() for path in DOCS.rglob("*.md")}
+START = "index.md"
+
+
+def test_every_code_of_a_finding_has_its_cause_and_its_remedy() -> None:
+    page = PAGES["troubleshooting.md"]
+    entries = re.findall(r"^### `(\w+)`\n(.*?)(?=^##|\Z)", page, re.M | re.S)
+    assert sorted(code for code, _ in entries) == sorted(CODES)
+    for code, text in entries:
+        assert re.search(r"\*\*Cause\.\*\*\s\S.*\*\*Remedy\.\*\*\s\S", text, re.S), code
+
+
+@pytest.mark.parametrize("path", JOBS)
+def test_every_command_has_a_page_with_its_options_and_an_example(path: str) -> None:
+    (page,) = [text for text in PAGES.values() if f"<!-- options: {path} -->" in text]
+    assert f"magfusion {path}" in page or f"`{path} " in page
+
+
+def test_every_name_of_the_package_is_in_the_reference() -> None:
+    shown = re.findall(r"^::: ([\w.]+)$", PAGES["api.md"], re.M)
+    for name in magfusion.__all__:
+        whole = getattr(magfusion, name)
+        assert f"{whole.__module__}.{whole.__qualname__}" in shown
+
+
+def test_every_page_is_in_the_contents() -> None:
+    contents = (ROOT / "mkdocs.yml").read_text()
+    for name in PAGES:
+        assert f": {name}\n" in contents
+
+
+@pytest.fixture(scope="module")
+def started(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the directory that the first page leaves to all others."""
+    directory = tmp_path_factory.mktemp("start")
+    run_blocks(PAGES[START], directory)
+    return directory
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [n for n, page in PAGES.items() if n != START and blocks(page)])
+def test_what_a_page_says_is_what_happens(name: str, started: Path, tmp_path: Path) -> None:
+    directory = shutil.copytree(started, tmp_path / "here")
+    run_blocks(PAGES[name], directory)

@@ -1,0 +1,83 @@
+"""What the pages of the documentation have from the code: tables of options and of codes.
+
+A page says where: ``<!-- options: smooth -->`` and ``<!-- codes -->``; a heading that is the code
+of a finding is followed by what the code means.  Formulas become MathML, which needs no script.
+`mkdocs` calls the hook.
+"""
+
+import dataclasses
+import importlib
+import re
+from collections.abc import Iterable
+from typing import Any
+
+from latex2mathml.converter import convert
+
+from magfusion.jobs import JOBS
+from magfusion.jobs.settings import Command, Option, options
+from magfusion.model.trust import CODES
+
+OPTIONS = re.compile(r"<!-- options: ([a-z -]+) -->")
+ENTRY = re.compile(r"^### `(\w+)`$", re.M)
+FORMULA = re.compile(r"^\$\$\s(.+?)\$\$$", re.M | re.S)
+CODES_HERE = "<!-- codes -->"
+
+
+def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    lines = [head, ("---",) * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _default(field: dataclasses.Field[Any], option: Option) -> str:
+    value = field.default
+    if value is dataclasses.MISSING:
+        return "must be given"
+    if option.words is not None:
+        value = next((word for word, meant in option.words.items() if meant == value), value)
+    nothing = value is None or value is False or value == ()
+    return "" if nothing else "yes" if value is True else f"`{value}`"
+
+
+def option_table(path: str) -> str:
+    """Return what a command takes, from the fields of its job's settings.
+
+    Parameters
+    ----------
+    path : str
+        Of `magfusion.jobs.JOBS`, as ``calibrate log``.
+    """
+    module, sentence = JOBS[path]
+    command: Command = importlib.import_module(f"magfusion.jobs.{module}").COMMAND
+    rows = []
+    for field, option in options(command.settings):
+        name = option.name or field.name.replace("_", "-")
+        shown = f"`{name.upper()}`" if option.positional else f"`--{name}`"
+        if field.default is True:
+            shown += f", `--no-{name}`"
+        rows.append((shown, option.sentence.replace("|", "\\|"), _default(field, option)))
+    title = f"**`magfusion {path}`**: {sentence}"
+    rows.append(("`--help`", "Show the rest, as where the results go.", ""))
+    return f"{title}\n\n{_table(('option', 'what', 'default'), rows)}"
+
+
+def code_table() -> str:
+    """Return every code of `reasons` and `remarks`, what it means, and where its remedy is."""
+    rows = ((f"[`{code}`](troubleshooting.md#{code})", meaning) for code, meaning in CODES.items())
+    return _table(("code", "what it says"), rows)
+
+
+def _meaning(heading: str) -> str:
+    meaning = CODES.get(heading)
+    return f"\n\n*{meaning[0].upper()}{meaning[1:]}.*\n" if meaning else ""
+
+
+def _mathml(formula: str) -> str:
+    return f"<div>{convert(formula, display='block')}</div>"
+
+
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Fill the tables in; called by mkdocs for every page."""
+    filled = OPTIONS.sub(lambda found: option_table(found[1]), markdown)
+    filled = FORMULA.sub(lambda found: _mathml(found[1]), filled)
+    filled = ENTRY.sub(lambda found: found[0] + _meaning(found[1]), filled)
+    return filled.replace(CODES_HERE, code_table())
