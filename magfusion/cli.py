@@ -4,6 +4,7 @@ import errno
 import inspect
 import json
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -23,9 +24,10 @@ from typer.main import get_command
 from magfusion.errors import EstimationError, InputError, InputErrors
 from magfusion.files.standard_streams import binary_output, occupy_closed, until_closed
 from magfusion.jobs import GROUPS, JOBS
-from magfusion.jobs.settings import Command, Option, options
+from magfusion.jobs.settings import Command, Option, Settings, options
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figures
+from magfusion.results.provenance import Run, recorded_as
 
 DEBUG = "--debug"
 LONGEST_REASON = 200  # characters, of an error that was not foreseen
@@ -49,7 +51,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         with _terminated_as_interrupted(), until_closed():
             status = application()(
-                args=given or ["--help"], prog_name="magfusion", standalone_mode=False
+                args=given or ["--help"], prog_name="magfusion", standalone_mode=False, obj=given
             )
     except KeyboardInterrupt:
         raise SystemExit(130) from None
@@ -207,9 +209,12 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
             output = Path(command.output or f"{log}_{path.split()[-1].replace('-', '_')}")
         earlier = _stamp(output)
         with _progress() as report:
-            offered = {"output": output, "report": report, "given": _given(context)}
+            given = _given(context)
+            offered = {"output": output, "report": report, "given": given}
             try:
-                figures = command.run(settings, **{k: v for k, v in offered.items() if k in wanted})
+                with recorded_as(_run(context, settings, given)):
+                    kept = {k: v for k, v in offered.items() if k in wanted}
+                    figures = command.run(settings, **kept)
             except EstimationError as error:
                 if output is not None:
                     from magfusion.jobs.failure import failed_figures
@@ -290,6 +295,17 @@ def _given(context: typer.Context) -> set[str]:
     """Return the fields that the user gave, rather than leave them at their defaults."""
     sources = {name: context.get_parameter_source(name) for name in context.params}
     return {name for name, source in sources.items() if source and source.name == "COMMANDLINE"}
+
+
+def _run(context: typer.Context, settings: Settings, given: set[str]) -> Run:
+    """Return what a page tells of how it came about."""
+    values = {field.name: getattr(settings, field.name) for field, _ in options(type(settings))}
+    return Run(
+        shlex.join(["magfusion", *(context.obj or [])]),
+        values,
+        frozenset(given),
+        tuple(value for value in values.values() if isinstance(value, Path) and value.exists()),
+    )
 
 
 @contextmanager

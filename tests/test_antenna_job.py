@@ -82,6 +82,7 @@ def test_the_refined_site_tracks_better(
     assert {p.name for p in (tmp_path / "out").iterdir()} == {
         "site.yaml",
         "antenna.png",
+        "report.html",
         "report.json",
     }
     assert figures["rank"] == 35

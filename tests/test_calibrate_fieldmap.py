@@ -176,7 +176,7 @@ def test_a_survey_becomes_a_site_with_its_map(
 ) -> None:
     output = tmp_path / "mapped"
     run_command("calibrate", "fieldmap", surveyed, "-o", output)
-    names = {"site.yaml", "site_field_map.parquet", "field_map.png", "report.json"}
+    names = {"site.yaml", "site_field_map.parquet", "field_map.png", "report.html", "report.json"}
     assert {p.name for p in output.iterdir()} == names
     figures = _figures(output)
     assert figures["job"] == "calibrate fieldmap"

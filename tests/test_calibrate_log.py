@@ -56,7 +56,13 @@ def report(calibrated: Path) -> dict[str, Any]:
 
 def test_the_command_writes_its_files_and_no_others(calibrated: Path) -> None:
     names = {path.name for path in calibrated.iterdir()}
-    assert names == {"site.yaml", "site_correlation.parquet", "calibration.png", "report.json"}
+    assert names == {
+        "site.yaml",
+        "site_correlation.parquet",
+        "calibration.png",
+        "report.html",
+        "report.json",
+    }
     assert (calibrated / "calibration.png").read_bytes()[:4] == b"\x89PNG"
 
 

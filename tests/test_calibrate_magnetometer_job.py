@@ -28,7 +28,7 @@ from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
 from magfusion.simulation.motion import Rests
 
-FILES = {"site.yaml", "report.json", "magnetometer.png"}
+FILES = {"site.yaml", "report.html", "report.json", "magnetometer.png"}
 DURATION = 60.0  # s
 
 

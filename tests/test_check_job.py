@@ -52,7 +52,11 @@ def test_a_good_log_is_trustworthy_and_nothing_is_written(
 def test_report_and_picture_are_written_where_that_is_asked(worked: Worked, tmp_path: Path) -> None:
     run_command("check", worked.log, "-o", tmp_path / "look")
     run_command("check", worked.log, "-o", tmp_path / "look")  # an earlier one is replaced
-    assert {p.name for p in (tmp_path / "look").iterdir()} == {"check.png", "report.json"}
+    assert {p.name for p in (tmp_path / "look").iterdir()} == {
+        "check.png",
+        "report.html",
+        "report.json",
+    }
     report = json.loads((tmp_path / "look" / "report.json").read_text())
     assert report["job"] == "check"
 
@@ -78,7 +82,10 @@ def test_a_failed_log_exits_with_one_and_says_why_first(
     assert isinstance(reasons, list)
     assert reasons[0]["code"] == "gyro_sign"
     assert {p.name for p in (tmp_path / "look").iterdir()} == {"failed", "report.json"}
-    assert {p.name for p in (tmp_path / "look" / "failed").iterdir()} == {"check.png"}
+    assert {p.name for p in (tmp_path / "look" / "failed").iterdir()} == {
+        "check.png",
+        "report.html",
+    }
 
 
 def test_without_a_site_the_recording_alone_is_judged(

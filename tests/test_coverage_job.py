@@ -9,7 +9,7 @@ import pytest
 import yaml
 from conftest import Refuse, Worked, run_command
 
-FILES = {"coverage.parquet", "coverage.png", "run.rrd", "report.json"}
+FILES = {"coverage.parquet", "coverage.png", "run.rrd", "report.html", "report.json"}
 
 
 def test_the_command_writes_table_picture_recording_and_report(

@@ -213,6 +213,7 @@ def test_the_command_writes_report_picture_and_recording(tmp_path, capsys):
         main([*arguments, "--json", "-o", str(output)])
     assert not stopped.value.code
     assert {p.name for p in output.iterdir()} == {
+        "report.html",
         "report.json",
         "drift.png",
         "stability.png",

@@ -76,7 +76,7 @@ def report(path: Path) -> dict[str, Any]:
 
 def test_the_database_has_table_picture_and_report(logs: Path) -> None:
     found = logs / "nod_table"
-    names = {"attitudes.parquet", "attitudes.png", "report.json"}
+    names = {"attitudes.parquet", "attitudes.png", "report.html", "report.json"}
     assert {path.name for path in found.iterdir()} == names
     assert (found / "attitudes.png").read_bytes().startswith(b"\x89PNG")
     told = report(found)
@@ -94,7 +94,7 @@ def test_roll_and_pitch_are_found_in_the_database_of_another_log(
     for _ in range(2):  # an earlier result is replaced
         run_command("match", logs / "nod_again", "--database", logs / "nod_table",
                     "--method", method, "-o", tmp_path / "out")  # fmt: skip
-    names = {"attitude.parquet", "attitude.png", "report.json"}
+    names = {"attitude.parquet", "attitude.png", "report.html", "report.json"}
     assert {path.name for path in (tmp_path / "out").iterdir()} == names
     told = report(tmp_path / "out")
     assert told["roll_rms_deg"] < limit

@@ -54,6 +54,7 @@ def test_it_writes_what_smooth_writes_and_the_lagged_states(smoothed: Path) -> N
         "trajectory.tum",
         "trajectory.parquet",
         "lagged.parquet",
+        "report.html",
         "report.json",
         "run.rrd",
         "site.yaml",

@@ -136,7 +136,12 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def test_the_command_writes_survey_picture_and_report(surveyed: tuple[Path, Path]) -> None:
     log, place = surveyed
-    assert {p.name for p in place.iterdir()} == {"survey.parquet", "survey.png", "report.json"}
+    assert {p.name for p in place.iterdir()} == {
+        "survey.parquet",
+        "survey.png",
+        "report.html",
+        "report.json",
+    }
     assert (place / "survey.png").read_bytes().startswith(b"\x89PNG")
     survey, report = read_survey(place / "survey.parquet"), _report(place)
     assert report["points"] == len(survey) > 20

@@ -167,6 +167,7 @@ def write_fix_result(
     from magfusion.files.fix_table import write_hypotheses
     from magfusion.files.trajectory_table import write_trajectory
     from magfusion.files.tum import write_tum
+    from magfusion.results.page_motion import Motion
     from magfusion.results.recording import write_recording
     from magfusion.results.report import compared_with_truth, write_report
 
@@ -195,7 +196,8 @@ def write_fix_result(
         trust=trust,
         states=states,
     )
-    write_report(directory, figures | compared)
+    motion = Motion(site, best, log.truth, errors, trust=states)
+    write_report(directory, figures | compared, motion)
     return figures | compared
 
 
@@ -222,6 +224,7 @@ def run_published_fix(job: Job, settings: FixSettings) -> Figures:
     from magfusion.papers.p004_fingerprints.algorithms import fix_as_published
     from magfusion.papers.p004_fingerprints.fingerprint import fingerprint_database
     from magfusion.papers.p004_fingerprints.rotating import rotating_beacons, rotating_fields
+    from magfusion.results.page_motion import Motion
     from magfusion.results.recording import write_recording
     from magfusion.results.report import compared_with_truth, dropped_figures, write_report
     from magfusion.results.verdict import trust_figures
@@ -273,7 +276,7 @@ def run_published_fix(job: Job, settings: FixSettings) -> Figures:
         write_trajectory(found, directory / "trajectory.parquet", log.epoch_ns, rows)
         recording = directory / "run.rrd"
         write_recording(recording, site, found, truth=log.truth, errors=errors, trust=trust)
-        write_report(whole, figures)
+        write_report(whole, figures, Motion(site, found, log.truth, errors))
     refuse_failed(job.log_path, job.output, trust)
     return figures
 

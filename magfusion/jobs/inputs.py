@@ -26,6 +26,8 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Trust, Verdict
 from magfusion.receiver.receiver import Receiver
+from magfusion.results.page import PAGE
+from magfusion.results.report import FAILED
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,6 @@ class Job:
 
 
 _SITE = {"site.yaml", "site_field_map.parquet", "site_correlation.parquet"}
-FAILED = "failed"  # directory of what was found where the verdict is that
 _RESULT = {"trajectory.tum", "trajectory.parquet", *_SITE, "run.rrd", "report.json", FAILED}
 _TABLES = {"imu.parquet", "magnetometer.parquet", "fields.parquet", "truth.parquet"}
 _TRUE_SITE = {f"true_{name}" for name in _SITE}
@@ -101,7 +102,7 @@ def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
         job = report["job"]
     except (OSError, ValueError, KeyError, TypeError):
         return False
-    return job in kinds and found <= _WRITTEN[job] | {FAILED}
+    return job in kinds and found <= _WRITTEN[job] | {FAILED, PAGE}
 
 
 def claim(output: Path, *kinds: str) -> AbstractContextManager[Path]:

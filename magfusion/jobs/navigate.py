@@ -132,7 +132,7 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
     from magfusion.files.checkpoint import claim_checkpoint
     from magfusion.files.row_file import claim_rows
     from magfusion.jobs.inputs import CHECKPOINT, claim, found_in, named, read_job, refuse_failed
-    from magfusion.jobs.navigate_results import write_navigated
+    from magfusion.jobs.navigate_results import motion_of, write_navigated
     from magfusion.results.report import write_report
 
     job, claimed = settings.job(output), claim(output, "navigate")
@@ -158,7 +158,7 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
             directory = found_in(whole, trust)
             if results is not None:
                 write_navigated(directory, log, results)
-            write_report(whole, figures)
+            write_report(whole, figures, None if results is None else motion_of(log, results))
     except (InputError, EstimationError):
         _clear(run, place, made)
         raise

@@ -30,6 +30,7 @@ from magfusion.results.figures import (
     determined_figures,
     heading,
 )
+from magfusion.results.page_motion import Motion
 from magfusion.results.recording import write_recording
 from magfusion.results.refinement import parameter_estimates, refined_site
 from magfusion.results.report import (
@@ -214,7 +215,12 @@ def _run_figures(navigator: Navigator, current: Trajectory) -> Figures:
         | rival_figures(navigator.rival_chi_square)
         | Figures(
             *(
-                Figure("counted_" + reason.replace(":", "").replace(" ", "_"), count, label=reason)
+                Figure(
+                    "counted_" + reason.replace(":", "").replace(" ", "_"),
+                    count,
+                    label=reason,
+                    refused="too late" in reason or reason.startswith("window"),
+                )
                 for reason, count in navigator.losses.items()
             ),
             *(
@@ -247,6 +253,13 @@ def _memory_mb() -> float | None:
 
     unit = 1 << 20 if sys.platform == "darwin" else 1 << 10  # macOS reports bytes
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+
+def motion_of(log: Log, results: NavigateResults) -> Motion:
+    """Return what the page of a navigation shows."""
+    current, innovations = results.current, results.innovations
+    own = (results.refined, current.states, log.truth, results.errors, innovations)
+    return Motion(*own, current.trust)
 
 
 def write_navigated(directory: Path, log: Log, results: NavigateResults) -> None:

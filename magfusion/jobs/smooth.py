@@ -113,10 +113,12 @@ def run_smooth(
     from magfusion.files.site import save_site
     from magfusion.files.trajectory_table import write_trajectory
     from magfusion.files.tum import write_tum
-    from magfusion.jobs.inputs import FAILED, claim, found_in, named, read_job, refuse_failed
+    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.results.page_motion import Motion
     from magfusion.results.recording import write_recording
     from magfusion.results.refinement import result_site
     from magfusion.results.report import (
+        FAILED,
         compared_with_truth,
         placement_figures,
         smoothed_figures,
@@ -155,7 +157,7 @@ def run_smooth(
     figures |= compared | placement_figures(placed, result.calibration.site)
     if errors is not None and not placed:
         figures |= _fixed_survey_figures(log, site, settings, result)
-    refined = result_site(result, log.name)
+    refined, innovations = result_site(result, log.name), _innovations(result)
     written = at_imu_rate(result, log) if imu_rate else result.states
     with claimed as whole:
         directory = found_in(whole, trust)
@@ -169,11 +171,12 @@ def run_smooth(
             result.states,
             truth=log.truth,
             errors=errors,
-            innovations=_innovations(result),
+            innovations=innovations,
             trust=trust,
             states=by_state,
         )
-        write_report(whole, figures)
+        motion = Motion(refined, result.states, log.truth, errors, innovations, by_state)
+        write_report(whole, figures, motion)
     refuse_failed(job.log_path, output=job.output, trust=trust)
     return figures
 

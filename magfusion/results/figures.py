@@ -64,6 +64,8 @@ class Figure:
         A warning that the screen shows beside the figure.
     remark : str
         A sentence that the screen shows after all notes.
+    refused : bool
+        Whether it counts data that were refused; its title says why.
     """
 
     name: str
@@ -75,6 +77,7 @@ class Figure:
     column: Column = Column.NONE
     note: str = ""
     remark: str = ""
+    refused: bool = False
 
     @property
     def key(self) -> str:

@@ -28,17 +28,28 @@ from magfusion.results.figures import (
     determined_figures,
 )
 from magfusion.results.observability import Observability, observability
+from magfusion.results.page import write_page
+from magfusion.results.page_motion import Motion
 from magfusion.results.refinement import parameter_estimates
 from magfusion.units import Array
 
+FAILED = "failed"  # directory of what was found where the verdict is that
 POOR_FIT = 3.0  # whitened residual, one where noise and model are as declared
 _REPORT, _ERRORS, _SUMMARY = Section.REPORT, Section.ERRORS, Section.SUMMARY
 
 
-def write_report(directory: Path, figures: Figures) -> None:
-    """Write ``report.json``."""
+def write_report(directory: Path, figures: Figures, motion: Motion | None = None) -> None:
+    """Write ``report.json``, and ``report.html`` with the result: below `FAILED` if that is there.
+
+    Parameters
+    ----------
+    motion : Motion, optional
+        What the page shows beside the figures, and the pictures that lie with the result.
+    """
     text = json.dumps(dict(figures), indent=1, allow_nan=False, default=float)
     (directory / "report.json").write_text(text + "\n")
+    failed = directory / FAILED
+    write_page(failed if failed.is_dir() else directory, figures, motion)
 
 
 def where_found(name: str, found: bool, value: Value, label: str = "") -> Figure:
@@ -112,7 +123,7 @@ def dropped_figures(dropped: Mapping[str, int], what: str = "windows") -> Figure
     return Figures(
         where_found(f"{what}_dropped", total > 0, total),
         *(
-            Figure(f"{what}_dropped_{reason.replace(' ', '_')}", count)
+            Figure(f"{what}_dropped_{reason.replace(' ', '_')}", count, refused=True)
             for reason, count in dropped.items()
         ),
     )

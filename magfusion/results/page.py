@@ -1,0 +1,266 @@
+"""A result as one page for those who review a measurement: ``report.html``.
+
+The page is one file that asks nothing of the network: pictures are inside, there is no script, and
+all that comes from a file of the user's (a beacon's name, a path) is escaped.
+"""
+
+import base64
+from collections.abc import Iterable, Sequence
+from html import escape
+from pathlib import Path
+
+from magfusion.results.figures import Estimate, Figures, Section, Value
+from magfusion.results.page_motion import (
+    Motion,
+    error_section,
+    excluded_rows,
+    path_section,
+    residual_section,
+)
+from magfusion.results.page_style import STYLE
+from magfusion.results.provenance import Run, current_run, input_files, versions
+from magfusion.results.shown import (
+    as_sure,
+    column_rows,
+    findings,
+    labelled,
+    notes,
+    number_text,
+    sentences,
+    summary_rows,
+)
+
+PAGE = "report.html"
+LARGEST = 4_500_000  # bytes, of which a mail takes one
+FAR = 3.0  # sigmas; a change beyond is marked
+_MEANING = {
+    "trustworthy": "Nothing in the data speaks against it; its claimed accuracy holds.",
+    "doubtful": "It can be used with care: what it claims of its accuracy has been widened until it"
+    " covers what is wrong.",
+    "failed": "It must not be used: what is shown below is kept for diagnosis only.",
+}
+_CAPTIONS = {
+    "antenna": "Antennas: residuals, and what was found",
+    "attitude": "Angles found over time, and their errors where there is a truth",
+    "attitudes": "Attitudes that the database holds",
+    "beacon": "Beacons: residuals of the survey",
+    "calibration": "What the log determined: sigma after over sigma before",
+    "check": "Spectrum, signal to noise, and the two free compasses: gravity and steady field",
+    "coverage": "Where the installation can navigate",
+    "drift": "Errors and claims over the days",
+    "field_map": "Where the beacons' fields differ from their model",
+    "magnetometer": "Magnetometer: field before and after",
+    "stability": "Stability of the estimates",
+    "survey": "Places of the survey",
+}
+
+
+def write_page(directory: Path, figures: Figures, motion: Motion | None = None) -> None:
+    """Write ``report.html`` with the pictures (``.png``) that lie in the directory.
+
+    Parameters
+    ----------
+    motion : Motion, optional
+        Where the job found one.
+    """
+    name = " of ".join(str(figure.value) for figure in figures.of(Section.TITLE))
+    blocks = [
+        f"<h1>magfusion {escape(name)}</h1>",
+        _verdict(figures),
+        _section("Held, and not checked by these data", _unverified(figures)),
+        _section("Main figures", _main(figures)),
+    ]
+    if motion is not None:
+        blocks += [
+            _section("Path", path_section(motion)),
+            _section(*error_section(motion)),
+            _section("Residuals by beacon", residual_section(motion)),
+        ]
+    blocks.append(_section("Calibration, before and after", _calibration(figures)))
+    after = [
+        _section("What was refused or left out", _refused(figures, motion)),
+        _section("Notes", _list(_notes(figures))),
+        _section("How it was run", _how(current_run())),
+        _section("All figures of report.json", _all(figures)),
+    ]
+    room = LARGEST - sum(len(block.encode()) for block in (*blocks, *after, STYLE))
+    blocks.append(_section("Pictures", _pictures(directory, room)))
+    text = (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\';'
+        " img-src data:; style-src 'unsafe-inline'\">"
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{escape(_title(figures, name))}</title><style>{STYLE}</style></head>\n<body>\n"
+        + "\n".join(filter(None, [*blocks, *after]))
+        + "\n</body></html>\n"
+    )
+    (directory / PAGE).write_text(text, encoding="utf-8", errors="replace")
+
+
+def _title(figures: Figures, name: str) -> str:
+    return f"{figures['verdict']}: {name}" if "verdict" in figures else name
+
+
+def _section(heading: str, content: str) -> str:
+    return f"<section><h2>{escape(heading)}</h2>\n{content}</section>" if content else ""
+
+
+def _verdict(figures: Figures) -> str:
+    if "verdict" not in figures:
+        said = "<strong>NO VERDICT</strong><p>This job judges nothing.</p>"
+        return f'<div class="verdict none">{said}</div>'
+    verdict = str(figures["verdict"])
+    reasons = [_finding(one) for one in findings(figures, "reasons")]
+    reasons += [f"Noticed: {_finding(one)}" for one in findings(figures, "remarks")]
+    listed = "".join(f"<li>{reason}</li>" for reason in reasons)
+    return (
+        f'<div class="verdict {escape(verdict)}"><strong>{escape(verdict.upper())}</strong>'
+        f"<p>{_MEANING.get(verdict, '')}</p>{f'<ul>{listed}</ul>' if listed else ''}</div>"
+    )
+
+
+def _finding(one: dict[str, str | float]) -> str:
+    return f"{escape(str(one['text']))} <code>{escape(str(one['code']))}</code>"
+
+
+def _unverified(figures: Figures) -> str:
+    rows = [
+        [
+            str(one["parameter"]),
+            number_text(one["sigma"]),
+            number_text(1e3 * float(one["position_m"])),
+            number_text(one["rotation_deg"]),
+        ]
+        for one in findings(figures, "unverified")
+    ]
+    if not rows:
+        return ""
+    said = (
+        "<p>These parameters were taken as declared. Were one of them wrong by its declared sigma,"
+        " nothing in the data would tell, and the pose would be wrong by:</p>"
+    )
+    head = ["parameter", "declared sigma", "position (mm)", "attitude (deg)"]
+    return said + _table([head, *rows])
+
+
+def _main(figures: Figures) -> str:
+    errors = column_rows(figures.of(Section.ERRORS), "")
+    transfer = column_rows(figures.of(Section.TRANSFER), "other part of the log")
+    tables = [_table(rows) for rows in (errors, transfer) if len(rows) > 1]
+    summary = [list(row) for row in summary_rows(figures.of(Section.SUMMARY))]
+    return "".join([*tables, _table([[], *summary]) if summary else ""])
+
+
+def _calibration(figures: Figures) -> str:
+    """Return what is known of each parameter before and after, from its declared value on."""
+    estimates = [f for f in figures.all if isinstance(f, Estimate)]
+    if not estimates:
+        return ""
+    head = ["parameter", "before", "after", "change in sigmas", "determined by these data"]
+    rows: list[list[str]] = []
+    far: set[int] = set()
+    for one in estimates:
+        before = f"0 ± {number_text(one.prior_sigma, 2)}" if one.prior_sigma else "not known"
+        change = one.change / one.prior_sigma if one.prior_sigma else None
+        if change is not None and abs(change) > FAR:
+            far.add(len(rows))
+        name = f"{one.key} ({one.unit})" if one.unit else one.key
+        after = f"{as_sure(one.change, one.sigma)} ± {number_text(one.sigma, 2)}"
+        told = "" if change is None else f"{change:+.2f}"
+        rows.append([name, before, after, told, "yes" if one.determined else "no"])
+    said = (
+        "<p>Deviations from what was declared, which is the zero of each line, with one sigma;"
+        " the change is in sigmas of what was declared, and marked beyond"
+        f" {FAR:g}. A parameter that these data do not determine stays where it was.</p>"
+    )
+    return said + _table([head, *rows], far)
+
+
+def _refused(figures: Figures, motion: Motion | None) -> str:
+    rows = [[labelled(f), number_text(f.value)] for f in figures.all if f.refused and f.value]
+    rows += [[what, str(n)] for what, n in ([] if motion is None else excluded_rows(motion))]
+    if rows:
+        return _table([["what, and why", "count"], *rows])
+    return "<p>Nothing.</p>" if any(f.refused for f in figures.all) else ""
+
+
+def _notes(figures: Figures) -> list[str]:
+    said = list(notes(figures))
+    for figure in figures.all:
+        if figure.section in (Section.REMARKS, Section.DIRECTIONS):
+            said += sentences(figure)
+        said += [figure.remark] if figure.remark else []
+    return said
+
+
+def _pictures(directory: Path, room: int) -> str:
+    parts = []
+    for path in sorted(directory.glob("*.png")):
+        caption = escape(_CAPTIONS.get(path.stem, path.stem))
+        size = 4 * path.stat().st_size // 3 + 200
+        if size > room:
+            parts.append(f"<p>{caption}: see {escape(path.name)}, beside this page.</p>")
+            continue
+        room -= size
+        data = base64.b64encode(path.read_bytes()).decode()
+        parts.append(
+            f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
+            f"<figcaption>{caption}</figcaption></figure>"
+        )
+    return "".join(parts)
+
+
+def _how(run: Run | None) -> str:
+    if run is None:
+        return _table([[], ["called", "from Python"], ["version", versions()]])
+    facts = [
+        ["command", run.command],
+        ["version", versions()],
+        ["started", f"{run.started:%Y-%m-%d %H:%M:%S} UTC"],
+        ["duration", f"{run.elapsed:.3g} s"],
+    ]
+    files = [[name, f"{size:,}", digest] for name, size, digest in input_files(run)]
+    options = [
+        [name, "" if value is None else str(value), "given" if name in run.given else "default"]
+        for name, value in run.options.items()
+    ]
+    return (
+        _table([[], *facts])
+        + (_table([["input file", "bytes", "SHA-256"], *files]) if files else "")
+        + _folded("Options", _table([["option", "value", ""], *options]))
+    )
+
+
+def _all(figures: Figures) -> str:
+    rows = [[key, _plain(value)] for key, value in figures.items()]
+    return _folded(f"{len(rows)} figures", _table([["key", "value"], *rows]))
+
+
+def _plain(value: Value) -> str:
+    if isinstance(value, list):
+        return "; ".join(
+            ", ".join(f"{k}: {v}" for k, v in one.items()) if isinstance(one, dict) else str(one)
+            for one in value
+        )
+    return "" if value is None else str(value)
+
+
+def _folded(heading: str, content: str) -> str:
+    return f"<details><summary>{escape(heading)}</summary>{content}</details>"
+
+
+def _list(items: Iterable[str]) -> str:
+    listed = "".join(f"<li>{escape(item)}</li>" for item in items)
+    return f"<ul>{listed}</ul>" if listed else ""
+
+
+def _table(rows: Sequence[Sequence[str]], marked: Iterable[int] = ()) -> str:
+    """Return a table, its head first (empty for none), some of its rows marked."""
+    head, *body = rows
+    marked = set(marked)
+    parts = ["<tr>", *(f"<th>{escape(cell)}</th>" for cell in head), "</tr>"] if head else []
+    for k, row in enumerate(body):
+        parts.append('<tr class="far">' if k in marked else "<tr>")
+        parts += [f"<td>{escape(cell)}</td>" for cell in row]
+        parts.append("</tr>")
+    return f'<div class="wide"><table>{"".join(parts)}</table></div>'

@@ -1,0 +1,213 @@
+"""What a page shows of a motion: its path, its errors or sigmas in time, residuals by beacon."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import StateTrust
+from magfusion.results.errors import TrajectoryErrors
+from magfusion.results.plots.chart import Band, Chart, Line, Mark, svg
+from magfusion.units import DEGREE, Array
+
+TIME = "time (s)"
+MOST_BEACONS = 24  # with a chart of residuals of their own
+_FAR = 3.0  # of the path's size; beyond, a beacon would hide the path
+_GAP = 10.0  # times the usual step; a line across it would invent states
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A trajectory with what is known of it; as `magfusion.results.recording.write_recording`."""
+
+    site: Site
+    states: Trajectory
+    truth: Trajectory | None = None
+    errors: TrajectoryErrors | None = None
+    innovations: Mapping[str, tuple[Array, Array]] | None = None
+    trust: StateTrust | None = None
+
+
+def path_section(motion: Motion) -> str:
+    """Return plan and height."""
+    time, position = motion.states.time, _interrupted(motion.states)
+    lines = [Line(position[:, 0], position[:, 1], "estimate")]
+    upright = [Line(time, position[:, 2], "estimate")]
+    truth = _truth_within(motion)
+    if truth is not None:
+        path = truth.position_world
+        lines.append(Line(path[:, 0], path[:, 1], "truth", "truth"))
+        upright.append(Line(truth.time, path[:, 2], "truth", "truth"))
+    beacons, away = _beacons_near(motion)
+    first = motion.states.position_world[0]
+    start = Mark(float(first[0]), float(first[1]), "start", "start")
+    plan = Chart("Plan", "x (m)", "y (m)", tuple(lines), marks=(*beacons, start), equal=True)
+    bands: tuple[Band, ...] = ()
+    sigma = _sigma_world(motion.states)
+    if sigma is not None:
+        high = motion.states.position_world[:, 2]
+        bands = (Band(time, high - 3.0 * sigma[:, 2], high + 3.0 * sigma[:, 2], "3 sigma"),)
+    height = Chart("Height", TIME, "z (m)", tuple(upright), bands)
+    note = f"<p>Outside the plan: {escape(', '.join(away))}.</p>" if away else ""
+    return f'<div class="charts">{svg(plan)}{svg(height)}</div>{note}'
+
+
+def error_section(motion: Motion) -> tuple[str, str]:
+    """Return heading and charts of the errors, or of the sigmas where there is no truth."""
+    if motion.errors is not None:
+        return "Errors against the truth", _charts([*_of_axes(motion.errors), *_sizes(motion)])
+    charts = _sizes(motion)
+    return (
+        ("Claimed accuracy (there is no truth to compare with)", _charts(charts))
+        if charts
+        else (
+            "",
+            "",
+        )
+    )
+
+
+def residual_section(motion: Motion) -> str:
+    """Return a chart for each beacon; one scale, so that the worst stands out."""
+    found = motion.innovations or {}
+    if not found:
+        return ""
+    every = np.concatenate([rms for _, rms in found.values()])
+    most = max(3.0, 1.3 * float(np.nanpercentile(every, 99.5)))
+    charts = []
+    for name, (time, rms) in list(found.items())[:MOST_BEACONS]:
+        ends = time[[0, -1]]
+        lines = (
+            Line(ends, np.ones(2), "", "expected"),
+            Line(time, rms, "", dots=True),
+        )
+        title = f"Beacon {name}"
+        charts.append(
+            Chart(title, TIME, "residual", lines, y_limits=(0.0, most), width=330, height=190)
+        )
+    left = len(found) - len(charts)
+    more = f"<p>{left} more beacons are in run.rrd.</p>" if left else ""
+    return (
+        "<p>What the fields leave unexplained, in units of its declared sigma: about 1 (the line)"
+        " where noise and model are as declared; values above the frame are drawn at its edge.</p>"
+        + _charts(charts)
+        + more
+    )
+
+
+def excluded_rows(motion: Motion) -> list[tuple[str, int]]:
+    """Return of how many states each beacon was left out."""
+    counts: dict[str, int] = {}
+    for names in () if motion.trust is None else motion.trust.excluded:
+        for name in names:
+            counts[name] = counts.get(name, 0) + 1
+    return [(f"states without beacon {name}, which contradicts", n) for name, n in counts.items()]
+
+
+def _charts(charts: list[Chart]) -> str:
+    return f'<div class="charts">{"".join(map(svg, charts))}</div>' if charts else ""
+
+
+def _of_axes(errors: TrajectoryErrors) -> list[Chart]:
+    """Return the errors by axis with their bands: of position in the world, of attitude in body."""
+    position_sigma = attitude_sigma = None
+    if errors.pose_cov is not None:
+        turn = errors.world_from_body
+        cov_world = turn @ errors.pose_cov[:, 3:, 3:] @ turn.swapaxes(1, 2)
+        position_sigma = np.sqrt(np.diagonal(cov_world, axis1=1, axis2=2))
+        attitude_sigma = np.sqrt(np.diagonal(errors.pose_cov[:, :3, :3], axis1=1, axis2=2))
+    size, unit = _unit_of(errors.position_world, position_sigma)
+    charts = []
+    for k, axis in enumerate("xyz"):
+        title = f"Position, {axis} of the world"
+        sigma = None if position_sigma is None else position_sigma[:, k] / size
+        charts.append(_error(title, unit, errors.time, errors.position_world[:, k] / size, sigma))
+    for k, axis in enumerate("xyz"):
+        title = f"Attitude, about {axis} of the body"
+        sigma = None if attitude_sigma is None else attitude_sigma[:, k] / DEGREE
+        value = errors.attitude_body[:, k] / DEGREE
+        charts.append(_error(title, "deg", errors.time, value, sigma))
+    return charts
+
+
+def _error(title: str, unit: str, time: Array, value: Array, sigma: Array | None) -> Chart:
+    bands = () if sigma is None else (Band(time, -3.0 * sigma, 3.0 * sigma, "3 sigma"),)
+    line = Line(time, value, "error", "error")
+    return Chart(title, TIME, f"error ({unit})", (line,), bands, width=330, height=200)
+
+
+def _sizes(motion: Motion) -> list[Chart]:
+    """Return size of the error, largest three sigma and protection level on one axis."""
+    states, errors, trust = motion.states, motion.errors, motion.trust
+    if states.pose_cov is None:
+        return []
+    charts = []
+    for name, part, unit, size in (
+        ("Position", slice(3, 6), "m", 1.0),
+        ("Attitude", slice(0, 3), "deg", DEGREE),
+    ):
+        largest = np.linalg.eigvalsh(states.pose_cov[:, part, part])[:, -1]
+        radius = 3.0 * np.sqrt(np.maximum(largest, 0.0)) / size
+        lines = [Line(states.time, radius, "3 sigma, worst direction", "sigma")]
+        if trust is not None:
+            level = trust.protection_level_m if unit == "m" else trust.protection_level_deg
+            if np.any(np.isfinite(level)):
+                lines.append(Line(states.time, level, "protection level", "level"))
+        if errors is not None:
+            found = np.linalg.norm(errors.pose_body[:, part], axis=1) / size
+            lines.append(Line(errors.time, found, "error", "error"))
+        title = f"{name}: size and bounds"
+        charts.append(Chart(title, TIME, unit, tuple(lines), log=True))
+    return charts
+
+
+def _sigma_world(states: Trajectory) -> Array | None:
+    if states.pose_cov is None:
+        return None
+    turn = states.world_from_body
+    cov_world = turn @ states.pose_cov[:, 3:, 3:] @ turn.swapaxes(1, 2)
+    return np.sqrt(np.diagonal(cov_world, axis1=1, axis2=2))
+
+
+def _unit_of(values: Array, sigma: Array | None) -> tuple[float, str]:
+    largest = max(np.max(np.abs(values)), 0.0 if sigma is None else 3.0 * float(np.max(sigma)))
+    return (1e-3, "mm") if largest < 0.1 else (1.0, "m")
+
+
+def _truth_within(motion: Motion) -> Trajectory | None:
+    truth, time = motion.truth, motion.states.time
+    if truth is None:
+        return None
+    inside = (truth.time >= time[0]) & (truth.time <= time[-1])
+    if not inside.any():
+        return None
+    return Trajectory(
+        truth.time[inside], truth.world_from_body[inside], truth.position_world[inside]
+    )
+
+
+def _interrupted(states: Trajectory) -> Array:
+    """Return positions, those after a gap as NaN so that no line crosses it."""
+    position = states.position_world.copy()
+    step = np.diff(states.time)
+    if len(step):
+        position[1:][step > _GAP * np.median(step)] = np.nan
+    return position
+
+
+def _beacons_near(motion: Motion) -> tuple[list[Mark], list[str]]:
+    """Return those that the plan can show, and what is to be said of the others."""
+    path = motion.states.position_world[:, :2]
+    low, high = path.min(axis=0), path.max(axis=0)
+    reach = _FAR * max(float(np.max(high - low)), 3.0)
+    shown, away = [], []
+    for beacon in motion.site.beacons:
+        x, y, z = beacon.position_world.tolist()
+        if np.all(np.abs([x, y] - 0.5 * (low + high)) < reach):
+            shown.append(Mark(x, y, beacon.name))
+        else:
+            away.append(f"beacon {beacon.name} at ({x:.4g}, {y:.4g}, {z:.4g}) m")
+    return shown, away

@@ -1,0 +1,95 @@
+"""How a result came about: command, options, input files, version, date and duration."""
+
+import hashlib
+import platform
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+LARGEST_HASHED = 64 << 20  # bytes; a tenth of a second
+MOST_FILES = 60
+_LIBRARIES = ("numpy", "scipy", "gtsam")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a command.
+
+    Parameters
+    ----------
+    command : str
+        As it was typed.
+    options : mapping
+        Value of every option.
+    given : set of str
+        Those that were typed rather than left at their defaults.
+    inputs : tuple of Path
+        Files and directories that were named.
+    """
+
+    command: str
+    options: Mapping[str, object] = field(default_factory=dict)
+    given: frozenset[str] = frozenset()
+    inputs: tuple[Path, ...] = ()
+    started: datetime = field(default_factory=lambda: datetime.now(UTC))
+    began: float = field(default_factory=time.perf_counter)
+
+    @property
+    def elapsed(self) -> float:
+        """Since it began (s)."""
+        return time.perf_counter() - self.began
+
+
+# A job knows its settings and not the command: pages are written many calls below it.
+_RUN: ContextVar[Run | None] = ContextVar("run", default=None)
+
+
+@contextmanager
+def recorded_as(run: Run) -> Iterator[None]:
+    """Say what the results that are written meanwhile came of."""
+    token = _RUN.set(run)
+    try:
+        yield
+    finally:
+        _RUN.reset(token)
+
+
+def current_run() -> Run | None:
+    """Return the run that is being done; None in a program of the user's own."""
+    return _RUN.get()
+
+
+def versions() -> str:
+    """Return the versions of what computed."""
+    libraries = [f"{name} {_version(name)}" for name in _LIBRARIES]
+    return (
+        f"magfusion {_version('magfusion')} (Python {platform.python_version()},"
+        f" {', '.join(libraries)}; {platform.system()} {platform.machine()})"
+    )
+
+
+def input_files(run: Run) -> list[tuple[str, int, str]]:
+    """Return name, size (bytes) and SHA-256 of the files that were named, or lie in directories."""
+    found = []
+    for path in run.inputs:
+        own = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+        found += [p for p in own if p.is_file()]
+    return [(str(p), p.stat().st_size, _sha256(p)) for p in found[:MOST_FILES]]
+
+
+def _sha256(path: Path) -> str:
+    if path.stat().st_size > LARGEST_HASHED:
+        return f"not taken (above {LARGEST_HASHED >> 20} MiB)"
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "of unknown version"

@@ -1,0 +1,83 @@
+"""The words and tables in which figures are shown, on the screen and on a page."""
+
+import math
+
+from magfusion.results.figures import Column, Figure, Figures, Section, Value
+
+# Codes of reasons that say what the note of a figure would say again.
+_SAID = {"residual_rms_{beacon}": {"field_residuals"}, "ambiguous": {"ambiguous"}}
+
+
+def notes(figures: Figures) -> list[str]:
+    """Return in words what a reader of the figures must not overlook, beside the verdict."""
+    out = []
+    codes = {str(one["code"]) for one in findings(figures, "reasons")}
+    for figure in figures.all:
+        out += sentences(figure) if figure.section is Section.NOTES else []
+        out += [figure.note] if figure.note and codes.isdisjoint(_SAID.get(figure.name, ())) else []
+    said = [one["text"] for key in ("reasons", "remarks") for one in findings(figures, key)]
+    return [note for note in out if not any(str(text) in note for text in said)]
+
+
+def findings(figures: Figures, key: str) -> list[dict[str, str | float]]:
+    """Return what a report says under a key: reasons, remarks, or what is unverified."""
+    found = figures.get(key, [])
+    assert isinstance(found, list)
+    return [one for one in found if isinstance(one, dict)]
+
+
+def sentences(figure: Figure) -> list[str]:
+    """Return the sentences that are a figure's value, or that its label and value make."""
+    if isinstance(figure.value, list):
+        lead = f"{figure.label}: " if figure.label else ""
+        return [f"{lead}{sentence}" for sentence in figure.value]
+    return [f"{number_text(figure.value)} {figure.title}"]
+
+
+def labelled(figure: Figure) -> str:
+    """Return what a figure is called, with its unit."""
+    return f"{figure.title} ({figure.unit})" if figure.unit else figure.title
+
+
+def column_rows(figures: list[Figure], corner: str) -> list[list[str]]:
+    """Return a table of figures by their labels and columns, its head first."""
+    used = {figure.column for figure in figures}
+    columns = [column for column in Column if column in used]
+    rows: dict[str, dict[str, str]] = {}
+    for figure in figures:
+        rows.setdefault(labelled(figure), {})[figure.column] = number_text(figure.value)
+    cells = [[label, *(row.get(c, "") for c in columns)] for label, row in rows.items()]
+    return [[corner, *columns], *cells]
+
+
+def summary_rows(figures: list[Figure]) -> list[tuple[str, str]]:
+    """Return one line for each figure, and one for what several beacons have each."""
+    rows: list[tuple[str, str]] = []
+    lists: dict[str, list[str]] = {}
+    for figure in figures:
+        if figure.beacon is None:
+            known = f"{number_text(figure.value)} {figure.unit}".rstrip()
+            rows.append((figure.title, "none" if figure.value is None else known))
+        else:
+            value = f"{figure.beacon} {number_text(figure.value)}"
+            lists.setdefault(labelled(figure), []).append(value)
+    return rows + [(label, ", ".join(values)) for label, values in lists.items()]
+
+
+def number_text(value: Value, digits: int = 3) -> str:
+    """Write a value for a reader."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list):
+        return ", ".join(str(one) for one in value)
+    return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
+
+
+def as_sure(value: float, sigma: float) -> str:
+    """Write a number to the second digit of its sigma."""
+    if not sigma > 0.0:
+        return number_text(value)
+    decimals = max(0, 1 - math.floor(math.log10(sigma)))
+    return f"{value:+.{decimals}f}"
