@@ -14,7 +14,8 @@ from conftest import run_command
 from matplotlib.image import imread
 from scipy.spatial.transform import Rotation
 
-from magfusion.files.site import save_site
+from magfusion.jobs.coverage import CoverageSettings
+from magfusion.jobs.settings import Command
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, StateTrust, Trust, Unverified, Verdict
@@ -30,6 +31,7 @@ from magfusion.simulation.demo_site import demo_site
 
 EVIL = '<script>alert("x")</script>'
 N = 400
+ABC = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # FIPS 180-4
 VOID = {"meta", "img", "path", "circle", "br"}
 LARGEST = 5_000_000  # bytes
 TRUST = Trust(
@@ -171,8 +173,7 @@ def test_the_page_says_what_was_found_refused_and_how_it_was_run(page: Page) -> 
     assert "too short" not in refused
     assert f"states without beacon {EVIL}, which contradicts 7" in page.text
     assert "magfusion smooth 'a log'" in page.text
-    abc = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # FIPS 180-4, A.1
-    assert f"imu.csv 3 {abc}" in page.text
+    assert f"imu.csv 3 {ABC}" in page.text
     assert "tune True given" in page.text
 
 
@@ -212,16 +213,25 @@ def test_pictures_are_inside_as_far_as_there_is_room(tmp_path: Path) -> None:
     assert "see large.png, beside this page" in found.text
 
 
-def test_a_command_tells_its_page_how_it_was_called(tmp_path: Path) -> None:
+def test_a_command_tells_its_page_how_it_was_called(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     site, output = tmp_path / "site.yaml", tmp_path / "reach"
-    save_site(demo_site(), site)
-    run_command("coverage", site, "-o", output, "--height", 1, "--spacing", 3)
+    site.write_text("abc")
+    output.mkdir()
+
+    def run(settings: CoverageSettings, output: Path) -> Figures:
+        write_report(output, heading("coverage", settings.site.name))
+        return heading("coverage", settings.site.name)
+
+    monkeypatch.setattr("magfusion.jobs.coverage.COMMAND", Command(CoverageSettings, run))
+    run_command("coverage", site, "-o", output, "--height", 1)
     found = Page(output / PAGE)
     found.check()
-    assert f"magfusion coverage {site} -o {output} --height 1 --spacing 3" in found.text
-    assert len(found.addresses) == 1  # coverage.png
-    assert f"{site} {site.stat().st_size:,}" in found.text
+    assert f"magfusion coverage {site} -o {output} --height 1" in found.text
+    assert f"{site} 3 {ABC}" in found.text
     assert "height 1.0 given" in found.text
+    assert "spacing default" in found.text
 
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), "")
