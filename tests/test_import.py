@@ -98,7 +98,7 @@ def test_tables_of_other_names_and_units_are_the_log_they_were_made_of(
     assert_same(log)
     assert log.epoch_ns == 0
     assert {p.name for p in (tmp_path / "log").iterdir()} == {
-        *("log.yaml", "report.json"),
+        *("log.yaml", "report.html", "report.json"),
         *(f"{stream}.parquet" for stream in tables),
     }
     assert json.loads((tmp_path / "log" / "report.json").read_text()) == dict(figures)

@@ -1,14 +1,12 @@
 """How a result came about: command, options, input files, version, date and duration."""
 
-import hashlib
-import platform
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
+from functools import cache
 from pathlib import Path
 
 LARGEST_HASHED = 64 << 20  # bytes; a tenth of a second
@@ -64,12 +62,19 @@ def current_run() -> Run | None:
     return _RUN.get()
 
 
+@cache
 def versions() -> str:
     """Return the versions of what computed."""
+    import platform
+
+    from magfusion.files.commit import commit
+
+    known = commit()
+    at = f" (commit {known})" if known else ""
     libraries = [f"{name} {_version(name)}" for name in _LIBRARIES]
     return (
-        f"magfusion {_version('magfusion')} (Python {platform.python_version()},"
-        f" {', '.join(libraries)}; {platform.system()} {platform.machine()})"
+        f"magfusion {_version('magfusion')}{at}; Python {platform.python_version()},"
+        f" {', '.join(libraries)}; {platform.system()} {platform.machine()}"
     )
 
 
@@ -83,12 +88,16 @@ def input_files(run: Run) -> list[tuple[str, int, str]]:
 
 
 def _sha256(path: Path) -> str:
+    import hashlib
+
     if path.stat().st_size > LARGEST_HASHED:
         return f"not taken (above {LARGEST_HASHED >> 20} MiB)"
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _version(name: str) -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         return version(name)
     except PackageNotFoundError:
