@@ -72,7 +72,6 @@ SPOILED: dict[str, tuple[Change, tuple[str, ...], str]] = {
     "mounted upside down": (mounted((180.0, 0.0, 0.0)), ("mounting",), "by 180 deg"),
     "mounted by 12 deg": (mounted((0.0, 12.0, 0.0)), ("mounting",), "by 12 deg"),
     "other hemisphere": (_earth, ("earth_field",), "hemisphere"),
-    "two undeclared": (beacons(lambda b: b[:2]), ("undeclared_line",), "30.00 Hz"),
     "neighbour": (with_line(25.8, 3e-8), ("undeclared_line",), "25.80 Hz"),
     "beacon off": (silent("B", 8.0, 16.0), ("silent_beacon",), "beacon B (25 Hz)"),
     "beacon at another place of the band": (

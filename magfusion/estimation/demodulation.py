@@ -7,6 +7,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.integrity.detection import drowned, without_silence
+from magfusion.estimation.integrity.spectrum import beside_lines
 from magfusion.estimation.motion_compensation import MotionCompensated, demodulate_about
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.likelihood import fix_epochs
@@ -118,7 +119,7 @@ def demodulated(log: Log, site: Site, settings: LockinSettings | None = None) ->
         if log.fields is None:
             raise EstimationError(f"log {log.name} has neither waveform nor phasors")
         return Demodulation(log, without_silence(log.fields), {})
-    receiver = Receiver.of(site, settings)
+    receiver = Receiver.of(site, beside_lines(log, site, settings))
     windows, fields = receiver.whole(log.waveform, log.imu)
     heard, hidden = without_silence(fields), drowned(fields)
     return Demodulation(log, heard, receiver.dropped, receiver, windows, hidden)

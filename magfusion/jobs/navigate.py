@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -129,6 +129,7 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
     EstimationError
         Where the log leads to no state.
     """
+    from magfusion.estimation.integrity.spectrum import beside_lines
     from magfusion.files.checkpoint import claim_checkpoint
     from magfusion.files.row_file import claim_rows
     from magfusion.jobs.inputs import CHECKPOINT, claim, found_in, named, read_job, refuse_failed
@@ -143,6 +144,7 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
         if path != place or not settings.resume:
             claim_checkpoint(path)
     log, site = read_job(job)
+    navigator = replace(navigator, lockin=beside_lines(log, site, navigator.lockin))
     if settings.earth and log.waveform is None:
         raise InputError(
             f"{job.log_path}: holds only phasors, which know nothing of the Earth field; give the"

@@ -96,6 +96,7 @@ CODES = {
     "survey_overconfident": "the survey of the beacons is worse than its sigmas",
     "time_offset": "the IMU's time offset is not as declared",
     "transfer": "a calibration does not hold where it was not made",
+    "fitted_line": "something undeclared transmits, and is fitted beside the tones",
     "undeclared_line": "something transmits that the site does not declare",
     "unstable": "an estimator drifts over hours, or errs by other than it claims",
     "update_failed": "an update of the estimator failed; the state is a prediction",

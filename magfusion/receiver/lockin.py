@@ -89,7 +89,8 @@ class WindowOperator:
         n, parts = len(self.frequencies_hz), []
         for rows, fit in self._fitted(measured_sensor):
             turn = self.measured_from_still[rows]
-            noise = noise_beside_tones(self.frequencies_hz, self.nuisance_hz, fit)
+            beside_hz = np.concatenate([self.nuisance_hz, self.settings.lines_hz])
+            noise = noise_beside_tones(self.frequencies_hz, beside_hz, fit)
             own = np.einsum("nii->ni", fit.inverse)
             parts.append(
                 (
@@ -123,7 +124,7 @@ class WindowOperator:
             rows = slice(begin, begin + CHUNK)
             some = self.windows.rows(rows)
             index, weight, elapsed = _padded(some, self.time)
-            design = _design(elapsed, self.settings.window, self.frequencies_hz, self.nuisance_hz)
+            design = _design(elapsed, self.settings, self.frequencies_hz, self.nuisance_hz)
             design *= weight[..., None]
             field, projected = still[index] * weight[..., None], np.swapaxes(design, -1, -2)
             inverse = np.asarray(np.linalg.inv(projected @ design))
@@ -150,7 +151,8 @@ def _nuisances_hz(settings: LockinSettings, frequencies: Array, nyquist_hz: floa
     if settings.mains_hz <= 0:
         return np.zeros(0)
     lines = np.arange(settings.mains_hz, 0.95 * nyquist_hz, settings.mains_hz)[:6]
-    apart = np.min(np.abs(lines[:, None] - frequencies), axis=1) * settings.window
+    others = np.concatenate([frequencies, settings.lines_hz])
+    apart = np.min(np.abs(lines[:, None] - others), axis=1) * settings.window
     return lines[apart > 0.8]
 
 
@@ -217,7 +219,7 @@ def separable(step: float, settings: LockinSettings, frequencies_hz: Array) -> b
     elapsed = _whole_window(step, settings)
     design = _design(
         elapsed,
-        settings.window,
+        settings,
         frequencies_hz,
         _nuisances_hz(settings, frequencies_hz, 0.5 / step),
     )[0]
@@ -247,7 +249,7 @@ def variance_growth(
     nuisance_hz = _nuisances_hz(settings, frequencies_hz, 0.5 / step)
 
     def variance(elapsed: Array, weight: BoolArray) -> Array:
-        design = _design(elapsed, settings.window, frequencies_hz, nuisance_hz) * weight[..., None]
+        design = _design(elapsed, settings, frequencies_hz, nuisance_hz) * weight[..., None]
         normal = np.swapaxes(design, -1, -2) @ design
         good = np.linalg.cond(normal) < WORST_CONDITION
         normal[~good] = np.eye(normal.shape[-1])
@@ -262,9 +264,13 @@ def variance_growth(
     return np.concatenate(out)
 
 
-def _design(elapsed: Array, window: float, frequencies: Array, nuisances: Array) -> Array:
-    """Columns: constant, drift, each tone's cosines, sines and their ramps, mains."""
-    ramp = elapsed[..., None] * (2.0 / window)
+def _design(
+    elapsed: Array, settings: LockinSettings, frequencies: Array, nuisances: Array
+) -> Array:
+    """Columns: constant, drift, each tone's cosines, sines and their ramps, mains, other lines."""
+    ramp = elapsed[..., None] * (2.0 / settings.window)
+    other = 2.0 * np.pi * elapsed[..., None] * np.array(settings.lines_hz)
+    along, across = np.cos(other), np.sin(other)
     angle = 2.0 * np.pi * elapsed[..., None] * frequencies
     cosine, sine = np.cos(angle), np.sin(angle)
     mains = 2.0 * np.pi * elapsed[..., None] * nuisances
@@ -272,6 +278,7 @@ def _design(elapsed: Array, window: float, frequencies: Array, nuisances: Array)
         [
             *(np.ones_like(ramp), ramp, cosine, sine, ramp * cosine, ramp * sine),
             *(np.cos(mains), np.sin(mains)),
+            *(along, across, ramp * along, ramp * across),
         ],
         axis=-1,
     )

@@ -24,12 +24,15 @@ class LockinSettings:
         Mains frequency; 0 for none.  Harmonics below the Nyquist frequency are fitted too.
     noise_windows : int
         Windows over which the noise beside the tones is averaged.
+    lines_hz : tuple of float
+        Lines that are no tones of the site; they are fitted beside these as tones are.
     """
 
     window: float
     step: float
     mains_hz: float = 50.0
     noise_windows: int = 9
+    lines_hz: tuple[float, ...] = ()
 
 
 def default_settings(site: Site, mains_hz: float = 50.0) -> LockinSettings:

@@ -13,6 +13,7 @@ from magfusion.estimation.integrity.signal import Heard, heard_in
 from magfusion.estimation.integrity.spectrum import (
     Line,
     Spectrum,
+    beside_lines,
     judged_lines,
     named_lines,
     spectrum,
@@ -99,7 +100,7 @@ def first_look(log: Log, site: Site | None, lockin: LockinSettings | None = None
         samples = FieldSamples.empty(site.channels)
     hearing = heard_in(log, site, lockin)
     if found is not None and not has_schedule(site):
-        settings = usual_lockin(site) if lockin is None else lockin
+        settings = beside_lines(log, site, lockin) or usual_lockin(site)
         harmless = judged_lines(found, site, settings)
         findings += [line for line in harmless if line.verdict is Verdict.TRUSTWORTHY]
     fixes = _fixed(log, site, samples, look[1].time)

@@ -21,6 +21,7 @@ from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Trust, Verdict
+from magfusion.receiver.windows import LockinSettings
 
 Witness = Callable[[Log, Site | None], Iterable[Finding]]
 
@@ -49,6 +50,7 @@ def recorded(
     estimated: Trajectory | None = None,
     beacons: bool = False,
     hearing: Heard | None = None,
+    lockin: LockinSettings | None = None,
 ) -> tuple[Finding, ...]:
     """Return what is wrong with a recording; without a site, of the streams alone.
 
@@ -65,6 +67,8 @@ def recorded(
         transmits.
     hearing : Heard, optional
         How they are heard, where that is known already.
+    lockin : LockinSettings, optional
+        As it was asked for.
     """
     found = [*log.noticed, *(one for witness in WITNESSES for one in witness(log, site))]
     log = beginning(log)
@@ -74,10 +78,14 @@ def recorded(
         if site is not None and log.waveform is not None:
             found += iron_on_body(still_means(log, site, IRON_SPAN), site)
     if beacons and site is not None and site.beacons:
-        found += [f for f in undeclared_lines(log, site) if f.verdict is not Verdict.TRUSTWORTHY]
+        found += [f for f in undeclared_lines(log, site, lockin) if _matters(f)]
         hearing = heard_in(log, site) if hearing is None else hearing
         found += [] if hearing is None else unheard(hearing, site)
     return tuple(replace(f, verdict=Verdict.TRUSTWORTHY) if f.code in bridged else f for f in found)
+
+
+def _matters(line: Finding) -> bool:
+    return line.verdict is not Verdict.TRUSTWORTHY or line.code == "fitted_line"
 
 
 def beginning(log: Log, span: float = LONGEST) -> Log:

@@ -6,17 +6,18 @@ amplitude ``1 / (pi |df| window)``, all of it where it is nearer.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import median_filter
 
 from magfusion.errors import InputError
 from magfusion.estimation.integrity.turning import field_body
-from magfusion.model.samples import Log
+from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import Site
 from magfusion.model.strapdown import attitude_at, attitude_from_gyro
 from magfusion.model.trust import Finding, Verdict
+from magfusion.receiver.lockin import separable
 from magfusion.receiver.receiver import usual_lockin
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
@@ -41,6 +42,10 @@ CONSEQUENCE = 3.0  # times the model's error of a tone, from which a leak casts 
 FITTED_CONSEQUENCE = 25.0  # the same of mains, which the noise beside the tones accounts for
 LEAST_MODEL_ERROR = 2e-3
 LISTED = 4
+BEGINNING = 60.0  # s; in which the lines are found that are fitted beside the tones
+MOST_FITTED = 6  # of them
+LONGER = 2.0  # times the usual window, by which a line is told from a tone
+SEPARATED = 1.5  # over the window, the least distance of a fitted line from a tone
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,6 +207,48 @@ def leaked(line: Line, tone_hz: float, window: float) -> float:
     return float(line.amplitude / max(turns, 1.0))
 
 
+def beside_lines(log: Log, site: Site, lockin: LockinSettings | None) -> LockinSettings | None:
+    """Return settings by which the lines that would disturb the tones are fitted beside them.
+
+    By the beginning of the log; as given where nothing disturbs, or the tones are of slots.
+
+    Parameters
+    ----------
+    lockin : LockinSettings, optional
+        As asked for: its window is kept.  One that is chosen by the tones is chosen by the lines,
+        too.
+    """
+    wave = log.waveform
+    if wave is None or len(wave) < 2 or has_schedule(site) or not site.beacons:
+        return lockin
+    end = float(wave.time[0]) + BEGINNING
+    few, first = wave.time < end, log.imu.time < end
+    imu = ImuSamples(log.imu.time[first], log.imu.gyro_body[first], log.imu.accel_body[first])
+    wave = Waveform(wave.time[few], wave.measured_sensor[few])
+    found = spectrum(replace(log, waveform=wave, imu=imu), site)
+    try:
+        settings = usual_lockin(site) if lockin is None else lockin
+    except InputError:
+        return lockin
+    if found is None:
+        return lockin
+    tones = np.array([f for _, f in _tones(site)])
+    chosen: list[float] = []
+    for line in undeclared(found, site):
+        apart = float(np.min(np.abs(line.frequency_hz - np.array([*tones, *chosen]))))
+        needed = SEPARATED / apart if lockin else 2.0 / apart
+        most = settings.window if lockin else LONGER * usual_lockin(site).window
+        if _consequence(found, line, site, settings)[0] <= CONSEQUENCE or needed > most:
+            continue
+        longer = max(settings.window, needed)
+        step = settings.step if lockin else longer / 2.0
+        lines_hz = (*chosen, line.frequency_hz)
+        trial = replace(settings, window=longer, step=step, lines_hz=lines_hz)
+        if len(chosen) < MOST_FITTED and separable(1.0 / found.rate_hz, trial, tones):
+            settings, chosen = trial, [*lines_hz]
+    return settings if chosen else lockin
+
+
 def undeclared_lines(
     log: Log, site: Site | None, lockin: LockinSettings | None = None
 ) -> Iterator[Finding]:
@@ -212,7 +259,7 @@ def undeclared_lines(
     if found is None:
         return
     try:
-        settings = usual_lockin(site) if lockin is None else lockin
+        settings = beside_lines(log, site, lockin) or usual_lockin(site)
     except InputError:
         return
     yield from judged_lines(found, site, settings)
@@ -222,10 +269,22 @@ def judged_lines(found: Spectrum, site: Site, settings: LockinSettings) -> Itera
     """Yield what undeclared lines of a spectrum do to the tones of a site."""
     doubtful: list[tuple[float, Line, str]] = []
     seen: list[tuple[float, Line, str]] = []
+    fitted: list[str] = []
     for line in undeclared(found, site):
+        if any(abs(line.frequency_hz - one) < APART_HZ for one in settings.lines_hz):
+            fitted.append(_named(line, site, found, settings))
+            continue
         worst, words = _consequence(found, line, site, settings)
         limit = FITTED_CONSEQUENCE if mains_of(line.frequency_hz, found.rate_hz) else CONSEQUENCE
         (doubtful if worst > limit else seen).append((worst, line, words))
+    if fitted:
+        yield Finding(
+            "fitted_line",
+            f"magnetometer: undeclared lines: {'; '.join(fitted)}. They are fitted beside the"
+            f" tones, by a window of {settings.window:.3g} s. Declare what transmits, or switch it"
+            " off.",
+            Verdict.TRUSTWORTHY,
+        )
     for group, verdict in ((doubtful, Verdict.DOUBTFUL), (seen, Verdict.TRUSTWORTHY)):
         if not group:
             continue
