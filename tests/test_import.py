@@ -57,6 +57,13 @@ def table(path: Path, names: str, *columns: np.ndarray, delimiter: str = ",") ->
     return path
 
 
+@pytest.fixture(autouse=True)
+def _unchecked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the check, which has its own tests, but where it is what is tested."""
+    if "check" not in request.node.name:
+        monkeypatch.setattr("magfusion.jobs.check.run_check", lambda _: Figures())
+
+
 @pytest.fixture
 def tables(tmp_path: Path) -> dict[str, Path]:
     """Return the tables of a recording, in units of their own."""
@@ -91,7 +98,7 @@ def assert_same(log: Log, truth: bool = True, begin: float = 0.0) -> None:
 # Formats --------------------------------------------------------------------------------------
 
 
-def test_tables_of_other_names_and_units_are_the_log_they_were_made_of(
+def test_tables_of_other_names_and_units_are_checked_and_the_log_they_were_made_of(
     tables: dict[str, Path], tmp_path: Path
 ) -> None:
     log, figures = imported(tmp_path / "log", maps=(*IMU_MAP, *FIELD_MAP, *TRUTH_MAP), **tables)

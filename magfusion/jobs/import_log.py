@@ -212,7 +212,11 @@ def _checked(directory: Path, output: Path, found: Gathered, site: Path | None) 
     except InputError as error:
         sentence = str(error)
         for stream, plan in found.plans.items():
-            sentence = sentence.replace(str(directory / f"{stream}.parquet"), _place(plan))
+            file = str(directory / f"{stream}.parquet")
+            if file in sentence:
+                # The remedy of a log's reader is to change the numbers.
+                fact = sentence.rpartition(";")[0].replace(file, _place(plan))
+                sentence = f"{fact}; correct the units in --map."
         raise InputError(sentence.replace(str(directory), str(output))) from error
     return Figures(*(f for f in figures.all if f.section is not Section.TITLE))
 

@@ -81,7 +81,7 @@ def first_stamp(path: Path, topic: str) -> int:
     """
     with _opened(path) as reader:
         connections = [c for c in reader.connections if c.topic == topic]
-        for _, arrived, raw in reader.messages(connections):
+        for _, arrived, raw in reader.messages(connections) if connections else ():
             message: Any = reader.deserialize(raw, connections[0].msgtype)
             header = getattr(message, "header", None)
             return int(arrived) if header is None else stamp_ns(header)

@@ -13,11 +13,13 @@ from magfusion.files.foreign.plan import Plan
 from magfusion.files.foreign.source import Part
 from magfusion.files.foreign.units import NO_STAMP, Raw, to_nanoseconds
 from magfusion.files.inertial_tables import MOST_MISSING, MOST_TWICE
+from magfusion.files.plausible import SHORTEST_STEP
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, LONGEST_GAP, ROWS_PER_GROUP
 from magfusion.files.table import TIME as TIME_NS
 from magfusion.units import NANOSECOND, AnyArray, Array, BoolArray, IntArray
 
 MOST_BACK = 1.0  # s; further back, a clock was set or wrapped around
+STEPS = {"imu": (SHORTEST_STEP, 0.5), "magnetometer": (1e-6, 0.5)}  # s
 LEAST_QUATERNION = 1e-6  # of its length; trackers write zeros where they see nothing
 
 
@@ -214,6 +216,15 @@ def _check(plan: Plan, counts: Counts) -> None:
             f"{place}: {twice} of {counts.read} rows have the stamp of another: the times are"
             f" coarser than the sampling; map a finer column to {stream}.time, or give --rate-hz"
             f" {stream}=HZ."
+        )
+    step = (counts.last - counts.first) * NANOSECOND / max(1, counts.written - 1)
+    least, most = STEPS.get(stream, (0.0, np.inf))
+    if counts.written > 1 and not least <= step <= most:
+        kind = "slow" if step > most else "fast"
+        raise InputError(
+            f"{place}: the rows of {stream} are {step:.3g} s apart (mean), which is too {kind} for"
+            f" such a sensor: {stream}.time is probably in another unit; write it by --map"
+            f" '{stream}.time=NAME[unit]'."
         )
     if counts.missing > MOST_MISSING * counts.written:
         raise InputError(

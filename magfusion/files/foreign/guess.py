@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.files.foreign.columns import STREAMS, TIME
+from magfusion.files.foreign.columns import STREAMS, TIME, Term
 from magfusion.files.foreign.source import Column
 from magfusion.files.foreign.units import (
     ISO,
@@ -41,17 +41,20 @@ _SHORT = {
     "q": ("q",),
 }
 _TIMES = ("time", "timestamp", "timestamps", "stamp", "epoch", "clock", "elapsed", "datetime")
-_SHORT_TIMES = ("t", "ts", "utc", "sec", "seconds", "date")
+_SHORT_TIMES = ("t", "ts", "utc", "sec", "seconds", "date", "zeit", "temps", "tiempo", "tempo")
+# Of messages of ROS written as text, whose stamps are in two columns.
+_WHOLE = re.compile(r"stamp\W*(secs?|seconds)$", re.I)
+_REST = re.compile(r"stamp\W*(nsecs?|nanosecs?|nanoseconds)$", re.I)
 _NOT_MEASURED = re.compile(r"bias|cov|std|sigma|var(?!io)|temp|offset|status|uncal|error")
 _OF_STREAM = {
     "imu": re.compile(r"imu|gyr|acc|inertial"),
     "magnetometer": re.compile(r"mag|field|fgm|flux"),
     "truth": re.compile(r"truth|gt|ref|mocap|vicon|opti|pose|odom"),
 }
-SURE_RATIO = 3.0  # of a typical size, within which a unit is plausible
 _TYPICAL = {Dimension.FORCE: STANDARD_GRAVITY, Dimension.FIELD: 5e-5}  # SI
 FAST = 8.0  # rad/s; a body that turns so fast on the mean is more likely measured in degrees
 FAR = 500.0  # m
+LEAST_RISING = 0.99  # of the steps of a clock
 _RATES_HZ = (5.0, 30_000.0)
 
 
@@ -77,6 +80,16 @@ def named_columns(columns: Sequence[Column], stream: str) -> dict[str, list[Name
         if (one := _named(place, column, stream)) is not None:
             found[one.target].append(one)
     return {target: _nearest(named, columns, stream) for target, named in found.items()}
+
+
+def parted_stamp(columns: Sequence[Column]) -> tuple[Term, ...]:
+    """Return seconds and nanoseconds of stamps that are in two columns, if there are such."""
+    whole = [k for k, column in enumerate(columns) if _WHOLE.search(column.name)]
+    rest = [k for k, column in enumerate(columns) if _REST.search(column.name)]
+    if len(whole) != 1 or len(rest) != 1:
+        return ()
+    units = [Unit(name, Dimension.TIME) for name in ("s", "ns")]
+    return tuple(Term(*one) for one in zip((whole[0], rest[0]), units, strict=True))
 
 
 def _named(place: int, column: Column, stream: str) -> Named | None:
@@ -205,3 +218,42 @@ def likely_time_unit(raw: Raw) -> Unit:
         ):
             return Unit(name, Dimension.TIME)
     return Unit("s", Dimension.TIME)
+
+
+def by_place(stream: str, samples: Sequence[Array]) -> dict[str, tuple[int, Unit]]:
+    """Return what the columns of a table without names may be, by their number and sizes.
+
+    Parameters
+    ----------
+    samples : sequence of ndarray
+        The first values of each column.
+    """
+    clocks = [k for k, values in enumerate(samples) if len(values) > 1 and _is_clock(values)]
+    if not clocks:
+        return {}
+    first = clocks[0]
+    found = {TIME: (first, likely_time_unit(samples[first]))}
+    others = [k for k in range(len(samples)) if k != first]
+    triples = [others[k : k + 3] for k in range(0, len(others) - len(others) % 3, 3)]
+    stems = {"imu": ("gyro", "accel"), "magnetometer": ("field",)}.get(stream, ())
+    if not stems or len(triples) < len(stems):
+        return found
+    sizes = [_sizes([samples[k] for k in triple]) for triple in triples]
+    # Gravity keeps its size while a body moves.
+    steady = min(range(len(triples)), key=lambda k: float(np.std(sizes[k]) / np.mean(sizes[k])))
+    order = [1 - steady, steady] if stream == "imu" and len(triples) == 2 else range(len(stems))
+    for stem, k in zip(stems, order, strict=False):
+        dimension = STREAMS[stream][f"{stem}_x"]
+        unit = likely_unit(dimension, sizes[k])
+        for axis, place in zip("xyz", triples[k], strict=True):
+            found[f"{stem}_{axis}"] = (place, unit)
+    return found
+
+
+def _is_clock(values: Array) -> bool:
+    steps = np.diff(values)
+    return bool(np.mean(steps > 0.0) > LEAST_RISING and np.all(np.isfinite(values)))
+
+
+def _sizes(columns: Sequence[Array]) -> Array:
+    return np.asarray(np.sqrt(np.sum(np.square(columns), axis=0)) + np.finfo(float).tiny)

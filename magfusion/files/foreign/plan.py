@@ -18,7 +18,13 @@ from magfusion.files.foreign.columns import (
     Undecided,
     resolve,
 )
-from magfusion.files.foreign.guess import likely_time_unit, likely_unit, named_columns
+from magfusion.files.foreign.guess import (
+    by_place,
+    likely_time_unit,
+    likely_unit,
+    named_columns,
+    parted_stamp,
+)
 from magfusion.files.foreign.source import Source
 from magfusion.files.foreign.units import (
     ISO,
@@ -75,10 +81,14 @@ def shown(source: Source, terms: Sequence[Term]) -> str:
     parts = []
     for term in terms:
         name = source.columns[term.place].name
-        known = term.unit.dimension is Dimension.NUMBER or name.endswith(f"[{term.unit}]")
+        known = term.unit.dimension is Dimension.NUMBER or _says(name, str(term.unit))
         unit = "" if known else f"[{term.unit}]"
         parts.append(f"{'-' if term.sign < 0.0 else ''}{name}{unit}")
     return "+".join(parts)
+
+
+def _says(name: str, unit: str) -> bool:
+    return name.endswith((f"[{unit}]", f"({unit})"))
 
 
 def as_options(stream: str, source: Source, terms: Terms) -> list[str]:
@@ -95,7 +105,7 @@ def as_options(stream: str, source: Source, terms: Terms) -> list[str]:
             done |= set(GROUPS[group])
             tag = "wxyz" if group == "quaternion" else str(every[0].unit)
             signed = [("-" if t.sign < 0.0 else "") + n for t, n in zip(every, names, strict=True)]
-            tag = "" if names[-1].endswith(f"[{tag}]") else f"[{tag}]"
+            tag = "" if all(_says(name, tag) for name in names) else f"[{tag}]"
             options.append(f"{stream}.{group}={','.join(signed)}{tag}")
         else:
             options.append(f"{stream}.{target}={shown(source, own)}")
@@ -162,6 +172,10 @@ class _Planning:
                 self.open[entry.column] = (reason.place, reason.sign, said)
 
     def guess(self, target: str, named: Sequence, optional: bool) -> None:  # type: ignore[type-arg]
+        if target == TIME and (parted := parted_stamp(self.source.columns)):
+            self.terms[target] = parted
+            self.guessed.append(target)
+            return
         if not named:
             if target == TIME and self.source.rate_hz is not None:
                 self.rate = Rate(Fraction(self.source.rate_hz))
@@ -209,9 +223,23 @@ class _Planning:
         names = ", ".join(column.name for column in self.source.columns[:30])
         what = f"no column is found for {', '.join(f'{self.stream}.{t}' for t in self.absent)}"
         remedy = f"name it by --map '{self.stream}.{self.absent[0]}=NAME[unit]'"
+        self._propose_by_place()
         if self.absent == [TIME]:
             remedy += f", or give --rate-hz {self.stream}=HZ"
         self.problem(f"{what} (found {names}); {remedy}")
+
+    def _propose_by_place(self) -> None:
+        """Propose what columns that nothing is known of may be, by their sizes."""
+        used = {term.place for terms in self.terms.values() for term in terms}
+        used |= {place for place, _, _ in self.open.values()}
+        free = [k for k in range(len(self.source.columns)) if k not in used]
+        samples = [_numbers(self.source, k) for k in free]
+        terms = {
+            target: (Term(free[place], unit),)
+            for target, (place, unit) in by_place(self.stream, samples).items()
+            if target in self.absent
+        }
+        self.told.proposals += as_options(self.stream, self.source, terms)
 
     def _tell_open(self) -> None:
         groups: dict[str, list[str]] = defaultdict(list)
@@ -221,9 +249,11 @@ class _Planning:
         for stem, targets in groups.items():
             names = [self.source.columns[self.open[t][0]].name for t in targets]
             lead = "columns" if len(names) > 1 else "column"
-            self.problem(
-                f"the unit of {lead} {', '.join(names)} is not said, for {self.stream}.{stem}"
-            )
+            size = _size(self.source, [self.open[t][0] for t in targets])
+            size = size[np.isfinite(size)]
+            sized = f" (median size {np.median(size):.4g})" if len(size) and stem != TIME else ""
+            named = f"the unit of {lead} {', '.join(names)}"
+            self.problem(f"{named} is not said, for {self.stream}.{stem}{sized}")
         terms: Terms = {t: (self._likely(t, p, sign),) for t, (p, sign, _) in self.open.items()}
         self.told.proposals += as_options(self.stream, self.source, terms)
 
@@ -259,9 +289,17 @@ def _sample(source: Source, place: int, as_written: bool) -> Raw:
     return np.zeros(0) if part is None else part.columns[0]
 
 
+def _numbers(source: Source, place: int) -> Array:
+    """Return the first values of a column, none where they are no numbers."""
+    try:
+        return np.asarray(_sample(source, place, False), dtype=np.float64)
+    except (TypeError, ValueError):
+        return np.zeros(0)
+
+
 def _size(source: Source, places: Sequence[int]) -> Array:
     """Return lengths of the vectors that columns make."""
-    samples = [np.asarray(_sample(source, place, False), dtype=np.float64) for place in places]
+    samples = [_numbers(source, place) for place in places]
     if len({len(sample) for sample in samples}) != 1:
         return np.zeros(0)
     return np.asarray(np.sqrt(np.sum(np.square(samples), axis=0)))

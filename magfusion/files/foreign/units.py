@@ -87,6 +87,7 @@ _SPELLINGS = {
     Dimension.SPEED: {**dict.fromkeys(("mps", "m_s", "ms", "ms-1", "m/sec"), "m/s")},
     Dimension.NUMBER: {"": "1", "-": "1"},
 }
+_ISO = r"^\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.]\d{1,9})?)?(Z|[-+]\d\d:?\d\d)?$"
 _SCALED = re.compile(r"(?P<factor>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?)\*(?P<unit>.*)", re.I)
 
 
@@ -245,9 +246,10 @@ def _dates(raw: Raw) -> IntArray:
     for zone in (None, "UTC"):
         try:
             return _of_timestamps(pc.cast(text, pa.timestamp("ns", zone)))
-        except pa.ArrowInvalid as error:
-            found = re.search(r"'(.*)' as a scalar", str(error))
-    raise ValueError(found[1] if found else "what is no date")
+        except pa.ArrowInvalid:
+            continue
+    bad = pc.filter(text, pc.invert(pc.fill_null(pc.match_substring_regex(text, _ISO), True)))
+    raise ValueError(bad[0].as_py() if len(bad) else "dates of several kinds")
 
 
 def _of_timestamps(stamps: pa.Array) -> IntArray:

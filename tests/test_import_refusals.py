@@ -1,0 +1,240 @@
+"""Slips of an import: each is told by its cause, all at once, and nothing is left behind."""
+
+import re
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import Refuse
+from example_bag import FIELD, SENSORS, field_message, write_bag
+
+from magfusion.cli import main
+
+ROWS = 400
+_rng = np.random.default_rng(5)
+TIME = 5.0 * np.arange(ROWS)  # ms
+RATES = 20.0 * _rng.standard_normal((ROWS, 3))  # deg/s
+FORCES = np.array([0.0, 0.0, 1.0]) + 0.01 * _rng.standard_normal((ROWS, 3))  # g
+FIELDS = np.array([2e4, 0.0, -4e4]) + 1e3 * _rng.standard_normal((ROWS, 3))  # nT
+IMU_HEAD = "t_ms,GyrX_dps,GyrY_dps,GyrZ_dps,AccX_g,AccY_g,AccZ_g"
+FIELD_HEAD = "t_ms,Bx_nT,By_nT,Bz_nT"
+
+
+def rows_of(*columns: np.ndarray) -> list[list[str]]:
+    return [[f"{v:.6f}" for v in row] for row in np.column_stack(columns)]
+
+
+def write(path: Path, head: str, rows: list[list[str]]) -> None:
+    path.write_text("\n".join([head, *(",".join(row) for row in rows)]) + "\n")
+
+
+@pytest.fixture
+def tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a directory with two tables that say all of themselves."""
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path / "imu.csv", IMU_HEAD, rows_of(TIME, RATES, FORCES))
+    write(tmp_path / "mag.csv", FIELD_HEAD, rows_of(TIME, FIELDS))
+    return tmp_path
+
+
+def told(capfd: pytest.CaptureFixture[str], line: str) -> str:
+    """Return what an import that is refused says; it must leave nothing behind."""
+    before = sorted(Path().rglob("*"))
+    with pytest.raises(SystemExit) as ended:
+        main(["import", *shlex.split(line), "-o", "log"])
+    out, err = capfd.readouterr()
+    assert (ended.value.code, out) == (2, ""), err
+    assert err.startswith("magfusion: ")
+    assert "Traceback" not in err
+    assert sorted(Path().rglob("*")) == before
+    return err
+
+
+# What is typed --------------------------------------------------------------------------------
+
+BOTH = "imu.csv mag.csv"
+SLIPS = [
+    ("", "nothing to import"),
+    ("nowhere.csv mag.csv", "nowhere.csv: there is no such file"),
+    ("imu.csv", "No table is given for the magnetometer; give --magnetometer FILE"),
+    ("--imu imu.csv --magnetometer imu.csv", "imu.csv: no column is found for magnetometer.field"),
+    (f"{BOTH} imu.csv", "imu.csv and imu.csv both hold the imu"),
+    (f"{BOTH} --map imu.gyro", "write TABLE.COLUMN=NAME.unit., as 'imu.gyro_x=GyrX"),
+    (f"{BOTH} --map 'gyro.x=GyrX_dps[deg/s]'", "gyro is no table; write one of imu, magnet"),
+    (f"{BOTH} --map 'imu.gyr_x=GyrX_dps[deg/s]'", "gyr_x is no column of imu; .*gyro_x"),
+    (f"{BOTH} --map 'imu.gyro_x=GyroX[deg/s]'", "no column GyroX .*found t_ms, GyrX_dps.*is it G"),
+    (f"{BOTH} --map 'imu.gyro_x=GyrX_dps[deg]'", "'deg' is no unit of angular rate; .*rad/s, mr"),
+    (f"{BOTH} --map 'imu.accel_z=AccZ_g[T]'", "'T' is no unit of specific force; .*mg, ug"),
+    (f"{BOTH} --map 'imu.time=t_ms[msk]'", "'msk' is no unit of time; .*s, ms, us, ns, min, h, is"),
+    (f"{BOTH} --map 'imu.time=t_ms[0*ms]'", "'0.ms' is no unit of time"),
+    (f"{BOTH} --map 'imu.time=t_ms[iso]'", "found '0.000000', which is no time in iso"),
+    (f"{BOTH} --map 'imu.gyro=GyrX_dps,GyrY_dps[deg/s]'", "gyro takes 3 names, .*found 2"),
+    (f"{BOTH} --map 'truth.time=t[s]'", "no file is given for truth; give --truth FILE"),
+    (f"{BOTH} --map 'imu.time=t_ms[ms]' --map 'imu.time=t_ms[s]'", "imu.time is given twice"),
+    ("imu.csv --truth mag.csv --map 'truth.quaternion=a,b,c,d'", "order of the quaternion.*wxyz"),
+    (f"{BOTH} --map 'imu.time=t_ms[ms]' --rate-hz imu=200", "imu.time and --rate-hz imu are given"),
+    (f"{BOTH} --rate-hz imu=0", "--rate-hz 'imu=0': write TABLE=HZ"),
+    (f"{BOTH} --rate-hz gyro=200", "--rate-hz 'gyro=200': write TABLE=HZ with a table of imu"),
+    (f"{BOTH} --delimiter semi", "--delimiter 'semi': write one character, or one of comma"),
+    (f"{BOTH} --delimiter ';'", "imu.csv: holds no table of numbers .first line: 't_ms,Gyr"),
+    (f"{BOTH} --epoch noon", "--epoch 'noon': write a stamp in ns, or first"),
+    (f"{BOTH} --site nosite.yaml", "nosite.yaml: there is no such file"),
+    (f"{BOTH} --map-file nomap.yaml", "nomap.yaml: there is no such file"),
+    (f"{BOTH} --map 'imu.time=t_ms[s]'", "rows of imu are 5 s apart .*probably in another unit"),
+    (
+        f"{BOTH} --map 'imu.time=t_ms[ns]'",
+        "rows of imu are 5e-09 s apart .mean., which is too fast",
+    ),
+    (f"{BOTH} --map 'imu.gyro=GyrX_dps,GyrY_dps,GyrZ_dps[10*rad/s]'", "imu.csv as imu.*deg/s"),
+    (f"{BOTH} --map 'magnetometer.field=Bx_nT,By_nT,Bz_nT[uT]'", "mag.csv as magnetometer.*unit"),
+    (f"{BOTH} --rate-hz 'imu=200@500'", "imu and magnetometer have no moment in common.*one clock"),
+]
+
+
+@pytest.mark.parametrize(("line", "pattern"), SLIPS)
+def test_a_slip_is_told_by_its_cause(
+    line: str, pattern: str, tables: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert tables.is_dir()
+    assert re.search(pattern, told(capfd, line), re.S)
+
+
+# What is in the file --------------------------------------------------------------------------
+
+
+def _cell(row: int, column: int, text: str) -> Callable[[list[list[str]]], None]:
+    def change(rows: list[list[str]]) -> None:
+        rows[row][column] = text
+
+    return change
+
+
+def _later(rows: list[list[str]], begin: int, by: float) -> None:
+    for row in rows[begin:]:
+        row[0] = f"{float(row[0]) + by:.6f}"
+
+
+SPOILED: list[tuple[Callable[[list[list[str]]], object], str]] = [
+    (_cell(7, 1, "ERR"), r"column Bx_nT, row 7 of the data .*found 'ERR'; write a number, or nan"),
+    (_cell(7, 0, "noon"), r"column t_ms: found 'noon', which is no time in ms"),
+    (lambda rows: _later(rows, 200, 4e6), r"time, row 200 .*4000\S* s after .*the clock jumped"),
+    (lambda rows: _later(rows, 200, -5e3), r"row 200 .*goes back by .*a counter wrapped around"),
+    (
+        lambda rows: [r.__setitem__(0, "") for r in rows],
+        "none of 400 rows can be used .400 without a time",
+    ),
+    (lambda rows: [r.__setitem__(2, "nan") for r in rows[::3] + rows[1::3]], "lack a number of m"),
+    (lambda rows: [r.__setitem__(0, f"{float(r[0]) // 50 * 50}") for r in rows], "coarser than"),
+    (lambda rows: rows.clear(), "holds no table of numbers"),
+]
+
+
+@pytest.mark.parametrize(("change", "pattern"), SPOILED)
+def test_a_spoiled_table_is_refused_by_column_row_and_cause(
+    change: Callable[[list[list[str]]], object],
+    pattern: str,
+    tables: Path,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    rows = rows_of(TIME, FIELDS)
+    change(rows)
+    write(tables / "mag.csv", FIELD_HEAD, rows)
+    sentence = told(capfd, BOTH)
+    assert "mag.csv" in sentence
+    assert re.search(pattern, sentence)
+    assert sentence.count("\n") == 1
+
+
+def test_a_column_that_is_there_twice_is_named_by_its_place(
+    tables: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write(tables / "mag.csv", "t_ms,B,B,B", rows_of(TIME, FIELDS))
+    sentence = told(capfd, f"imu.csv --magnetometer mag.csv --map '{_field('B,B,B')}'")
+    assert "column B is there 3 times" in sentence
+    assert "one of #1, #2, #3" in sentence
+    line = f"import imu.csv --magnetometer mag.csv --map '{_field('#1,#2,#3')}' -o log"
+    with pytest.raises(SystemExit) as ended:
+        main(shlex.split(line))
+    assert not ended.value.code
+
+
+def _field(names: str) -> str:
+    return f"magnetometer.field={names}[nT]"
+
+
+def test_all_problems_are_told_at_once_with_what_would_decide_them(
+    tables: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    write(tables / "imu.csv", "time,wx,wy,wz,ax,ay,az", rows_of(TIME, RATES, FORCES))
+    write(tables / "mag.csv", "time,Bx,By,Bz", rows_of(1e3 * TIME, FIELDS))
+    said = told(capfd, BOTH)
+    assert "for 5 problems" in said
+    proposed = [line.strip(" \\") for line in said.splitlines() if line.startswith("  --map")]
+    assert proposed == [
+        "--map 'imu.time=time[ms]'",
+        "--map 'imu.gyro=wx,wy,wz[deg/s]'",
+        "--map 'imu.accel=ax,ay,az[g]'",
+        "--map 'magnetometer.time=time[us]'",
+        "--map 'magnetometer.field=Bx,By,Bz[nT]'",
+    ]
+    with pytest.raises(SystemExit) as ended:  # as it can be pasted
+        main(shlex.split(f"import {BOTH} -o log {' '.join(proposed)}"))
+    assert not ended.value.code
+
+
+def test_what_is_in_the_way_is_kept(tables: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tables / "log").mkdir()
+    (tables / "log" / "notes.txt").write_text("mine")
+    assert "holds other files" in told(capfd, BOTH)
+    (tables / "log" / "notes.txt").unlink()
+    for _ in range(2):  # its own log is replaced
+        with pytest.raises(SystemExit) as ended:
+            main(["import", "imu.csv", "mag.csv", "-o", "log"])
+        assert not ended.value.code
+    capfd.readouterr()
+    assert "is a log of magfusion already" in told(capfd, "log")
+
+
+def test_lengths_that_differ_and_a_missing_package(
+    tables: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with h5py.File(tables / "all.h5", "w") as file:
+        file["t"], file["B"] = TIME, FIELDS[:-1]
+    maps = "--map 'magnetometer.time=t[ms]' --map 'magnetometer.field=B[nT]'"
+    sentence = told(capfd, f"imu.csv --magnetometer all.h5 {maps}")
+    assert re.search("t has 400 rows, B:. has 399 rows", sentence)
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    assert "pip install 'magfusion[import]'" in told(capfd, f"imu.csv --magnetometer all.h5 {maps}")
+
+
+@pytest.mark.parametrize(
+    ("maps", "pattern"),
+    [
+        ("", r"several topics may be magnetometer: /imu/mag, /mag2.*--map magnetometer=/imu/mag"),
+        ("--map imu=/gyro", "has no topic /gyro for imu .found /imu/data, /imu/mag, /mag2"),
+        ("--map imu=/mag2", "topic /mag2 is of sensor_msgs/msg/MagneticField, which is none of"),
+        ("--map 'imu=/imu/data[deg/s]'", "messages of sensor_msgs/msg/Imu are in SI"),
+        ("--map 'magnetometer=/mag2[deg]'", r"write one of T, mT, uT, nT"),
+        ("--map 'imu.gyro_x=a[deg/s]'", "a bag's columns are known; name the topic"),
+        ("--map magnetometer=/mag2 --epoch /pps", "has no message of /pps for --epoch"),
+    ],
+)
+def test_a_bag_of_which_something_is_open(
+    maps: str,
+    pattern: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_bag(tmp_path / "run", SENSORS | {"/mag2": (FIELD, field_message)})
+    assert re.search(pattern, told(capfd, f"run {maps}"), re.S)
+
+
+def test_a_single_problem_is_one_sentence(tables: Path, refuse: Refuse) -> None:
+    sentence = refuse("import", tables / "imu.csv", "-o", tables / "log")
+    assert "give --magnetometer FILE" in sentence
