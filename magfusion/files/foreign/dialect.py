@@ -140,7 +140,8 @@ def _way_of_writing(
     lines: Sequence[str], delimiters: Sequence[str], path: Path
 ) -> tuple[str, str, int]:
     """Return delimiter, decimal sign and number of columns that make most cells numbers."""
-    sample = [line for line in lines if line and not line.startswith(COMMENTS)][-SAMPLE:]
+    filled = [line for line in lines if line and not line.startswith(COMMENTS)]
+    sample = filled[len(filled) // 3 :][-SAMPLE:]  # the first are names, if there are any
     best, found = 0.0, None
     for sign in delimiters:
         rows = [cells_of(line, sign) for line in sample]

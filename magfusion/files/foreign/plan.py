@@ -234,7 +234,7 @@ class _Planning:
         used |= {place for place, _, _ in self.open.values()}
         free = [k for k in range(len(self.source.columns)) if k not in used]
         samples = [_numbers(self.source, k) for k in free]
-        terms = {
+        terms: Terms = {
             target: (Term(free[place], unit),)
             for target, (place, unit) in by_place(self.stream, samples).items()
             if target in self.absent
