@@ -245,10 +245,14 @@ def _figures(found: Gathered, counts: dict[str, Counts], epoch_ns: int, is_first
                 for reason, count in one.left_out.items()
             ),
         )
-    lines = [f"--map {_quoted(line)}" for plan in found.plans.values() for line in plan.options()]
     forms = {p.source.place: p.source.form for p in found.plans.values() if p.source.form}
-    lines = [f"{place}: {form}" for place, form in forms.items()] + lines
-    figures |= Figures(Figure("map", lines, section=Section.REMARKS))
+    lines = [line for plan in found.plans.values() for line in plan.options()]
+    shown = [f"{place}: {form}" for place, form in forms.items()]
+    shown += ["understood as:", *(f"  --map {_quoted(line)}" for line in lines)]
+    figures |= Figures(
+        Figure("map", lines, section=Section.REPORT),
+        Figure("understood", shown, section=Section.REMARKS),
+    )
     if not is_first and abs(counts["imu"].first - epoch_ns) * 1e-9 > LATE:
         begin = (counts["imu"].first - epoch_ns) * 1e-9
         text = (
