@@ -82,6 +82,28 @@ def test_a_stream_leads_to_the_states_of_the_log(walk: OnlineLog, site: Path, fo
     assert 5 <= len(waiting) <= 8
 
 
+@pytest.mark.parametrize("form", ["json", "msgpack"])
+def test_nan_and_null_are_missing_samples_as_in_tables(
+    walk: OnlineLog, site: Path, form: Format
+) -> None:
+    """The same states as where the samples were never sent, and a count at the end."""
+    lines = [json.loads(line) for line in records(walk).splitlines()]
+    inertial = [k for k, one in enumerate(lines) if "imu" in one][200:1000:100]
+    left = [one for k, one in enumerate(lines) if k not in inertial]
+    spoiled = [json.loads(json.dumps(one)) for one in lines]
+    for k, value in zip(inertial, (np.nan, None) * len(inertial), strict=False):
+        gyro = np.array(spoiled[k]["imu"]["gyro"], dtype=object)
+        gyro[..., 1] = value
+        spoiled[k]["imu"]["gyro"] = gyro.tolist()
+    write = msgpack.packb if form == "msgpack" else lambda one: json.dumps(one).encode() + b"\n"
+    settings = StreamSettings(EKF.navigator, form)
+    expected, _ = answered(site, b"".join(write(one) for one in left), settings)
+    found, told = answered(site, b"".join(write(one) for one in spoiled), settings)
+    count = sum(np.size(lines[k]["imu"]["time"]) for k in inertial)
+    assert [s for s in found if s["started"]] == [s for s in expected if s["started"]]
+    assert told == f"magfusion: imu: {count} samples are NaN. They are left out.\n"
+
+
 def test_a_state_tells_all_that_is_known(walk: OnlineLog, site: Path) -> None:
     last = answered(site, records(walk))[0][-1]
     truth = walk.motion.trajectory(np.array([last["time"]]))
@@ -148,7 +170,13 @@ FIELDS = {"time": 1.0, "window": 0.4, "sigma": 1e-9, "phasors": {"A": [[VECTOR, 
         ({"imu": {"time": True, "gyro": VECTOR, "accel": VECTOR}}, "imu.time: found True; it sho"),
         ({"imu": {"time": 1, "gyro": [1, 2], "accel": VECTOR}}, "imu.gyro: found [1, 2]; it shoul"),
         ({"imu": {"time": [1, 2], "gyro": VECTOR, "accel": VECTOR}}, "gyro has 1 rows for 2 times"),
-        (b'{"magnetometer": {"time": 1, "field": [1, 2, NaN]}}', "magnetometer.field: found [1, 2"),
+        (b'{"magnetometer": {"time": 1, "field": [1, 2, 1e999]}}', "magnetometer.field: found [1"),
+        (b'{"magnetometer": {"time": 1, "field": [1, 2, "3"]}}', "magnetometer.field: found [1, 2"),
+        (
+            b'{"magnetometer": {"time": 1, "field": [1, true, null]}}',
+            "magnetometer.field: found [1",
+        ),
+        (b'{"magnetometer": {"time": NaN, "field": [1, 2, 3]}}', "magnetometer.time: found nan"),
         (b'{"magnetometer": {"time": 1e999, "field": [1, 2, 3]}}', "magnetometer.time: found inf"),
         ({"fields": {**FIELDS, "window": 0.0}}, "fields.window: found 0.0; "),
         ({"fields": {**FIELDS, "sigma": None}}, "it should have either sigma or covariance"),

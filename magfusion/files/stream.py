@@ -8,6 +8,7 @@ from typing import Annotated, Any, BinaryIO, Literal
 
 import msgpack
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, PlainValidator, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
@@ -25,15 +26,32 @@ LONGEST_LIST = 1 << 17
 LATEST = 1e-9 * LARGEST_TIME_NS  # s
 
 
-def _numbers(value: object, what: str) -> Array:
-    """Return finite numbers as an array; NumPy alone would take text and truth values too."""
+def _numbers(value: object, what: str, *, missing: bool = False) -> Array:
+    """Return finite numbers as an array; NumPy alone would take text and truth values too.
+
+    Parameters
+    ----------
+    missing : bool
+        Whether null and NaN are taken, for a sample that is not there.
+    """
     try:
         found = np.asarray(value)
     except ValueError:
         found = np.empty(0, dtype=object)
-    if found.dtype.kind not in "iuf" or not np.all(np.abs(found) < LARGEST_NUMBER):
+    if missing and found.dtype.kind == "O":
+        found = _with_nulls(found)
+    sound = np.abs(found) < LARGEST_NUMBER if found.dtype.kind in "iuf" else np.zeros(1, dtype=bool)
+    if missing and found.dtype.kind == "f":
+        sound |= np.isnan(found)
+    if not np.all(sound):
         raise PydanticCustomError("numbers", "it should be {what}, finite", {"what": what})
     return np.asarray(found, dtype=float)
+
+
+def _with_nulls(found: NDArray[np.object_]) -> NDArray[np.generic]:
+    """Return numbers with NaN for null; as it is where it holds anything else."""
+    kinds = {type(one) for one in found.ravel()}
+    return found.astype(float) if kinds <= {int, float, type(None)} and found.size else found
 
 
 def _times(value: object) -> Array:
@@ -44,7 +62,7 @@ def _times(value: object) -> Array:
 
 
 def _vectors(value: object) -> Array:
-    found = np.atleast_2d(_numbers(value, "three numbers, or a list of such"))
+    found = np.atleast_2d(_numbers(value, "three numbers, or a list of such", missing=True))
     if found.ndim != 2 or found.shape[1] != 3:
         raise PydanticCustomError("vectors", "it should be three numbers, or a list of such")
     return found
@@ -79,7 +97,7 @@ class _Arrays(StrictModel):
 
 
 class ImuRecord(_Arrays):
-    """Inertial samples: stamps (k,), rates and specific forces (k, 3)."""
+    """Inertial samples: stamps (k,), rates and specific forces (k, 3); NaN where missing."""
 
     time: Annotated[Array, PlainValidator(_times)]
     gyro: Annotated[Array, PlainValidator(_vectors)]
@@ -92,7 +110,7 @@ class ImuRecord(_Arrays):
 
 
 class MagnetometerRecord(_Arrays):
-    """Raw samples of the magnetometer: stamps (k,), fields (k, 3) (T)."""
+    """Raw samples of the magnetometer: stamps (k,), fields (k, 3) (T); NaN where missing."""
 
     time: Annotated[Array, PlainValidator(_times)]
     field: Annotated[Array, PlainValidator(_vectors)]
@@ -148,6 +166,12 @@ def _check_lengths(time: Array, **rows: Array) -> None:
             given = {"name": name, "rows": len(values), "times": len(time)}
             text = "{name} has {rows} rows for {times} times; they should be as many"
             raise PydanticCustomError("lengths", text, given)
+
+
+def whole_rows(time: Array, *values: Array) -> tuple[Array, ...]:
+    """Return stamps (k,) and values (k, 3) without the rows of which a number is missing."""
+    whole = np.all([np.all(np.isfinite(rows), axis=1) for rows in values], axis=0)
+    return time[whole], *(rows[whole] for rows in values)
 
 
 def field_samples(entry: FieldsRecord, channels: tuple[tuple[str, int], ...]) -> FieldSamples:

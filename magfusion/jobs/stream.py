@@ -1,5 +1,6 @@
 """Navigation in a pipe: records in, a state out at every epoch; and a log as such records."""
 
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
@@ -20,6 +21,7 @@ from magfusion.files.stream import (
     field_samples,
     json_line,
     read_records,
+    whole_rows,
 )
 from magfusion.jobs.checkpoint import begin, save
 from magfusion.model.site import Site
@@ -87,9 +89,10 @@ def run_stream(
     navigator = begin(place, key, site, settings.navigator, None, resume=settings.resume).navigator
     view = open_live_view(site) if settings.live else None
     refused, saved, reached = 0, -np.inf, -np.inf
+    missing: Counter[str] = Counter()
     for numbered in read_records(source, settings.form):
         try:
-            newest = _take_in(navigator, site, numbered)
+            newest = _take_in(navigator, site, numbered, missing)
         except InputError as error:
             sentence = f"standard input, {_PLACE[settings.form]} {numbered.number}: {error}"
             if not settings.keep_going:
@@ -109,22 +112,30 @@ def run_stream(
         if place is not None and newest >= saved + settings.every:
             save(navigator, numbered.number, None, place, key)
             saved = newest
+    for stream, count in missing.items():
+        messages.write(f"magfusion: {stream}: {count} samples are NaN. They are left out.\n")
     if refused:
         messages.write(f"magfusion: {refused} records were passed over\n")
     return refused
 
 
-def _take_in(navigator: Navigator, site: Site, numbered: Numbered) -> float:
-    """Give a record to the navigator; return the newest time in it (s)."""
+def _take_in(navigator: Navigator, site: Site, numbered: Numbered, missing: Counter[str]) -> float:
+    """Give a record to the navigator, and count what it lacks; return the newest time in it (s)."""
     if numbered.record is None:
         raise InputError(numbered.refusal)
     record, newest = numbered.record, -np.inf
     if record.imu is not None:
-        navigator.add_imu(record.imu.time, record.imu.gyro, record.imu.accel)
-        newest = max(newest, _last(record.imu.time))
+        time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
+        if len(time):
+            navigator.add_imu(time, gyro, accel)
+        missing += Counter(imu=len(record.imu.time) - len(time))
+        newest = max(newest, _last(time))
     if record.magnetometer is not None:
-        navigator.add_magnetometer(record.magnetometer.time, record.magnetometer.field)
-        newest = max(newest, _last(record.magnetometer.time))
+        time, field = whole_rows(record.magnetometer.time, record.magnetometer.field)
+        if len(time):
+            navigator.add_magnetometer(time, field)
+        missing += Counter(magnetometer=len(record.magnetometer.time) - len(time))
+        newest = max(newest, _last(time))
     if record.fields is not None:
         navigator.add_fields(field_samples(record.fields, site.channels))
         newest = max(newest, record.fields.time)
