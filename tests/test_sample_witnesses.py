@@ -27,6 +27,7 @@ from spoiled_log import (
 
 from magfusion.estimation.integrity.compasses import still_means
 from magfusion.estimation.integrity.first_look import first_look
+from magfusion.estimation.integrity.inertial_noise import noisy_inertial, white_density
 from magfusion.estimation.integrity.recording import recorded
 from magfusion.estimation.integrity.samples import clipped
 from magfusion.estimation.integrity.spectrum import aliased, mains_of
@@ -175,6 +176,31 @@ def test_compasses_know_gravity_and_field_without_a_beacon() -> None:
     assert size == pytest.approx(np.linalg.norm(earth), rel=0.01)
     dip = np.arccos(earth[2] / np.linalg.norm(earth))
     assert np.median(means.angle) == pytest.approx(dip, abs=0.03)
+
+
+@pytest.mark.parametrize("motion", ["walk", "turn"])
+def test_white_noise_is_measured_in_motion(motion: str) -> None:
+    one = good(motion)
+    imu_declared = one.site.platform.imu
+    for value, density in (
+        (one.log.imu.gyro_body, imu_declared.gyro_noise),
+        (one.log.imu.accel_body, imu_declared.accel_noise),
+    ):
+        found = white_density(one.log.imu.time, value)
+        assert found is not None
+        np.testing.assert_allclose(found, density, rtol=0.25)  # the quietest blocks are below it
+
+
+@pytest.mark.parametrize("name", ["gyro_noise", "accel_noise"])
+def test_a_density_declared_ten_times_too_small_is_said(name: str) -> None:
+    one = good("turn")
+    assert not list(noisy_inertial(one.log, one.site))
+    declared = one.site.platform.imu
+    wrong = replace(declared, **{name: getattr(declared, name) / 10.0})
+    site = replace(one.site, platform=replace(one.site.platform, imu=wrong))
+    (found,) = noisy_inertial(one.log, site)
+    assert found.code == "imu_noise"
+    assert name in found.text
 
 
 @pytest.mark.parametrize("motion", ["walk", "turn"])

@@ -54,6 +54,7 @@ CODES = {
     "imu_axes": "axes of the inertial sensor are exchanged",
     "imu_bias": "a bias of the inertial sensor is larger than declared",
     "imu_clock": "the IMU's clock runs at another rate than the magnetometer's",
+    "imu_noise": "the inertial samples scatter by more than is declared of their sensor",
     "imu_spikes": "single samples of the inertial sensor are false",
     "inertial_residuals": "the inertial data contradict the motion by more than was declared",
     "iron": "the fields deviate from the beacons' model from place to place",

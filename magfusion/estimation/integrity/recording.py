@@ -7,6 +7,7 @@ import numpy as np
 
 from magfusion.estimation.integrity.body_iron import IRON_SPAN, iron_on_body
 from magfusion.estimation.integrity.compasses import still_means, wrong_compasses
+from magfusion.estimation.integrity.inertial_noise import noisy_inertial
 from magfusion.estimation.integrity.samples import (
     clipped_samples,
     false_samples,
@@ -31,6 +32,7 @@ WITNESSES: tuple[Witness, ...] = (
     repeated_samples,
     clipped_samples,
     false_samples,
+    noisy_inertial,
 )
 LONGEST = 1200.0  # s; of a longer log the compasses and the spectrum are judged by its beginning
 # Of the gyroscope and the clocks: with them wrong, nothing is still in the axes it keeps.

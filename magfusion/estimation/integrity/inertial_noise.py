@@ -1,0 +1,61 @@
+"""The white noise of the inertial samples, from the samples alone, against what is declared."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import Array
+
+BLOCK = 128  # samples, in which the noise is measured
+QUIETEST = 0.1  # share of the blocks that are taken for free of vibration
+FEWEST = 4  # blocks
+MORE = 4.0  # times what is declared; a declared density is a prior with a factor of two
+
+
+def white_density(time: Array, value: Array) -> Array | None:
+    """Return the density of the white noise of each axis, shape (3,); None of too few samples.
+
+    By third differences, in which a motion that a platform makes is nearly nothing and white noise
+    of variance ``v`` has ``20 v``; in the quietest blocks, so that vibration has no part in it.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    value : ndarray, shape (n, 3)
+        In a unit; the density is in that unit per square root of hertz.
+    """
+    left = np.diff(value, n=3, axis=0)
+    count = len(left) // BLOCK
+    if count < FEWEST:
+        return None
+    blocks = left[: count * BLOCK].reshape(count, BLOCK, 3)
+    variance = np.quantile(np.mean(blocks**2, axis=1) / 20.0, QUIETEST, axis=0)
+    return np.asarray(np.sqrt(variance * float(np.median(np.diff(time)))))
+
+
+def noisy_inertial(log: Log, site: Site | None) -> Iterator[Finding]:
+    """Yield an inertial sensor whose samples scatter by far more than is declared of it."""
+    if site is None or len(log.imu) == 0:
+        return
+    imu = site.platform.imu
+    for name, key, unit, value, declared in (
+        ("gyroscope", "gyro_noise", "rad/s", log.imu.gyro_body, imu.gyro_noise),
+        ("accelerometer", "accel_noise", "m/s^2", log.imu.accel_body, imu.accel_noise),
+    ):
+        found = white_density(log.imu.time, value)
+        if found is None or not float(np.median(found)) > MORE * declared:
+            continue
+        density = float(np.median(found))
+        yield Finding(
+            "imu_noise",
+            f"{name}: even where it is quietest, its samples scatter by {density:.2g}"
+            f" {unit}/sqrt(Hz), {density / declared:.1f} times the declared {key}: what hangs on"
+            f" it is less sure than is claimed. Declare {key}: {density:.2g}, or what its data"
+            " sheet says.",
+            Verdict.DOUBTFUL,
+            50.0 + density / declared,
+        )
