@@ -76,7 +76,8 @@ def small_problem(
         measured=stacked(fields.phasor_sensor),
         sqrt_information=paired_whitening(measurement_cov(site, fields), fields.valid),
         rate_body=np.stack(rate, axis=1),
-        applied_offset=0.0,
+        applied_offset=np.zeros(n),
+        moving=np.ones(n, dtype=bool),
         by_time_offset=np.zeros((n, len(fields.channels), 6)),
         robust=loss,
     )

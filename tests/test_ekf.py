@@ -69,7 +69,7 @@ def an_epoch(site, state, blocks, rng, earth=False):
     true = moved(state, blocks, 0.3 * np.sqrt(np.diag(state.cov)) * rng.normal(size=len(state.cov)))
     pose = Trajectory(np.array([state.time]), true.world_from_body[None], true.position_world[None])
     samples = simulate_fields(site, pose, 1e-9, rng)
-    rate, offset = np.array([[0.3, -0.2, 0.5]]), site.platform.imu.time_offset
+    rate, offset = np.array([[0.3, -0.2, 0.5]]), np.array([site.platform.imu.time_offset])
     real, imaginary = 1e-7 * rng.normal(size=(2, 1, len(site.channels), 3))
     by_offset, now = real + 1j * imaginary, np.zeros(1, dtype=np.int64)
     out = [field_phasors(site, samples, now, pose, rate, offset, 1.0, by_offset)]

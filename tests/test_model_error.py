@@ -58,7 +58,9 @@ def test_epochs_that_share_their_model_error_have_the_information_of_one() -> No
     poses = Trajectory(time, np.tile(np.eye(3), (count, 1, 1)), still)
     epoch, rate = np.arange(count), np.zeros((count, 3))
     alike = alike_in_batch(still, LENGTH)
-    measured = field_phasors(site, samples, epoch, poses, rate, 0.0, 1.0, alike=alike)
+    measured = field_phasors(
+        site, samples, epoch, poses, rate, np.zeros(len(epoch)), 1.0, alike=alike
+    )
     root = measured.sqrt_information[:, 0, :3, :3]
     mean_cov = np.linalg.inv(np.sum(np.swapaxes(root, 1, 2) @ root, axis=0))
     expected = 1e-18 / count * np.eye(3) + model_error_cov(phasor[0, 0], 0.01)

@@ -80,7 +80,7 @@ def test_the_report_tells_errors_losses_latency_and_memory(smoothed: Path, worke
     for beacon in load_site(worked.log / "site.yaml").beacons:
         assert 0.0 < figures[f"distortion_{beacon.name}"] < 3.0
     assert figures["imu.time_offset_s_sigma"] < 0.5 * figures["imu.time_offset_s_prior_sigma"]
-    assert figures["determined"] == ["imu.time_offset_s"]
+    assert "imu.time_offset_s" in figures["determined"]
 
 
 def test_the_current_states_are_those_that_the_navigator_made(

@@ -43,7 +43,7 @@ from magfusion.units import DEGREE
 
 REFERENCE_TIME = 40.0  # s
 # Of the difference quotients: an epoch is 60 s away, where a drift of 1e-5 turns a tone by 0.1 rad.
-STEPS = {"drift": 1e-8}
+STEPS = {"drift": 1e-8, "clock_rate": 1e-7}
 
 ALL = choose_blocks(mixed_site(), GROUPS)
 GAINS = tuple(Block(GAIN, name, slice(i, i + 1), np.array([0.2])) for i, name in enumerate("ABC"))
@@ -92,7 +92,7 @@ def with_magnetometer_sigma(site, **sigmas):
 def well_surveyed():
     """Every prior so small that it is not worth estimating."""
     site = with_magnetometer_sigma(demo_site(), matrix=np.full((3, 3), 9e-4))
-    imu = replace(site.platform.imu, time_offset_sigma=9e-5)
+    imu = replace(site.platform.imu, time_offset_sigma=9e-5, clock_rate_sigma=9e-8)
     return replace(site, platform=replace(site.platform, imu=imu))
 
 
@@ -149,7 +149,7 @@ def test_each_block_of_the_jacobian_is_the_derivative_through_retract(block):
     def predicted(step):
         moved = retract(start, alone, step)
         # A sample is taken later than stamped: at the time of an epoch the body is not yet there.
-        late = moved.time_offset - start.time_offset
+        late = (moved.imu_offset(time) - start.imu_offset(time))[:, None]
         turned = rotation @ Rotation.from_rotvec(-rate * late).as_matrix()
         place = position - late * (rotation @ velocity_body[..., None])[..., 0]
         return real(predict_channels(moved, time, turned, place))
@@ -337,6 +337,7 @@ def test_estimates_are_named_with_the_unit_of_their_figures():
         "sensor.rotation_x_deg": DEGREE,
         "sensor.position_y_m": 1.0,
         "imu.time_offset_s": 1.0,
+        "imu.clock_rate_ppm": 1e-6,
     }
     for name, unit in units.items():
         assert told[name].change == pytest.approx(step[name] / unit, rel=1e-8), name
@@ -362,6 +363,8 @@ def test_a_refined_site_has_the_fitted_values_and_the_posterior_sigmas():
     assert imu.time_offset_sigma == pytest.approx(
         0.1 * declared.platform.imu.time_offset_sigma, rel=1e-12
     )
+    assert imu.clock_rate == fitted.clock_rate
+    assert imu.clock_rate_sigma == pytest.approx(5e-6, rel=1e-12)
     assert np.array_equal(site.beacons[1].position_world, fitted.site.beacons[1].position_world)
 
 
@@ -384,7 +387,13 @@ def test_a_refined_site_survives_its_file_and_tells_what_was_determined(tmp_path
     # The drive belongs to the log: phases and drifts are not the site's.
     steady = tuple(block for block in ALL if block.group != "phase")
     expected, found = (
-        replace(fitted, site=s, time_offset=s.platform.imu.time_offset) for s in (site, again)
+        replace(
+            fitted,
+            site=s,
+            time_offset=s.platform.imu.time_offset,
+            clock_rate=s.platform.imu.clock_rate,
+        )
+        for s in (site, again)
     )
     step = difference(expected, found, steady)
     assert np.max(np.abs(step)) < 1e-13

@@ -196,6 +196,8 @@ OUT_OF_RANGE: list[tuple[Key, Any, str]] = [
     ((*IMU, "accel_bias_sigma"), [0.1], "number"),
     ((*IMU, "time_offset_s"), NAN, "finite"),
     ((*IMU, "time_offset_sigma_s"), -0.01, "greater than or equal to 0"),
+    ((*IMU, "clock_rate_ppm"), 2e4, "between -10000 and 10000"),
+    ((*IMU, "clock_rate_sigma_ppm"), -1.0, "greater than or equal to 0"),
     ((*MOTION, "rest_gyro_rad_s"), 0.0, "greater than 0"),
     ((*MOTION, "rest_span_s"), 0.1, "greater than or equal to 0.2"),
     ((*MOTION, "speed_sigma_m_s"), "fast", "number"),
@@ -389,6 +391,7 @@ def test_what_is_left_out_takes_the_stated_defaults(tmp_path: Path) -> None:
     assert beacon.coils[0].radius is beacon.coils[0].length is None
     assert beacon.tones == ((25.0, None),)
     assert (imu.time_offset, imu.time_offset_sigma) == (0.0, 0.01)
+    assert (imu.clock_rate, imu.clock_rate_sigma) == (0.0, 5e-5)
     zeros: list[Array] = [
         beacon.coils[0].centre_beacon,
         *vars(beacon.sigma).values(),
@@ -502,7 +505,7 @@ def _random_site(rng: np.random.Generator) -> Site:
             rng.uniform(size=3),
         ),
     )
-    imu = type(demo.platform.imu)(*rng.uniform(1e-6, 1.0, 8))
+    imu = type(demo.platform.imu)(*rng.uniform(1e-6, 1.0, 8), *(rng.uniform(1.0, 1e3, 2) / 1e6))
     motion = MotionModel(*rng.uniform(0.5, 1.0, len(vars(MotionModel()))))
     magnetometer = dataclasses.replace(magnetometer, offset_walk=1e-8 * rng.uniform())
     return dataclasses.replace(

@@ -47,7 +47,7 @@ def surveyed_exactly(site: Site) -> Site:
 
 
 def simulated(
-    seed: int, *, synchronised: bool = True, time_offset: float = 0.004
+    seed: int, *, synchronised: bool = True, time_offset: float = 0.004, clock_rate: float = 0.0
 ) -> tuple[Site, SimulatedLog]:
     site = replace(demo_site(coil_radius=None, synchronised=synchronised), model_error=1e-5)
     config = SimulationConfig(
@@ -56,6 +56,7 @@ def simulated(
         motion="turn",
         rests=Rests(start=2.0, move=12.0, pause=2.0),
         time_offset=time_offset,
+        clock_rate=clock_rate,
     )
     return site, simulate_log(site, config, np.random.default_rng(seed))
 
@@ -124,14 +125,25 @@ def test_velocities_and_biases_are_the_true_ones(plain: Run) -> None:
     assert np.all(np.abs(bias) < 5e-4)  # rad/s; a tenth of its prior
 
 
-@pytest.mark.parametrize(("seed", "time_offset"), [(2, 0.012), (3, -0.009), (4, 0.0)])
-def test_the_time_offset_is_recovered_within_three_sigma(seed: int, time_offset: float) -> None:
-    site, made = simulated(seed, time_offset=time_offset)
+@pytest.mark.parametrize(
+    ("seed", "time_offset", "clock_rate"), [(2, 0.012, 8e-5), (3, -0.009, -5e-5), (4, 0.0, 0.0)]
+)
+def test_the_imus_clock_is_recovered_within_three_sigma(
+    seed: int, time_offset: float, clock_rate: float
+) -> None:
+    site, made = simulated(seed, time_offset=time_offset, clock_rate=clock_rate)
     result = smooth(made.log, site)
-    assert [b.name for b in result.blocks] == ["imu.time_offset"]
-    sigma = float(np.sqrt(result.calibration_cov[0, 0]))
-    assert sigma < 5e-4  # s; a twentieth of its prior
-    assert abs(result.calibration.time_offset - time_offset) < 3.0 * sigma
+    assert [b.name for b in result.blocks] == ["imu.time_offset", "imu.clock_rate"]
+    sigma = np.sqrt(np.diag(result.calibration_cov))
+    assert abs(result.calibration.time_offset - time_offset) < 3.0 * sigma[0]
+    assert abs(result.calibration.clock_rate - clock_rate) < 3.0 * sigma[1]
+    assert sigma[1] < 2.5e-5  # half its prior
+    middle = DURATION / 2.0
+    by_both = np.array([1.0, middle])
+    there = float(np.sqrt(by_both @ result.calibration_cov @ by_both))
+    assert there < 5e-4  # s; a twentieth of the prior of the time offset
+    true = time_offset + clock_rate * middle
+    assert abs(float(result.calibration.imu_offset(np.array(middle))) - true) < 3.0 * there
 
 
 def test_unsynchronised_beacons_give_up_phase_and_drift() -> None:

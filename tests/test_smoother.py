@@ -256,7 +256,7 @@ def test_what_is_held_is_considered_as_dense_algebra_has_it(
     problem, start = small_problem(small, choose_blocks(small.site, groups), loss=loss)
     estimate = optimise(problem, start, iterations=50, tolerance=1e-12).estimate
     wanted = considered_blocks(small.site, problem.blocks)
-    held = tuple(b for b in wanted if b.kind != "time_offset")
+    held = tuple(b for b in wanted if b.group != "time-offset")
     poses, calibration, _ = marginals(problem, estimate, held)
     alone, _, _ = marginals(problem, estimate)
 
@@ -285,7 +285,7 @@ def test_a_considered_survey_covers_errors_of_the_survey() -> None:
     rng = np.random.default_rng(4)
     small = small_log(4, epochs=6, perturb=False)
     problem, start = small_problem(small, ())
-    held = tuple(b for b in considered_blocks(small.site, ()) if b.kind != "time_offset")
+    held = tuple(b for b in considered_blocks(small.site, ()) if b.group != "time-offset")
     estimate = optimise(problem, start, tolerance=1e-12).estimate
     with_survey, _, _ = marginals(problem, estimate, held)
     alone, _, _ = marginals(problem, estimate)

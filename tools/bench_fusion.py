@@ -133,7 +133,8 @@ def make_scene(epochs: int, seed: int) -> Scene:
         measured=measured,
         sqrt_information=paired_whitening(samples.phasor_cov, samples.valid),
         rate_body=zero,
-        applied_offset=0.0,
+        applied_offset=np.zeros(epochs),
+        moving=np.ones(epochs, dtype=bool),
         by_time_offset=np.zeros_like(measured),
     )
     increments = cut_at_epochs(inertial, 0.0, samples.time)

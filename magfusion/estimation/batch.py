@@ -207,8 +207,10 @@ def _prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) 
             f"log {log.name} has {len(samples)} field epoch; at least 2 are needed"
         )
     report("finding a start", 1, settings.passes + 3)
-    calibration = initial_calibration(site, float(np.mean(samples.time)))
+    begin_imu = float(log.imu.time[0])
+    calibration = initial_calibration(site, float(np.mean(samples.time)), begin_imu)
     offset, steady = calibration.time_offset, None
+    log = replace(log, imu=calibration.on_log_rate(log.imu))
     if settings.earth:
         steady, samples = demodulation.steady(calibration), only(samples, detected(samples))
     between = _in_gaps(samples.time, log.imu, offset, site.platform.motion)
@@ -261,7 +263,7 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
     declared = log.declared.site
     tuning = settings.tune and log.fixes is None
     time, motion = states.time, log.declared.site.platform.motion
-    calm = quiet_before(log.imu, time - calibration.time_offset, motion)
+    calm = quiet_before(log.imu, time - calibration.imu_offset(time), motion)
     standing = np.zeros(len(time), dtype=bool)
     by_waveform = log.fixes is None and log.demodulation.log.waveform is not None
     iterations, done, settled = 0, 0, False

@@ -37,7 +37,8 @@ def at_imu_rate(result: Smoothed, log: Log) -> Trajectory:
     With the covariance of the poses.
     """
     states, offset = result.states, result.calibration.time_offset
-    imu = corrected_imu(result.calibration, result.blocks, log.imu)
+    calibration = result.calibration
+    imu = calibration.on_log_rate(corrected_imu(calibration, result.blocks, log.imu))
     stamps = imu.time + offset
     inside = (stamps >= states.time[0]) & (stamps <= states.time[-1])
     wanted = stamps[inside]

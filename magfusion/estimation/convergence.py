@@ -62,7 +62,8 @@ def refuse_open(states: Trajectory) -> None:
 
 
 def settled_at(before: Trajectory, after: Trajectory, old: Calibration, new: Calibration) -> bool:
-    """Tell whether a pass moved states and time offset by next to nothing."""
+    """Tell whether a pass moved states and the IMU's stamps by next to nothing."""
     moved = np.sqrt(np.mean((after.position_world - before.position_world) ** 2))
-    shifted = abs(new.time_offset - old.time_offset)
+    ends = after.time[[0, -1]]
+    shifted = np.max(np.abs(new.imu_offset(ends) - old.imu_offset(ends)))
     return bool(moved < POSITION_CONVERGED and shifted < OFFSET_CONVERGED)

@@ -72,7 +72,7 @@ class Demodulation:
             return self.log.steady
         assert self.windows is not None
         site, settings = calibration.site, self.receiver.lockin().settings
-        imu = on_clock(self.log.imu, calibration.time_offset)
+        imu = on_clock(calibration.on_log_rate(self.log.imu), calibration.time_offset)
         operator = window_operator(waveform, imu, site, settings, self.windows)
         offset = site.platform.magnetometer.offset
         _, steady = operator.demodulate(waveform.measured_sensor - offset)

@@ -107,9 +107,10 @@ class EpochUpdate:
         if predicted.bridged:
             self.gate.counts["inertial gap bridged"] += 1
         step = max(state.time - arrived.last_epoch, 1e-6)
-        found = arrived.measured(before, state, samples, step, earth=self._earth is not None)
+        earth, standing = self._earth is not None, arrived.rests(state)
+        found = arrived.measured(before, state, samples, step, earth=earth, standing=standing)
         measurements: list[Measurement] = arrived.others_at(state.time)
-        if arrived.rests(state):
+        if standing:
             measurements.append(zero_velocity(NOW, self.site.platform.motion.rest_speed_sigma))
         point = None
         if found is None or not np.any(found.samples.valid):

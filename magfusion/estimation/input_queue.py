@@ -21,9 +21,10 @@ from magfusion.estimation.measurements.zero_velocity import (
 )
 from magfusion.estimation.motion_compensation import MotionCompensated, demodulate_predicted
 from magfusion.estimation.preintegration import RATE_SPAN
+from magfusion.estimation.stand_in import StandIn
 from magfusion.estimation.state import MOTION, VELOCITY, State, as_trajectory
 from magfusion.estimation.stream_buffer import Buffer, check_clock
-from magfusion.model.parameters import TIME_OFFSET, Block
+from magfusion.model.parameters import CLOCK_RATE, TIME_OFFSET, Block
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
 from magfusion.receiver.receiver import LockinReceiver, Receiver
 from magfusion.units import Array
@@ -82,6 +83,10 @@ class Arrivals:
         Sampling interval of the IMU (s), once there is a state.
     last_epoch : float
         When fields were last measured (s).
+    unseen : int
+        Windows in which the inertial stream is silent.
+    stand_in : StandIn
+        What takes its place there.
     """
 
     receiver: Receiver
@@ -94,12 +99,17 @@ class Arrivals:
     windows: deque[int]
     usual: float | None
     last_epoch: float
+    unseen: int
+    stand_in: StandIn
     _detection: DetectionFilter
     _window: int | None  # at the state that is to be predicted
     _noise: list[Array]
+    _noise_unseen: bool
 
     def __init__(self, receiver: Receiver, applied_offset: float) -> None:
         self.receiver = receiver
+        # What stands in for them needs a state, which a whole log has only when it is smoothed.
+        receiver.needs_turn = not isinstance(receiver, LockinReceiver)
         self.applied_offset = applied_offset
         self.imu = Buffer("imu", 6)
         self.waveform = Buffer("magnetometer", 3)
@@ -108,7 +118,8 @@ class Arrivals:
         self.usual = self._window = None
         self.last_epoch = -np.inf
         self._detection = DetectionFilter()
-        self._noise = []
+        self.unseen, self.stand_in = 0, StandIn()
+        self._noise, self._noise_unseen = [], False
 
     # What goes in
 
@@ -202,7 +213,8 @@ class Arrivals:
     def losses(self) -> dict[str, int]:
         """What was of no use, with the reason: windows, samples."""
         late = {f"{b.name} sample too late": b.late for b in (self.imu, self.waveform) if b.late}
-        return {**{f"window: {k}": v for k, v in self.receiver.dropped.items()}, **late}
+        unseen = {"window without inertial samples": self.unseen} if self.unseen else {}
+        return {**{f"window: {k}": v for k, v in self.receiver.dropped.items()}, **unseen, **late}
 
     # How it goes on
 
@@ -216,7 +228,7 @@ class Arrivals:
     def start(self, start: OnlineStart, delay: float) -> None:
         """Go on from a first state, and drop what it has used; the delay as of `receive`."""
         time = start.state.time
-        self.applied_offset = start.state.calibration.time_offset
+        self.applied_offset = float(start.state.calibration.imu_offset(np.array(time)))
         self.usual = float(np.median(np.diff(self.imu.rows()[0])))
         self.fields = [s for s in self.fields if s.time[0] > time]
         self.steady = {t: s for t, s in self.steady.items() if t > time}
@@ -265,11 +277,17 @@ class Arrivals:
         A state is the platform's where the IMU's stamp says; under another offset it is the same
         state, a little earlier or later (s) on the log's clock.
         """
-        own = [MOTION + b.columns.start for b in blocks if b.parameter == TIME_OFFSET]
-        if not own:
+        by_state, run = np.zeros(len(state.cov)), state.time - state.calibration.imu_begin
+        for block in blocks:
+            if block.parameter in (TIME_OFFSET, CLOCK_RATE):
+                by_state[MOTION + block.columns.start] = (
+                    1.0 if block.parameter == TIME_OFFSET else run
+                )
+        if not np.any(by_state):
             return 0.0
-        lag = state.calibration.time_offset - self.applied_offset
-        if abs(lag) < max(OFFSET_STALE, 2.0 * float(np.sqrt(state.cov[own[0], own[0]]))):
+        lag = float(state.calibration.imu_offset(np.array(state.time))) - self.applied_offset
+        sigma = float(np.sqrt(by_state @ state.cov @ by_state))
+        if abs(lag) < max(OFFSET_STALE, 2.0 * sigma):
             return 0.0
         self.applied_offset += lag
         return lag
@@ -278,6 +296,7 @@ class Arrivals:
         """Keep the samples that are needed after a state (s)."""
         reach = 2.0 + self.receiver.history
         self.imu.forget(time - reach, time - self.applied_offset - 1.0)
+        self.stand_in.forget(time - reach)
         self.waveform.forget(time - reach, time - reach)
 
     # What comes out
@@ -286,6 +305,18 @@ class Arrivals:
         """Return the inertial samples between two stamps of their own, and the next outside."""
         time, rows = self.imu.between(begin, end)
         return ImuSamples(time, rows[:, :3], rows[:, 3:])
+
+    def motion_samples(self, begin: float, end: float) -> ImuSamples:
+        """Return them with what stands in for those that did not come."""
+        return self.stand_in.among(self.inertial_samples(begin, end), begin, end)
+
+    def fill_silence(self, state: State, time: float) -> None:
+        """Learn of the fields how the platform moves from a state to a time (s), if need be."""
+        receiver = self.receiver
+        if self.fields or not isinstance(receiver, LockinReceiver) or receiver.admission is None:
+            return
+        until, streams = time + receiver.settings.window / 2.0, (self.imu, self.waveform)
+        self.stand_in.fill(state, until, *streams, self.applied_offset, receiver.admission)
 
     def others_at(self, time: float) -> list[Measurement]:
         """Return anything else that was measured at a time (s), once."""
@@ -309,6 +340,7 @@ class Arrivals:
         step: float,
         *,
         earth: bool,
+        standing: bool,
     ) -> Measured | None:
         """Return what was detected and measured at a prediction; None where nothing was.
 
@@ -322,6 +354,8 @@ class Arrivals:
             Since fields were last measured (s).
         earth : bool
             Whether a steady field is a measurement.
+        standing : bool
+            Whether the platform is known to stand.
         """
         time = predicted.time
         by_offset, steady = None, self.steady.pop(time, None)
@@ -334,7 +368,7 @@ class Arrivals:
         if not np.any(samples.valid) and not (earth and steady is not None):
             return None
         self.last_epoch = time
-        now, offset = np.zeros(1, dtype=np.int64), self.applied_offset
+        now, offset = np.zeros(1, dtype=np.int64), np.full(1, self.applied_offset)
         rate_body = (self._rate_body(time) - predicted.gyro_bias_body)[None]
         repeats = max(1.0, float(samples.window[0]) / step)
         speed = float(np.linalg.norm(predicted.velocity_world))
@@ -348,6 +382,7 @@ class Arrivals:
             repeats,
             by_offset,
             alike_online(speed, step, predicted.calibration.site.model_error_length),
+            np.array([standing]),
         )
         field = None
         if earth and steady is not None:
@@ -363,10 +398,16 @@ class Arrivals:
         assert isinstance(receiver, LockinReceiver)
         half = receiver.settings.window / 2.0
         begin, end = min(before.time, predicted.time - half), predicted.time + half
-        imu = self.inertial_samples(begin - MARGIN, end + MARGIN)
+        imu = self.motion_samples(begin - MARGIN, end + MARGIN)
+        wave, offset = self._waveform_samples(), self.applied_offset
+        blind = self.stand_in.covers(begin - offset, end - offset)
         found = demodulate_predicted(
-            receiver, number, self._waveform_samples(), imu, before, predicted, self.applied_offset
+            receiver, number, wave, imu, before, predicted, offset, blind=blind
         )
+        unseen = found.unseen or blind
+        self.unseen += unseen
+        if unseen != self._noise_unseen:
+            self._noise, self._noise_unseen = [], unseen
         # The mean over neighbouring windows, as far as they are known.
         self._noise = [*self._noise, found.fields.phasor_cov][-receiver.settings.noise_windows :]
         return replace(found, fields=replace(found.fields, phasor_cov=np.mean(self._noise, axis=0)))
@@ -376,5 +417,5 @@ class Arrivals:
 
     def _rate_body(self, time: float) -> Array:
         stamp = time - self.applied_offset
-        _, rows = self.imu.between(stamp - RATE_SPAN / 2, stamp + RATE_SPAN / 2)
-        return np.asarray(np.mean(rows[:, :3], axis=0)) if len(rows) else np.zeros(3)
+        imu = self.motion_samples(stamp - RATE_SPAN / 2, stamp + RATE_SPAN / 2)
+        return np.asarray(np.mean(imu.gyro_body, axis=0)) if len(imu) else np.zeros(3)

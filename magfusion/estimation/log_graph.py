@@ -91,7 +91,8 @@ class PreparedLog:
         states : Trajectory
             At all epochs.
         """
-        imu, log = corrected_imu(calibration, self.blocks, self.imu), self.demodulation.log
+        log = self.demodulation.log
+        imu = calibration.on_log_rate(corrected_imu(calibration, self.blocks, self.imu))
         known = replace(self.demodulation, log=log if imu is log.imu else replace(log, imu=imu))
         wave = known.compensated(calibration, self.at_fields(states))
         heard, hidden = self.samples.valid, self.demodulation.drowned
@@ -131,7 +132,7 @@ def graph_of(
     if log.fixes is not None:
         measurements.append(_fixes(log, log.fixes))
     else:
-        measurements += _fields(log, states, calibration, wave)
+        measurements += _fields(log, states, calibration, wave, standing)
     native = inertial_graph([link.measurement for link in links], log.declared.site.platform)
     acting = links if links[0].by_calibration is not None else ()
     segments = segments_of(states.time, log.declared, log.blocks)
@@ -148,16 +149,16 @@ def _links(
 
     Its derivatives are by what is estimated, then by what is considered.
     """
-    site, offset = log.declared.site, calibration.time_offset
+    site, applied = log.declared.site, calibration
     accel, gyro = states.accel_bias_body, states.gyro_bias_body
     assert accel is not None
     assert gyro is not None
     blocks, bridged = (*log.blocks, *placed(log.considered, dimension(log.blocks))), []
 
     def preintegrated(calibration: Calibration) -> list[Preintegrated]:
-        imu = corrected_imu(calibration, blocks, log.imu)
+        imu = applied.on_log_rate(corrected_imu(calibration, blocks, log.imu))
         found, gaps = preintegrate_stream(
-            imu, offset, states.time, site.platform.imu, site.gravity, accel, gyro
+            imu, applied.time_offset, states.time, site.platform.imu, site.gravity, accel, gyro
         )
         bridged.append(int(np.sum(gaps)))
         return found
@@ -174,17 +175,31 @@ def _fixes(log: PreparedLog, fixes: Fixes) -> Measurement:
 
 
 def _fields(
-    log: PreparedLog, states: Trajectory, calibration: Calibration, wave: MotionCompensated | None
+    log: PreparedLog,
+    states: Trajectory,
+    calibration: Calibration,
+    wave: MotionCompensated | None,
+    standing: BoolArray | None,
 ) -> list[Measurement]:
     """Return the phasors, and the Earth field where it is measured."""
     samples = log.samples if wave is None else wave.fields
-    offset, here, site = calibration.time_offset, log.at_fields(states), calibration.site
+    here, site = log.at_fields(states), calibration.site
     assert here.gyro_bias_body is not None
-    imu = corrected_imu(calibration, log.blocks, log.imu)
-    rate_body = low_passed_rate_at(imu, offset, samples.time) - here.gyro_bias_body
+    imu = calibration.on_log_rate(corrected_imu(calibration, log.blocks, log.imu))
+    rate_body = low_passed_rate_at(imu, calibration.time_offset, samples.time)
+    rate_body -= here.gyro_bias_body
+    offset = calibration.imu_offset(samples.time)
     by_offset = None if wave is None else wave.by_time_offset
     phasors = field_phasors(
-        site, samples, log.epoch, here, rate_body, offset, overlap(samples), by_offset
+        site,
+        samples,
+        log.epoch,
+        here,
+        rate_body,
+        offset,
+        overlap(samples),
+        by_offset,
+        standing=None if standing is None else standing[log.epoch],
     )
     out: list[Measurement] = [replace(phasors, robust=log.loss)]
     if log.steady is not None:

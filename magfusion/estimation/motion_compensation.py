@@ -7,7 +7,7 @@ import numpy as np
 from magfusion.estimation.preintegration import low_passed, motion_at
 from magfusion.estimation.state import State, as_trajectory
 from magfusion.model.field import observe_earth
-from magfusion.model.parameters import Calibration, predict_channels
+from magfusion.model.parameters import Calibration, linearize_channels, predict_channels
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
 from magfusion.model.trajectory import Trajectory
 from magfusion.receiver.admission import Windows
@@ -17,6 +17,8 @@ from magfusion.receiver.turn import on_clock
 from magfusion.units import Array, ComplexArray
 
 OFFSET_STEP = 5e-4  # s; of the difference quotient
+# By how much a motion that was found without an IMU errs within a window, one sigma.
+MISSED_SPIN, MISSED_PUSH = 1.5, 3.0  # rad/s^2, m/s^2
 
 
 def predicted_waveform(
@@ -57,11 +59,14 @@ class MotionCompensated:
         Derivative of what was taken off by the IMU's time offset at fixed states (T/s).
     steady : SteadyFields
         The Earth field and the offset.
+    unseen : bool
+        Whether nothing was known of the motion, and nothing taken off.
     """
 
     fields: FieldSamples
     by_time_offset: ComplexArray
     steady: SteadyFields
+    unseen: bool = False
 
     @staticmethod
     def of_slots(fields: FieldSamples) -> "MotionCompensated":
@@ -114,6 +119,15 @@ def demodulate_about(
     )
 
 
+def _without_motion(
+    operator: WindowOperator, measured_sensor: Array, offset: Array
+) -> MotionCompensated:
+    """Demodulate windows of whose motion nothing is known."""
+    fields, steady = operator.demodulate(measured_sensor - offset)
+    steady = replace(steady, measured_sensor=steady.measured_sensor + offset)
+    return MotionCompensated(fields, np.zeros_like(fields.phasor_sensor), steady, unseen=True)
+
+
 def demodulate_predicted(
     receiver: LockinReceiver,
     number: int,
@@ -122,6 +136,8 @@ def demodulate_predicted(
     before: State,
     predicted: State,
     offset: float,
+    *,
+    blind: bool = False,
 ) -> MotionCompensated:
     """Demodulate one window about a prediction.
 
@@ -135,14 +151,38 @@ def demodulate_predicted(
         At the epoch before and at the centre.
     offset : float
         IMU time offset with which the states were propagated (s).
+    blind : bool
+        Whether samples stand in for inertial ones.
     """
     assert receiver.grid is not None
+    assert receiver.admission is not None
     window = receiver.grid.windows(np.array([number]), waveform.time)
     inside = slice(int(window.first[0]), int(window.first[0] + window.count[0]))
     samples = Waveform(waveform.time[inside], waveform.measured_sensor[inside])
     alone = Windows(window.number, window.centre, np.zeros(1, dtype=np.int64), window.count)
     calibration = replace(predicted.calibration, time_offset=offset)
     known = on_clock(imu, offset, predicted.gyro_bias_body)
-    operator = window_operator(samples, known, calibration.site, receiver.settings, alone)
+    site, step = calibration.site, receiver.admission.imu_step
+    operator = window_operator(samples, known, site, receiver.settings, alone, step)
+    if operator.unseen[0]:
+        return _without_motion(operator, samples.measured_sensor, site.platform.magnetometer.offset)
     centre, path = as_trajectory([predicted]), as_trajectory([before, predicted])
-    return demodulate_about(operator, samples.measured_sensor, centre, imu, calibration, path)
+    found = demodulate_about(operator, samples.measured_sensor, centre, imu, calibration, path)
+    if not blind:
+        return found
+    cov = found.fields.phasor_cov + _missed_cov(predicted, receiver.settings.window)
+    return replace(found, fields=replace(found.fields, phasor_cov=cov))
+
+
+def _missed_cov(state: State, window: float) -> Array:
+    """Return the covariance of phasors, shape (channels, 3, 3), by a shape that was missed (T^2).
+
+    It moves all channels alike: that they are taken for independent must not average it out.
+    """
+    time, turned = np.array([state.time]), state.world_from_body[None]
+    place = state.position_world[None]
+    _, by_pose, _ = linearize_channels(state.calibration, (), time, turned, place)
+    # The mean over the window of half the square of time.
+    shape = window**2 / 24.0 * np.repeat([MISSED_SPIN, MISSED_PUSH], 3)
+    by = (by_pose[0] * shape).reshape(-1, 2, 3, 6)
+    return np.asarray(0.5 * len(by) * np.einsum("ckxi,ckyi->cxy", by, by))

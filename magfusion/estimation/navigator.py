@@ -345,6 +345,8 @@ class Navigator:
     def _absorb(self, time: float, samples: FieldSamples | None) -> None:
         """Go on to a time and take in what was measured there."""
         assert self._estimator is not None
+        if samples is None:
+            self._arrived.fill_silence(self._estimator.state, time)
         predicted = self._propagated(time)
         judgement = self._update.take_in(self._estimator, self._arrived, predicted, samples)
         state = self._estimator.state
@@ -366,10 +368,10 @@ class Navigator:
         assert self._estimator is not None
         state = self._estimator.state
         offset, usual = self._arrived.applied_offset, self._arrived.usual
-        imu = self._arrived.inertial_samples(state.time - offset, time - offset)
-        return propagate(
-            state, imu, time, self.site, offset, self._process_noise, usual, self.blocks
-        )
+        imu = self._arrived.motion_samples(state.time - offset, time - offset)
+        blind = self._arrived.stand_in.covers(state.time - offset, time - offset)
+        noise, blocks = self._process_noise, self.blocks
+        return propagate(state, imu, time, self.site, offset, noise, usual, blocks, blind=blind)
 
 
 def restored(

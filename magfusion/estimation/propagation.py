@@ -49,6 +49,8 @@ def propagate(
     process_noise: ProcessNoise | None = None,
     usual: float | None = None,
     blocks: tuple[Block, ...] = (),
+    *,
+    blind: bool = False,
 ) -> Propagated:
     """Carry a state on to a later time.
 
@@ -71,6 +73,8 @@ def propagate(
         Sampling interval of the IMU (s), as in `cut_at_epochs`.
     blocks : tuple of Block
         Calibration parameters in the state's tangent.
+    blind : bool
+        Whether samples stand in for inertial ones: they have the noise of a gap.
     """
     epochs = np.array([state.time, time])
     accel, gyro = state.accel_bias_body, state.gyro_bias_body
@@ -79,7 +83,9 @@ def propagate(
 
     def steps(calibration: Calibration) -> Steps:
         stream = corrected_imu(calibration, blocks, imu)
-        return Steps(cut_at_epochs(stream, time_offset, epochs, usual), accel, gyro)
+        increments = cut_at_epochs(stream, time_offset, epochs, usual)
+        increments = replace(increments, bridged=increments.bridged | blind)
+        return Steps(increments, accel, gyro)
 
     def later_state(found: list[Preintegrated]) -> State:
         after = found[0].predict(before, bias)

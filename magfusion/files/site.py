@@ -16,6 +16,7 @@ from magfusion.files.site_schema import (
     BeaconEntry,
     ClockEntry,
     EarthEntry,
+    ImuEntry,
     MagnetometerEntry,
     MotionEntry,
     SiteEntry,
@@ -43,6 +44,7 @@ from magfusion.units import DEGREE, Array
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
+MILLION = 1e6  # ppm in one
 SAME_FIELD = 1e-12  # T; less is rounding
 Model = TypeVar("Model", bound="DataclassInstance")
 
@@ -217,11 +219,25 @@ def _magnetometer(entry: MagnetometerEntry) -> Magnetometer:
 def _model(model: type[Model], entry: StrictModel) -> Model:
     """Return a model from its entry, whose keys are the model's fields in order, with units."""
     given = {
-        field.name: value * DEGREE if key.endswith("_deg") and key != field.name else value
+        field.name: _si(key, value) if key != field.name else value
         for field, (key, value) in zip(fields(model), entry, strict=True)
         if key in entry.model_fields_set or field.default is MISSING
     }
     return model(**given)
+
+
+def _si(key: str, value: float) -> float:
+    """Return a value in the model's unit: the key's name ends with its own."""
+    if key.endswith("_ppm"):
+        return value / MILLION
+    return value * DEGREE if key.endswith("_deg") else value
+
+
+def _ppm(value: float) -> float:
+    """Return the number that is read back as the same, where there is one."""
+    near = value * MILLION
+    around = (near, np.nextafter(near, np.inf), np.nextafter(near, -np.inf))
+    return float(next((one for one in around if one / MILLION == value), near))
 
 
 def _model_entry(key: str, model: object, entry: type[StrictModel]) -> dict[str, Any]:
@@ -341,8 +357,12 @@ def _coil_entry(coil: Coil) -> dict[str, Any]:
 
 
 def _imu_entry(imu: ImuModel) -> dict[str, Any]:
-    renamed = {"time_offset": "time_offset_s", "time_offset_sigma": "time_offset_sigma_s"}
-    return {renamed.get(k, k): float(v) for k, v in vars(imu).items()}
+    usual = {
+        "clock_rate_ppm": ImuModel.clock_rate,
+        "clock_rate_sigma_ppm": ImuModel.clock_rate_sigma,
+    }
+    keys = zip(ImuEntry.model_fields, vars(imu).values(), strict=True)
+    return {k: _ppm(v) if k.endswith("_ppm") else float(v) for k, v in keys if usual.get(k) != v}
 
 
 def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:

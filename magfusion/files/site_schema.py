@@ -223,6 +223,8 @@ class ImuEntry(StrictModel):
     accel_bias_sigma: Annotated[_FromZero, between(0.0, 1e3)]
     time_offset_s: Annotated[float, between(-1e10, 1e10)] = 0.0
     time_offset_sigma_s: Annotated[_FromZero, between(0.0, 1e3)] = _MILLISECONDS
+    clock_rate_ppm: Annotated[float, between(-1e4, 1e4)] = 0.0
+    clock_rate_sigma_ppm: Annotated[_FromZero, between(0.0, 1e4)] = 50.0  # of quartz
 
 
 class MagnetometerSigmaEntry(StrictModel):

@@ -245,7 +245,8 @@ class MotionModel:
 class ImuModel:
     """Inertial noise: densities per square root of hertz, walks per square root of second.
 
-    ``time_offset`` says that the sample stamped t was taken at t + offset on the log's clock (s).
+    ``time_offset`` says that the sample stamped t was taken at t + offset on the log's clock (s);
+    that is of the first sample, and grows by ``clock_rate`` from there on.
     """
 
     gyro_noise: float
@@ -256,6 +257,8 @@ class ImuModel:
     accel_bias_sigma: float
     time_offset: float = 0.0
     time_offset_sigma: float = 0.01
+    clock_rate: float = 0.0
+    clock_rate_sigma: float = 5e-5
 
 
 @dataclass(frozen=True, eq=False)

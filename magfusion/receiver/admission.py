@@ -24,6 +24,7 @@ REASONS = (MAGNETOMETER_GAP, TOO_FEW, STILL, SATURATED, NO_INERTIAL, INERTIAL_GA
 
 MOST_GROWTH = 4.0  # of the variance of a phasor, by missing samples
 LONGEST_GAP = 0.02  # s; of inertial samples: the motion between is a straight line
+LATEST_USE = 0.6  # steps before a window's end after which no inertial sample is needed
 ROUNDING = 1e-6  # of a step; what arithmetic may take from a window
 
 
@@ -144,6 +145,8 @@ class Admission:
         How far a window may reach beyond the inertial samples (s).
     clips : bool
         Whether a constant extreme is saturation.
+    needs_turn : bool
+        Whether a window without inertial samples is of no use; otherwise it is one of more noise.
     least_share : float
         Of the samples that a window should hold.
     ends : tuple of RangeEnds
@@ -155,6 +158,7 @@ class Admission:
     imu_begin: float
     imu_margin: float
     clips: bool
+    needs_turn: bool
     least_share: float
     ends: tuple[RangeEnds, ...] = field(default_factory=lambda: tuple(RangeEnds() for _ in "xyz"))
 
@@ -197,11 +201,39 @@ class Admission:
             drop(STILL, still(waveform, windows.first, last))
             drop(SATURATED, saturated(waveform, windows.first, last, self.ends))
         drop(NO_INERTIAL, begin < self.imu_begin - self.imu_margin)
-        gap = np.flatnonzero(np.diff(imu_time) > max(3.0 * self.imu_step, LONGEST_GAP))
-        silent = np.append(imu_time[gap], imu_time[-1:] + self.imu_margin)
-        spoken = np.append(imu_time[gap + 1], np.inf)
-        drop(INERTIAL_GAP, _meets(silent, spoken, begin, end - 0.6 * step))
+        if self.needs_turn:
+            silence = silences(imu_time, self.imu_step, self.imu_margin)
+            drop(INERTIAL_GAP, _meets(*silence, begin, end - LATEST_USE * step))
         return found
+
+
+def silences(imu_time: Array, step: float, margin: float) -> tuple[Array, Array]:
+    """Return where the gaps of an inertial stream begin and end, the last behind it (s).
+
+    Parameters
+    ----------
+    step, margin : float
+        As of `Admission` (s).
+    """
+    gap = np.flatnonzero(np.diff(imu_time) > max(3.0 * step, LONGEST_GAP))
+    begin = np.append(imu_time[gap], imu_time[-1:] + margin)
+    return begin, np.append(imu_time[gap + 1], np.inf)
+
+
+def meets_silence(
+    windows: Windows, length: float, time: Array, silence: tuple[Array, Array]
+) -> BoolArray:
+    """Return which windows of a length (s) lack inertial samples.
+
+    Parameters
+    ----------
+    time : ndarray
+        Of all samples of the magnetometer (s).
+    silence : tuple of ndarray
+        As from `silences`.
+    """
+    begin, end = windows.centre - length / 2.0, windows.centre + length / 2.0
+    return _meets(*silence, begin, end - LATEST_USE * float(np.median(np.diff(time))))
 
 
 def _meets(begin: Array, end: Array, window_begin: Array, window_end: Array) -> BoolArray:

@@ -14,20 +14,27 @@ import numpy as np
 
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
 from magfusion.model.site import Site
-from magfusion.receiver.admission import Windows, sample_rate_hz
+from magfusion.receiver.admission import (
+    Windows,
+    meets_silence,
+    sample_rate_hz,
+    silences,
+    usual_step,
+)
 from magfusion.receiver.noise import (
     FittedWindows,
     noise_beside_tones,
     not_below,
     smoothed_over_windows,
 )
-from magfusion.receiver.turn import on_clock, turn_of
+from magfusion.receiver.turn import on_clock, standing_in, turn_of
 from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 CHUNK = 1000  # windows demodulated at once: they fit in memory
 MOST_COMPARED = 50  # windows by which two clocks are compared
 LEAST_COMPARED = 0.8  # of the samples of the fullest
+UNSEEN_TURN = 1.0  # rad/s; of a person or a vehicle, while the gyro is silent
 WORST_CONDITION = 1e8  # of a normal matrix; beyond, the samples do not tell its columns apart
 
 
@@ -48,6 +55,9 @@ class WindowOperator:
         Takes the fields back at the centre of each window.
     declared_noise : float
         Of a sample, one sigma (T).
+    unseen : bool ndarray, shape (windows,)
+        Where the gyro is silent: the ramps follow a turn that it does not see, and what the
+        square of it does is noise.
     """
 
     settings: LockinSettings
@@ -59,6 +69,7 @@ class WindowOperator:
     still_from_measured: Array
     measured_from_still: Array
     declared_noise: float
+    unseen: BoolArray
 
     def apply(self, measured_sensor: Array) -> ComplexArray:
         """Return the phasors of a waveform given at the same sample times.
@@ -92,27 +103,31 @@ class WindowOperator:
             beside_hz = np.concatenate([self.nuisance_hz, self.settings.lines_hz])
             noise = noise_beside_tones(self.frequencies_hz, beside_hz, fit)
             own = np.einsum("nii->ni", fit.inverse)
+            found = self._phasor(rows, fit)
             parts.append(
                 (
-                    self._phasor(rows, fit),
+                    found,
+                    self._bent(rows, fit) * np.sum(np.abs(found) ** 2, axis=-1),
                     0.5 * (own[:, 2 : 2 + n] + own[:, 2 + n : 2 + 2 * n]),
                     turn[:, None] @ noise @ np.swapaxes(turn, 1, 2)[:, None],
                     (turn @ fit.coefficients[:, 0, :, None])[..., 0],
                     own[:, 0],
                 )
             )
-        phasor, unit, noise, constant, constant_unit = (
+        phasor, bent, unit, noise, constant, constant_unit = (
             np.concatenate(part) for part in zip(*parts, strict=True)
         )
         centre, settings = self.windows.centre, self.settings
-        smooth = smoothed_over_windows(noise, centre, settings.step, settings.noise_windows)
+        smooth = smoothed_over_windows(
+            noise, centre, settings.step, settings.noise_windows, self.unseen
+        )
         smooth = not_below(smooth, self.declared_noise)
         samples = FieldSamples(
             time=centre,
             window=np.full(len(centre), settings.window),
             channels=self.channels,
             phasor_sensor=phasor,
-            phasor_cov=unit[..., None, None] * smooth,
+            phasor_cov=unit[..., None, None] * smooth + bent[..., None, None] * np.eye(3),
         )
         beside = constant_unit[:, None, None] * np.mean(smooth, axis=1)
         return samples, SteadyFields(centre, constant, beside)
@@ -139,6 +154,22 @@ class WindowOperator:
             out.append(np.sum(left**2, axis=(1, 2)) / np.sum(fit.weight, axis=1))
         return np.concatenate(out)
 
+    def _bent(self, rows: slice, fit: FittedWindows) -> Array:
+        """Return the relative variance of phasors by the square of a turn that is not seen.
+
+        Shape (n, channels): what the design makes of a tone that falls with the square of time.
+        """
+        n, out = len(self.frequencies_hz), np.zeros((len(fit.elapsed), len(self.frequencies_hz)))
+        unseen = self.unseen[rows]
+        if not np.any(unseen):
+            return out
+        design, elapsed = fit.design[unseen], fit.elapsed[unseen]
+        square = (UNSEEN_TURN * elapsed[..., None]) ** 2  # half of it for each axis across
+        falling = square * design[..., 2 : 2 + n]
+        made = fit.inverse[unseen] @ (np.swapaxes(design, -1, -2) @ falling)
+        out[unseen] = np.einsum("nii->ni", made[:, 2 : 2 + n]) ** 2
+        return out
+
     def _phasor(self, rows: slice, fit: FittedWindows) -> ComplexArray:
         n, centre = len(self.frequencies_hz), self.windows.centre[rows]
         cosine, sine = fit.coefficients[:, 2 : 2 + n], fit.coefficients[:, 2 + n : 2 + 2 * n]
@@ -157,7 +188,12 @@ def _nuisances_hz(settings: LockinSettings, frequencies: Array, nyquist_hz: floa
 
 
 def window_operator(
-    waveform: Waveform, imu: ImuSamples, site: Site, settings: LockinSettings, windows: Windows
+    waveform: Waveform,
+    imu: ImuSamples,
+    site: Site,
+    settings: LockinSettings,
+    windows: Windows,
+    imu_step: float | None = None,
 ) -> WindowOperator:
     """Return the map from a waveform to phasors, with the gyro's turn of each sample.
 
@@ -169,9 +205,14 @@ def window_operator(
         Tones, magnetometer matrix and mounting.
     windows : Windows
         That were admitted.
+    imu_step : float, optional
+        Usual time between two inertial samples (s): a piece of a stream may have none.
     """
     frequencies, nyquist_hz = channel_frequencies_hz(site), sample_rate_hz(waveform) / 2.0
-    measured_from_still = turn_of(imu, site)
+    step = usual_step(imu.time, "imu") if imu_step is None else imu_step
+    margin = 2.0 * step + 3.0 * site.platform.imu.time_offset_sigma
+    silence = silences(imu.time, step, margin)
+    measured_from_still = turn_of(standing_in(imu, silence), site)
     return WindowOperator(
         settings=settings,
         channels=site.channels,
@@ -182,6 +223,7 @@ def window_operator(
         still_from_measured=np.asarray(np.linalg.inv(measured_from_still(waveform.time))),
         measured_from_still=measured_from_still(windows.centre),
         declared_noise=site.platform.magnetometer.noise_density * float(np.sqrt(nyquist_hz)),
+        unseen=meets_silence(windows, settings.window, waveform.time, silence),
     )
 
 

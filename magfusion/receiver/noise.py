@@ -105,12 +105,22 @@ def not_below(noise_cov: Array, sigma: float) -> Array:
     return np.where(low[..., None, None], raised, noise_cov)
 
 
-def smoothed_over_windows(noise_cov: Array, centre: Array, step: float, windows: int) -> Array:
+def smoothed_over_windows(
+    noise_cov: Array, centre: Array, step: float, windows: int, unseen: BoolArray | None
+) -> Array:
     """Average the noise over neighbouring windows, shape (n, tones, 3, 3), never across a gap.
 
     One window has four degrees of freedom a tone, too few for a weight.
+
+    Parameters
+    ----------
+    unseen : bool ndarray, shape (n,), optional
+        Windows without the gyro's turn: their noise is their own.
     """
-    breaks = np.flatnonzero(np.diff(centre) > 1.5 * step) + 1
+    apart = np.diff(centre) > 1.5 * step
+    if unseen is not None:
+        apart |= unseen[1:] != unseen[:-1]
+    breaks = np.flatnonzero(apart) + 1
     out = np.empty_like(noise_cov)
     for part in np.split(np.arange(len(centre)), breaks):
         rows = slice(part[0], part[-1] + 1)

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.admission import (
@@ -57,6 +58,8 @@ class Receiver(ABC):
         Numbers of windows that were admitted and that the phasors of later ones need.
     dropped : Counter
         Reason to number of windows.
+    needs_turn : bool
+        Whether windows without inertial samples are of no use.
     """
 
     grid: Grid | None
@@ -64,8 +67,10 @@ class Receiver(ABC):
     next_number: int
     recent: IntArray
     dropped: Counter[str]
+    needs_turn: bool
 
     def __init__(self, site: Site) -> None:
+        self.needs_turn = True
         self.site = site
         self.grid = self.admission = None
         self.next_number = 0
@@ -197,6 +202,8 @@ class Receiver(ABC):
         InputError
             Where no window is usable.
         """
+        if len(imu):
+            imu = initial_calibration(self.site, 0.0, float(imu.time[0])).on_log_rate(imu)
         self.begin(waveform, imu)
         windows = self.admit(waveform, imu)
         expected = int(np.sum(self._driven(windows.number)))
@@ -247,7 +254,13 @@ class Receiver(ABC):
             self.dropped[reason] += dropped
 
     def _begin(
-        self, waveform: Waveform, imu: ImuSamples, grid: Grid, share: float, *, clips: bool
+        self,
+        waveform: Waveform,
+        imu: ImuSamples,
+        grid: Grid,
+        share: float,
+        *,
+        clips: bool,
     ) -> None:
         model = self.site.platform.imu
         stamps = imu.time + model.time_offset
@@ -259,6 +272,7 @@ class Receiver(ABC):
             imu_begin=float(stamps[0]),
             imu_margin=2.0 * step + 3.0 * model.time_offset_sigma,
             clips=clips,
+            needs_turn=self.needs_turn,
             least_share=share,
         )
 
@@ -372,7 +386,8 @@ class SlotReceiver(Receiver):
         elapsed = float(waveform.time[0]) - 1.0 / rate_hz - slots.start
         self.next_number = int(np.ceil(elapsed / slots.duration + ROUNDING))
         # The plateau of a pulse is no saturation.
-        self._begin(waveform, imu, grid, LEAST_SHARE_OF_SLOT, clips=not is_pulsed(self.site))
+        clips = not is_pulsed(self.site)
+        self._begin(waveform, imu, grid, LEAST_SHARE_OF_SLOT, clips=clips)
 
     def phasors(
         self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site

@@ -345,7 +345,7 @@ def _noise(
     power = np.add.reduceat(weight**2, begins)
     cov = np.einsum("nx,ny->nxy", seen, np.conj(seen)).real / power[:, None, None]
     number = NOISE_CYCLES * slots.count
-    smooth = smoothed_over_windows(cov[:, None], windows.centre, slots.cycle, number)[:, 0]
+    smooth = smoothed_over_windows(cov[:, None], windows.centre, slots.cycle, number, None)[:, 0]
     least = 1e-12 * np.max(np.abs(still))
     return smooth + least**2 * np.eye(3)
 

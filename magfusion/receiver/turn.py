@@ -27,6 +27,29 @@ def on_clock(
     return replace(imu, time=imu.time + time_offset, gyro_body=gyro)
 
 
+def standing_in(imu: ImuSamples, silence: tuple[Array, Array]) -> ImuSamples:
+    """Return an inertial stream that says of its gaps that nothing turns there.
+
+    Parameters
+    ----------
+    imu : ImuSamples
+        As from `on_clock`.
+    silence : tuple of ndarray
+        Where the gaps begin and end (s), as from `magfusion.receiver.admission.silences`.
+    """
+    begin, end = silence
+    inner = np.stack([0.99 * begin[:-1] + 0.01 * end[:-1], 0.01 * begin[:-1] + 0.99 * end[:-1]])
+    # Behind the last sample its rate goes on for as long as that is no gap.
+    last = begin[-1] + np.array([0.0, max(begin[-1] - imu.time[-1], 1e-3)])
+    time = np.append(inner.T.ravel(), last)
+    at = np.searchsorted(imu.time, time)
+    rates = np.zeros((len(time), 3))
+    rates[-2] = imu.gyro_body[-1]
+    gyro = np.insert(imu.gyro_body, at, rates, axis=0)
+    accel = np.insert(imu.accel_body, at, imu.accel_body[at - 1], axis=0)
+    return ImuSamples(np.insert(imu.time, at, time), gyro, accel)
+
+
 def turn_of(imu: ImuSamples, site: Site) -> Callable[[Array], Array]:
     """Return what gives, at times (m,), the ``measured_from_still`` (m, 3, 3) of a field.
 

@@ -62,6 +62,7 @@ def simulate_imu(
     duration: float,
     rng: np.random.Generator,
     time_offset: float = 0.0,
+    clock_rate: float = 0.0,
     instability: BiasInstability | None = None,
 ) -> SimulatedImu:
     """Return inertial samples: the exact values of one instant, bias and white noise.
@@ -73,13 +74,15 @@ def simulate_imu(
     Parameters
     ----------
     imu : ImuModel
-        Its noise; its ``time_offset`` is not used.
+        Its noise; its clock is not used.
     gravity : float
         (m/s^2)
     duration : float
         (s); stamps run from 0 to less than this.
     time_offset : float
-        The sample stamped t is taken at t + time_offset on the log's clock (s).
+        The sample stamped t is taken at t + time_offset on the log's clock (s), the first one.
+    clock_rate : float
+        What that grows by in each second.
     instability : BiasInstability, optional
         Added to the bias walk.
 
@@ -94,7 +97,7 @@ def simulate_imu(
             f"imu_rate_hz: found {rate_hz} Hz for {duration} s; give at least one sample"
         )
     stamp = np.arange(count) / rate_hz
-    instant = stamp + time_offset
+    instant = (1.0 + clock_rate) * stamp + time_offset
     gyro_bias = _bias_walk(rng, count, rate_hz, imu.gyro_bias_sigma, imu.gyro_bias_walk)
     accel_bias = _bias_walk(rng, count, rate_hz, imu.accel_bias_sigma, imu.accel_bias_walk)
     if instability is not None:

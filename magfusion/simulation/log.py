@@ -50,6 +50,8 @@ class SimulationConfig:
         The latter more than 2.5 times the highest tone.
     time_offset : float, optional
         True time offset of the IMU (s); that which the site declares where it is None.
+    clock_rate : float, optional
+        True rate of the IMU's clock, by which its time offset grows; as declared where it is None.
     perturb : bool
         Whether the true calibration is drawn from the site's prior, or is as declared.
     noise_scale : float
@@ -73,6 +75,7 @@ class SimulationConfig:
     imu_rate_hz: float = 200.0
     magnetometer_rate_hz: float = 400.0
     time_offset: float | None = None
+    clock_rate: float | None = None
     perturb: bool = True
     noise_scale: float = 1.0
     mains: Mains | None = None
@@ -138,6 +141,7 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         config.duration,
         imu_rng,
         true_site.platform.imu.time_offset,
+        true_site.platform.imu.clock_rate,
         config.instability,
     )
     waveform = simulate_waveform(
@@ -152,7 +156,8 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         ambient,
     )
     stamp = imu.samples.time
-    taken = stamp + true_site.platform.imu.time_offset
+    clock = true_site.platform.imu
+    taken = (1.0 + clock.clock_rate) * stamp + clock.time_offset
     truth = replace(
         motion.trajectory(stamp),
         gyro_bias_body=interpolate(stamp, taken, imu.gyro_bias_body),
@@ -307,6 +312,7 @@ def _with_instruments(site: Site, config: SimulationConfig) -> Site:
         gyro_noise=scale * imu.gyro_noise,
         accel_noise=scale * imu.accel_noise,
         time_offset=declared if config.time_offset is None else config.time_offset,
+        clock_rate=imu.clock_rate if config.clock_rate is None else config.clock_rate,
     )
     magnetometer = replace(magnetometer, noise_density=scale * magnetometer.noise_density)
     return replace(site, platform=replace(site.platform, imu=imu, magnetometer=magnetometer))

@@ -161,7 +161,8 @@ def _by_stream(result: Smoothed, held: tuple[Block, ...], imu: ImuSamples) -> Ar
     size, count = dimension(held), graph.epochs - 1
     out = np.zeros((count, ROWS, size))
     linear = graph.native.linearize(result.estimate.values)
-    time = imu.time + result.calibration.time_offset
+    calibration = result.calibration
+    time = calibration.on_log_rate(imu).time + calibration.time_offset
     of_bias = np.zeros((count, ROWS, 6))
     for k in range(count):
         factor = linear.at(first + k)

@@ -13,6 +13,7 @@ import numpy as np
 from magfusion.model.parameters import (
     BEACON_POSITION,
     BEACON_ROTATION,
+    CLOCK_RATE,
     DECLINATION,
     DEGREES,
     DRIFT,
@@ -32,10 +33,10 @@ from magfusion.model.parameters import (
     candidates,
     placed,
 )
-from magfusion.model.parameters.parameter import AXES, PPM, PhasorView, Unit
+from magfusion.model.parameters.parameter import AXES, Unit
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
-from magfusion.units import DEGREE, Array, ComplexArray
+from magfusion.units import DEGREE, Array
 
 
 class Stream(NamedTuple):
@@ -103,26 +104,13 @@ class _Gravity(Inertial):
         return _stacked(up_body[:, :, None], np.zeros((len(up_body), 3, 1)))
 
 
-class _ClockRate(Inertial):
-    kind, spoken = "clock_rate", PPM
-    words, size = "the rate of the IMU's clock", 1
-
-    def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
-        by_offset = view.whole.time_offset
-        assert by_offset is not None
-        return (by_offset * view.elapsed[:, None, None])[..., None]
-
-    def as_bias(self, stream: Stream) -> Array:
-        return np.zeros((len(stream.world_from_body) - 1, 6, 1))
-
-
 def _stacked(accel: Array, gyro: Array) -> Array:
     return np.concatenate([accel, gyro], axis=1)
 
 
 GYRO_SCALE, ACCEL_SCALE, GYRO_ALIGNMENT = _GyroScale(), _AccelScale(), _GyroAlignment()
-GRAVITY, CLOCK_RATE = _Gravity(), _ClockRate()
-INERTIAL: tuple[Inertial, ...] = (GYRO_SCALE, ACCEL_SCALE, GYRO_ALIGNMENT, GRAVITY, CLOCK_RATE)
+GRAVITY = _Gravity()
+INERTIAL: tuple[Inertial, ...] = (GYRO_SCALE, ACCEL_SCALE, GYRO_ALIGNMENT, GRAVITY)
 
 # Typical error of an installation that nobody measured, in the unit of the tangent vector.
 TYPICAL: dict[Parameter, float] = {

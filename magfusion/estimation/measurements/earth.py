@@ -54,6 +54,8 @@ class EarthField(Measurement):
 
     Parameters
     ----------
+    time : ndarray, shape (n,)
+        (s)
     measured : ndarray, shape (n, 3)
         (T)
     sqrt_information : ndarray, shape (n, 3, 3)
@@ -62,17 +64,18 @@ class EarthField(Measurement):
         Angular rate, for the time offset (rad/s).
     repeats : float
         How many epochs in a row count as one measurement.
-    applied_offset : float
+    applied_offset : ndarray, shape (n,)
         IMU time offset with which the inertial data were cut (s).
     robust : bool
         Whether what the motion contradicts has no say.
     """
 
+    time: Array
     measured: Array
     sqrt_information: Array
     rate_body: Array
     repeats: float
-    applied_offset: float
+    applied_offset: Array
     robust: bool = True
 
     @property
@@ -86,8 +89,8 @@ class EarthField(Measurement):
         """Return the rows at an estimate."""
         site = calibration.site
         assert site.earth_field_world is not None
-        lag = calibration.time_offset - self.applied_offset
-        turn = Rotation.from_rotvec(-lag * self.rate_body).as_matrix()
+        lag = calibration.imu_offset(self.time) - self.applied_offset
+        turn = Rotation.from_rotvec(-lag[:, None] * self.rate_body).as_matrix()
         seen = observe_earth(
             site.platform.magnetometer, states.world_from_body @ turn, site.earth_field_world
         )
@@ -95,7 +98,7 @@ class EarthField(Measurement):
         by_pose = np.zeros((len(error), 1, 3, 6))
         by_pose[:, 0, :, :3] = self.sqrt_information @ seen.platform_rotation
         by_calibration = calibration_rows((len(error), 1, 3), blocks)
-        view = SteadyView(calibration, seen, self.rate_body)
+        view = SteadyView(calibration, seen, self.rate_body, self.time)
         for block in blocks:
             part = block.parameter.steady_jacobian(view)
             if part is not None:
@@ -108,7 +111,7 @@ def earth_measurement(
     steady: SteadyFields,
     epoch: IntArray,
     rate_body: Array,
-    applied_offset: float,
+    applied_offset: Array,
     step: float,
 ) -> EarthField:
     """Return steady fields as a measurement.
@@ -121,7 +124,7 @@ def earth_measurement(
         States that they belong to.
     rate_body : ndarray, shape (n, 3)
         Without the gyro's bias (rad/s).
-    applied_offset : float
+    applied_offset : ndarray, shape (n,)
         IMU time offset with which the inertial data were cut (s).
     step : float
         Between epochs (s).
@@ -130,7 +133,9 @@ def earth_measurement(
     valid = np.all(np.isfinite(steady.measured_sensor), axis=1)
     sqrt_information = whitening(repeats * earth_cov(site, steady), valid)
     measured = np.nan_to_num(steady.measured_sensor)
-    return EarthField(epoch, measured, sqrt_information, rate_body, repeats, applied_offset)
+    return EarthField(
+        epoch, steady.time, measured, sqrt_information, rate_body, repeats, applied_offset
+    )
 
 
 def check_earth(site: Site) -> None:

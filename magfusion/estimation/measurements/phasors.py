@@ -14,6 +14,7 @@ from magfusion.model.noise import (
     stacked,
 )
 from magfusion.model.parameters import (
+    CLOCK_RATE,
     TIME_OFFSET,
     Block,
     Calibration,
@@ -42,8 +43,11 @@ class FieldPhasors(Measurement):
         Angular rate, for the time offset (rad/s).
     by_time_offset : ndarray, shape (n, channels, 6)
         What a change of it does to the lock-in at fixed states (T/s).
-    applied_offset : float
+    applied_offset : ndarray, shape (n,)
         IMU time offset with which the inertial data were cut (s).
+    moving : bool ndarray, shape (n,)
+        Where the clocks have a bearing: a platform that stands is where it was a little earlier.
+        Noise in its rate and velocity would pass for information on them.
     robust : {None, 'huber', 'cauchy'}
         Loss of each channel.
     excess : ndarray, shape (n, channels), optional
@@ -56,7 +60,8 @@ class FieldPhasors(Measurement):
     sqrt_information: Array
     rate_body: Array
     by_time_offset: Array
-    applied_offset: float
+    applied_offset: Array
+    moving: BoolArray
     robust: str | None = None
     excess: Array | None = None
 
@@ -78,7 +83,8 @@ class FieldPhasors(Measurement):
         """Return the whitened error, shape (n, channels, 6), without a derivative."""
         lag, world_from_body, position_world = self._at_field(states, calibration)
         phasor = predict_channels(calibration, self.time, world_from_body, position_world)
-        value = np.concatenate([phasor.real, phasor.imag], axis=-1) + lag * self.by_time_offset
+        value = np.concatenate([phasor.real, phasor.imag], axis=-1)
+        value += lag[:, None, None] * self.by_time_offset
         return (self.sqrt_information @ (value - self.measured)[..., None])[..., 0]
 
     def linearize(
@@ -86,6 +92,7 @@ class FieldPhasors(Measurement):
     ) -> Rows:
         """Return the rows at an estimate, a group for each channel."""
         velocity_body = np.swapaxes(states.world_from_body, 1, 2) @ states.velocity_world[..., None]
+        twist_body = np.concatenate([self.rate_body, velocity_body[..., 0]], axis=1)
         lag, world_from_body, position_world = self._at_field(states, calibration)
         value, by_pose, by_calibration = linearize_channels(
             calibration,
@@ -93,12 +100,16 @@ class FieldPhasors(Measurement):
             self.time,
             world_from_body,
             position_world,
-            np.concatenate([self.rate_body, velocity_body[..., 0]], axis=1),
+            np.where(self.moving[:, None], twist_body, 0.0),
         )
-        value += lag * self.by_time_offset
+        value += lag[:, None, None] * self.by_time_offset
+        by_lag = np.where(self.moving[:, None, None], self.by_time_offset, 0.0)
         for block in blocks:
             if block.parameter == TIME_OFFSET:
-                by_calibration[..., block.columns.start] += self.by_time_offset
+                by_calibration[..., block.columns.start] += by_lag
+            elif block.parameter == CLOCK_RATE:
+                run = self.time - calibration.imu_begin
+                by_calibration[..., block.columns.start] += run[:, None, None] * by_lag
         return Rows(
             error=(self.sqrt_information @ (value - self.measured)[..., None])[..., 0],
             by_pose=self.sqrt_information @ by_pose,
@@ -110,17 +121,17 @@ class FieldPhasors(Measurement):
         kept = np.where(rejected[:, None, None], 0.0, self.sqrt_information)
         return replace(self, sqrt_information=kept)
 
-    def _at_field(self, states: States, calibration: Calibration) -> tuple[float, Array, Array]:
+    def _at_field(self, states: States, calibration: Calibration) -> tuple[Array, Array, Array]:
         """Return lag, attitude and position where the field was taken.
 
         The states carry the IMU's clock: that was a little before or after.
         """
-        lag = calibration.time_offset - self.applied_offset
-        turn = Rotation.from_rotvec(-lag * self.rate_body).as_matrix()
+        lag = np.where(self.moving, calibration.imu_offset(self.time) - self.applied_offset, 0.0)
+        turn = Rotation.from_rotvec(-lag[:, None] * self.rate_body).as_matrix()
         return (
             lag,
             states.world_from_body @ turn,
-            states.position_world - lag * states.velocity_world,
+            states.position_world - lag[:, None] * states.velocity_world,
         )
 
 
@@ -130,10 +141,11 @@ def field_phasors(
     epoch: IntArray,
     poses: Trajectory,
     rate_body: Array,
-    applied_offset: float,
+    applied_offset: Array,
     repeats: float,
     by_time_offset: ComplexArray | None = None,
     alike: Array | float = 1.0,
+    standing: BoolArray | None = None,
 ) -> FieldPhasors:
     """Return phasors as a measurement, weighed at poses that are about right.
 
@@ -145,7 +157,7 @@ def field_phasors(
         Of the same epochs.
     rate_body : ndarray, shape (n, 3)
         Angular rate without its bias (rad/s).
-    applied_offset : float
+    applied_offset : ndarray, shape (n,)
         IMU time offset with which the inertial data were cut (s).
     repeats : float
         How many epochs hold each sample of overlapping windows: that must not count twice.
@@ -153,6 +165,8 @@ def field_phasors(
         As of `magfusion.estimation.motion_compensation.WaveFields`.
     alike : ndarray, shape (n,), or float
         How many epochs have the same model error; no fewer than windows hold a sample.
+    standing : bool ndarray, shape (n,), optional
+        Where the platform is known to stand.
     """
     place = sensor_positions(site, poses)
     together = np.maximum(alike, repeats)
@@ -170,6 +184,7 @@ def field_phasors(
         rate_body=rate_body,
         by_time_offset=stacked(by),
         applied_offset=applied_offset,
+        moving=np.ones(len(epoch), dtype=bool) if standing is None else ~standing,
         excess=excess,
     )
 

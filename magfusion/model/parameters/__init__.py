@@ -26,6 +26,7 @@ from magfusion.model.parameters.parameter import Parameter as Parameter
 from magfusion.model.parameters.parameter import PhasorView
 from magfusion.model.parameters.parameter import SteadyView as SteadyView
 from magfusion.model.parameters.parameter import Unit as Unit
+from magfusion.model.parameters.platform import CLOCK_RATE as CLOCK_RATE
 from magfusion.model.parameters.platform import DECLINATION as DECLINATION
 from magfusion.model.parameters.platform import MATRIX as MATRIX
 from magfusion.model.parameters.platform import OFFSET as OFFSET
@@ -48,6 +49,7 @@ PARAMETERS: tuple[Parameter, ...] = (
     SENSOR_ROTATION,
     SENSOR_POSITION,
     TIME_OFFSET,
+    CLOCK_RATE,
     DECLINATION,
     STRENGTH,
 )
@@ -62,8 +64,18 @@ def of_phasors(parameters: Iterable[Parameter]) -> tuple[Parameter, ...]:
 PHASOR_PARAMETERS = of_phasors(PARAMETERS)
 
 
-def initial_calibration(site: Site, reference_time: float) -> Calibration:
-    """Return the calibration that the site declares."""
+def initial_calibration(
+    site: Site, reference_time: float, imu_begin: float | None = None
+) -> Calibration:
+    """Return the calibration that the site declares.
+
+    Parameters
+    ----------
+    reference_time : float
+        Where phases hold (s).
+    imu_begin : float, optional
+        Where the IMU's time offset holds (s); the reference time where there is no IMU.
+    """
     return Calibration(
         site=site,
         phase=np.zeros(len(site.channels)),
@@ -71,6 +83,8 @@ def initial_calibration(site: Site, reference_time: float) -> Calibration:
         time_offset=site.platform.imu.time_offset,
         reference_time=reference_time,
         log_gain=np.zeros(len(site.channels)),
+        clock_rate=site.platform.imu.clock_rate,
+        imu_begin=reference_time if imu_begin is None else imu_begin,
     )
 
 

@@ -28,13 +28,18 @@ class Calibration:
     drift : ndarray, shape (beacons,)
         Relative error of each beacon's clock.
     time_offset : float
-        The IMU's sample stamped t was taken at t + time_offset (s).
+        The IMU's sample stamped t was taken at t + time_offset (s), that of ``imu_begin``.
     reference_time : float
         Where ``phase`` holds (s).
     log_gain : ndarray, shape (channels,)
         Logarithm of what each channel's phasor is larger by than the site says.
     others : mapping
         Values of parameters that have no field here, by ``owner.kind``; absent means zero.
+
+    clock_rate : float
+        By how much more than a second of the log's clock passes in one of the IMU's.
+    imu_begin : float
+        Stamp of the IMU's at which its time offset holds (s): its first.
 
     ``phase`` and ``log_gain`` may have one row for each pose.
     """
@@ -46,6 +51,18 @@ class Calibration:
     reference_time: float
     log_gain: Array
     others: Mapping[str, Array] = field(default_factory=dict)
+    clock_rate: float = 0.0
+    imu_begin: float = 0.0
+
+    def imu_offset(self, time: Array) -> Array:
+        """Return what was to be added to the IMU's stamps at some times, shape of them (s)."""
+        return self.time_offset + self.clock_rate * (np.asarray(time) - self.imu_begin)
+
+    def on_log_rate(self, imu: ImuSamples) -> ImuSamples:
+        """Return the IMU's samples with stamps that lack no more than the time offset."""
+        if not self.clock_rate:
+            return imu
+        return replace(imu, time=imu.time + self.clock_rate * (imu.time - self.imu_begin))
 
     def drive_phase(self, time: Array) -> Array:
         """Return the phase of every channel at the given times, shape (..., channels) (rad)."""
@@ -89,6 +106,7 @@ class SteadyView(NamedTuple):
     calibration: Calibration
     observation: EarthObservation
     rate_body: Array  # (n, 3) (rad/s)
+    time: Array  # (n,) (s)
 
 
 class Parameter:

@@ -12,6 +12,7 @@ from magfusion.model.parameters.parameter import (
     METRE,
     MILLISECOND,
     PERCENT,
+    PPM,
     SECOND,
     Calibration,
     Parameter,
@@ -130,6 +131,48 @@ class _TimeOffset(Parameter):
         return -view.observation.platform_rotation @ view.rate_body[..., None]
 
 
+class _ClockRate(Parameter):
+    """What the time offset changes by in each second, from the IMU's first sample on."""
+
+    group, owner, kind = "time-offset", "imu", "clock_rate"
+    unit = spoken = PPM
+    words = by_turning = "the rate of the IMU's clock"
+    negligible = 1e-7
+    declared = True
+
+    def sigma(self, site: Site, owner: str) -> Array:
+        imu = site.platform.imu
+        # Stamps that are known exactly are of one clock.
+        return np.array([imu.clock_rate_sigma if imu.time_offset_sigma else 0.0])
+
+    def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
+        return replace(calibration, clock_rate=calibration.clock_rate + float(step[0]))
+
+    def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
+        return np.array([new.clock_rate - old.clock_rate])
+
+    def refined(self, site: Site, calibration: Calibration, owner: str, sigma: Array) -> Site:
+        value = {"clock_rate": calibration.clock_rate, "clock_rate_sigma": float(sigma[0])}
+        imu = replace(site.platform.imu, **value)
+        return replace(site, platform=replace(site.platform, imu=imu))
+
+    def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
+        by_offset = TIME_OFFSET.phasor_jacobian(view, owner)
+        assert by_offset is not None
+        time = view.calibration.reference_time + view.elapsed
+        return by_offset * _running(view.calibration, time)[:, None, None, None]
+
+    def steady_jacobian(self, view: SteadyView) -> Array | None:
+        by_offset = TIME_OFFSET.steady_jacobian(view)
+        assert by_offset is not None
+        return by_offset * _running(view.calibration, view.time)[:, None, None]
+
+
+def _running(calibration: Calibration, time: Array) -> Array:
+    """Return how long the IMU's clock has run (s)."""
+    return time - calibration.imu_begin
+
+
 def _cylindrical(calibration: Calibration) -> Array:
     """Return the Earth field's azimuth (rad), and its horizontal and vertical part (T)."""
     assert calibration.site.earth_field_world is not None
@@ -190,5 +233,5 @@ class _Strength(_EarthParameter):
 
 MATRIX, OFFSET = _Matrix(), _Offset()
 SENSOR_ROTATION, SENSOR_POSITION = _Rotation(), _Position()
-TIME_OFFSET = _TimeOffset()
+TIME_OFFSET, CLOCK_RATE = _TimeOffset(), _ClockRate()
 DECLINATION, STRENGTH = _Declination(), _Strength()

@@ -1,0 +1,63 @@
+"""What the magnetometer tells of the motion while the IMU is silent."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.motion_from_field import motion_from_field
+from magfusion.estimation.state import State
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import Waveform
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
+
+BEGIN, SPAN = 6.0, 0.4  # s
+
+
+def simulated() -> SimulatedLog:
+    site = replace(demo_site(coil_radius=None), model_error=1e-4)
+    config = SimulationConfig(DEMO_BOX_WORLD, 12.0, "turn", time_offset=0.0, perturb=False)
+    return simulate_log(site, config, np.random.default_rng(3))
+
+
+def state_at(made: SimulatedLog, time: float) -> State:
+    truth = made.motion.trajectory(np.array([time]))
+    assert truth.velocity_world is not None
+    sigma = np.repeat([0.01, 0.01, 0.3, 0.01, 0.01], 3)
+    return State(
+        time,
+        truth.world_from_body[0],
+        truth.position_world[0],
+        truth.velocity_world[0],
+        np.zeros(3),
+        np.zeros(3),
+        initial_calibration(made.true_site, time),
+        np.diag(sigma**2),
+    )
+
+
+def stretch(made: SimulatedLog) -> Waveform:
+    wave = made.log.waveform
+    assert wave is not None
+    inside = (wave.time > BEGIN) & (wave.time < BEGIN + SPAN)
+    return Waveform(wave.time[inside], wave.measured_sensor[inside])
+
+
+def test_the_turn_is_found_without_a_gyro() -> None:
+    made = simulated()
+    wave = stretch(made)
+    found = motion_from_field(state_at(made, BEGIN), wave)
+    assert found is not None
+    rate = made.motion.rate_body(wave.time)
+    assert np.sqrt(np.mean(np.sum(rate**2, axis=1))) > 0.3  # rad/s; there is a turn to be found
+    missed = np.sum(found.gyro_body - rate, axis=0) * np.median(np.diff(wave.time))
+    assert np.linalg.norm(missed) < 0.02  # rad; over the whole stretch
+
+
+def test_fields_that_contradict_the_state_are_not_followed() -> None:
+    made = simulated()
+    wave = stretch(made)
+    rng = np.random.default_rng(1)
+    noise = 1e-6 * rng.standard_normal(wave.measured_sensor.shape)
+    false = replace(wave, measured_sensor=wave.measured_sensor + noise)
+    assert motion_from_field(state_at(made, BEGIN), false) is None
