@@ -4,19 +4,29 @@ from dataclasses import replace
 
 import numpy as np
 
+from magfusion.estimation.batch import SmootherSettings, smooth
 from magfusion.estimation.motion_from_field import motion_from_field
 from magfusion.estimation.state import State
 from magfusion.model.parameters import initial_calibration
-from magfusion.model.samples import Waveform
+from magfusion.model.samples import ImuSamples, Log, Waveform
+from magfusion.receiver.admission import INERTIAL_GAP
+from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
 
 BEGIN, SPAN = 6.0, 0.4  # s
 
 
-def simulated() -> SimulatedLog:
+def simulated(rate_hz: float = 400.0) -> SimulatedLog:
     site = replace(demo_site(coil_radius=None), model_error=1e-4)
-    config = SimulationConfig(DEMO_BOX_WORLD, 12.0, "turn", time_offset=0.0, perturb=False)
+    config = SimulationConfig(
+        DEMO_BOX_WORLD,
+        12.0,
+        "turn",
+        time_offset=0.0,
+        perturb=False,
+        magnetometer_rate_hz=rate_hz,
+    )
     return simulate_log(site, config, np.random.default_rng(3))
 
 
@@ -50,8 +60,35 @@ def test_the_turn_is_found_without_a_gyro() -> None:
     assert found is not None
     rate = made.motion.rate_body(wave.time)
     assert np.sqrt(np.mean(np.sum(rate**2, axis=1))) > 0.3  # rad/s; there is a turn to be found
-    missed = np.sum(found.gyro_body - rate, axis=0) * np.median(np.diff(wave.time))
+    missed = np.sum(found.imu.gyro_body - rate, axis=0) * np.median(np.diff(wave.time))
     assert np.linalg.norm(missed) < 0.02  # rad; over the whole stretch
+
+
+def without_imu(log: Log, begin: float, end: float) -> Log:
+    kept = (log.imu.time < begin) | (log.imu.time > end)
+    imu = ImuSamples(log.imu.time[kept], log.imu.gyro_body[kept], log.imu.accel_body[kept])
+    return replace(log, imu=imu)
+
+
+def test_a_batch_knows_where_it_is_in_a_gap_of_the_imu() -> None:
+    made = simulated(rate_hz=200.0)
+    begin, end = 5.0, 7.0
+    log = without_imu(made.log, begin, end)
+    result = smooth(log, made.true_site, SmootherSettings(tune=False))
+    assert INERTIAL_GAP not in result.dropped
+    assert result.bridged >= 2.0 / result.fields.window[0]
+    assert log.truth is not None
+    errors = trajectory_errors(result.states, log.truth)
+    assert errors.nees is not None
+    inside = (errors.time > begin) & (errors.time < end)
+    assert np.sum(inside) == 10  # each window
+    assert np.max(np.linalg.norm(errors.position_world[inside], axis=1)) < 0.1  # m
+    assert np.max(errors.attitude[inside]) < 0.1  # rad
+    assert np.mean(errors.nees[inside]) < 12.0
+    assert result.states.pose_cov is not None
+    sigma = np.sqrt(np.diagonal(result.states.pose_cov, axis1=1, axis2=2)).max(axis=1)
+    known = (result.states.time > begin) & (result.states.time < end)
+    assert np.median(sigma[known]) > 2.0 * np.median(sigma[~known])
 
 
 def test_fields_that_contradict_the_state_are_not_followed() -> None:

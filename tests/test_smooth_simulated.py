@@ -137,7 +137,7 @@ def test_the_imus_clock_is_recovered_within_three_sigma(
     sigma = np.sqrt(np.diag(result.calibration_cov))
     assert abs(result.calibration.time_offset - time_offset) < 3.0 * sigma[0]
     assert abs(result.calibration.clock_rate - clock_rate) < 3.0 * sigma[1]
-    assert sigma[1] < 2.5e-5  # half its prior
+    assert sigma[1] < 4e-5  # of 20 s, in part at rest; its prior is 5e-5
     middle = DURATION / 2.0
     by_both = np.array([1.0, middle])
     there = float(np.sqrt(by_both @ result.calibration_cov @ by_both))

@@ -7,6 +7,7 @@ import numpy as np
 from gtsam.symbol_shorthand import V
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.bridged_log import bridged
 from magfusion.estimation.convergence import last_move, refuse_open, settled_at
 from magfusion.estimation.demodulation import demodulated
 from magfusion.estimation.graph import Estimate, Graph, initial_estimate, marginals, read_states
@@ -193,7 +194,7 @@ def smooth(
     if settings.earth:
         check_earth(site)
     known = mended(log, site)
-    return _solved(_prepared(known, site, settings, report), settings, report)
+    return _solved(bridged(_prepared(known, site, settings, report)), settings, report)
 
 
 def _prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) -> PreparedLog:
@@ -272,7 +273,7 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
         report(f"pass {done + 1}", done + 2, settings.passes + 3)
         if done > 0 and by_waveform:
             wave = log.compensated(calibration, states)
-        graph, bridged = graph_of(log, states, calibration, wave, standing)
+        graph, gaps = graph_of(log, states, calibration, wave, standing)
         found = optimise(graph, initial_estimate(states, calibration, segments))
         after = read_states(found.estimate.values, time)
         stood = _at_rest(graph, found.estimate, after, calm & ~standing, motion)
@@ -299,7 +300,7 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
         iterations, done = iterations + found.iterations, done + 1
     report("posterior", settings.passes + 2, settings.passes + 3)
     fields = log.samples if wave is None else wave.fields
-    result = _posterior(log, graph, found, fields, bridged)
+    result = _posterior(log, graph, found, fields, gaps)
     report("done", settings.passes + 3, settings.passes + 3)
     refuse_open(result.states)
     move = (
@@ -357,7 +358,7 @@ def _at_rest(
 
 
 def _posterior(
-    log: PreparedLog, graph: Graph, found: Optimised[Estimate], samples: FieldSamples, bridged: int
+    log: PreparedLog, graph: Graph, found: Optimised[Estimate], samples: FieldSamples, gaps: int
 ) -> Smoothed:
     estimate = found.estimate
     states, response = read_states(estimate.values, log.states.time), None
@@ -392,7 +393,7 @@ def _posterior(
         rival_chi_square=log.rival_chi_square,
         rival=log.rival,
         dropped=log.demodulation.dropped,
-        bridged=bridged,
+        bridged=gaps,
         cost=found.cost,
         passes=1,
         iterations=found.iterations,

@@ -1,14 +1,14 @@
 """The phasors and the first fixes of a log that has a waveform, or a table of phasors."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.integrity.detection import drowned, without_silence
 from magfusion.estimation.integrity.spectrum import beside_lines
-from magfusion.estimation.motion_compensation import MotionCompensated, demodulate_about
+from magfusion.estimation.motion_compensation import MotionCompensated, demodulate_about, noisier
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.parameters import Calibration
@@ -45,6 +45,10 @@ class Demodulation:
     drowned : bool ndarray, shape (n, channels), optional
         Phasors left out of ``fields`` in which the motion may hide a beacon; None where the log
         holds phasors.
+    blind : bool ndarray, shape (n,), optional
+        Windows in which what the fields tell of the motion stands in for inertial samples.
+    without_turn : Windows
+        That were dropped for want of inertial samples alone.
     """
 
     log: Log
@@ -53,6 +57,8 @@ class Demodulation:
     receiver: Receiver | None = None
     windows: Windows | None = None
     drowned: BoolArray | None = None
+    blind: BoolArray | None = None
+    without_turn: Windows = field(default_factory=Windows.none)
 
     def steady(self, calibration: Calibration) -> SteadyFields:
         """Return the Earth field and the offset before anything is known of the motion.
@@ -100,8 +106,15 @@ class Demodulation:
         if not isinstance(self.receiver, LockinReceiver):
             found, _ = self.receiver.phasors(waveform, known, windows, site)
             return MotionCompensated.of_slots(found)
+        length = self.receiver.settings.window
         operator = window_operator(waveform, known, site, self.receiver.settings, windows)
-        return demodulate_about(operator, waveform.measured_sensor, states, imu, calibration)
+        if self.blind is not None:
+            operator = replace(operator, apart=self.blind)
+        wave = demodulate_about(operator, waveform.measured_sensor, states, imu, calibration)
+        if self.blind is None:
+            return wave
+        fields = noisier(wave.fields, self.blind, states, calibration, length)
+        return replace(wave, fields=fields)
 
 
 OFF_GRAVITY = 0.5  # of it; a specific force farther from it is not its opposite
@@ -122,7 +135,9 @@ def demodulated(log: Log, site: Site, settings: LockinSettings | None = None) ->
     receiver = Receiver.of(site, beside_lines(log, site, settings))
     windows, fields = receiver.whole(log.waveform, log.imu)
     heard, hidden = without_silence(fields), drowned(fields)
-    return Demodulation(log, heard, receiver.dropped, receiver, windows, hidden)
+    without = receiver.without_turn if isinstance(receiver, LockinReceiver) else Windows.none()
+    dropped = receiver.dropped
+    return Demodulation(log, heard, dropped, receiver, windows, hidden, without_turn=without)
 
 
 def phasors(

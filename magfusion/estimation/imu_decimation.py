@@ -9,7 +9,7 @@ of the interval.  The derivatives differ by a twelfth of the square of the turn 
 change of bias that the next pass makes nothing.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.estimation.preintegration import Increments, cut_at_epochs, preintegrate
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel
+from magfusion.receiver.admission import meets
 from magfusion.units import Array, BoolArray, IntArray
 
 JOINED = (20, 10)  # steps made one: as many as leave enough
@@ -35,6 +36,7 @@ def preintegrate_stream(
     gravity: float,
     accel_bias: Array,
     gyro_bias: Array,
+    silence: tuple[Array, Array] | None = None,
 ) -> tuple[list[gtsam.PreintegratedCombinedMeasurementsG], BoolArray]:
     """Preintegrate a whole stream between epochs, a stretch of it at a time.
 
@@ -48,6 +50,8 @@ def preintegrate_stream(
         (m/s^2)
     accel_bias, gyro_bias : ndarray, shape (n, 3)
         At which to linearise (m/s^2, rad/s).
+    silence : tuple of ndarray, optional
+        Where gaps begin and end in which other samples stand in for inertial ones (s).
 
     Returns
     -------
@@ -68,6 +72,9 @@ def preintegrate_stream(
         here = slice(begin, end + 1)
         stream = ImuSamples(imu.time[rows], imu.gyro_body[rows], imu.accel_body[rows])
         increments = cut_at_epochs(stream, time_offset, epochs[here], usual)
+        if silence is not None:
+            silent = meets(*silence, epochs[begin:end], epochs[begin + 1 : end + 1])
+            increments = replace(increments, bridged=increments.bridged | silent)
         increments = thinned(increments, accel_bias[here], gyro_bias[here])
         measured += preintegrate(increments, model, gravity, accel_bias[here], gyro_bias[here])
         bridged.append(increments.bridged)

@@ -54,6 +54,9 @@ class PreparedLog:
         Anything else that was measured, with the times of its rows (s).
     rival_chi_square, rival : float, Trajectory, optional
         As of `Smoothed`.
+    silence : tuple of ndarray, optional
+        Where gaps of the inertial stream begin and end in which what the fields tell of the motion
+        stands in (s).
     """
 
     demodulation: Demodulation
@@ -70,10 +73,11 @@ class PreparedLog:
     others: tuple[tuple[Array, Measurement], ...]
     rival_chi_square: float | None = None
     rival: Trajectory | None = None
+    silence: tuple[Array, Array] | None = None
 
     @property
     def imu(self) -> ImuSamples:
-        """The inertial stream as it was recorded."""
+        """The inertial stream, with what stands in for it."""
         return self.demodulation.log.imu
 
     def at_fields(self, states: Trajectory) -> Trajectory:
@@ -157,8 +161,9 @@ def _links(
 
     def preintegrated(calibration: Calibration) -> list[Preintegrated]:
         imu = applied.on_log_rate(corrected_imu(calibration, blocks, log.imu))
+        offset, model, gravity = applied.time_offset, site.platform.imu, site.gravity
         found, gaps = preintegrate_stream(
-            imu, applied.time_offset, states.time, site.platform.imu, site.gravity, accel, gyro
+            imu, offset, states.time, model, gravity, accel, gyro, log.silence
         )
         bridged.append(int(np.sum(gaps)))
         return found

@@ -14,7 +14,7 @@ from magfusion.receiver.admission import Windows
 from magfusion.receiver.lockin import WindowOperator, window_operator
 from magfusion.receiver.receiver import LockinReceiver
 from magfusion.receiver.turn import on_clock
-from magfusion.units import Array, ComplexArray
+from magfusion.units import Array, BoolArray, ComplexArray
 
 OFFSET_STEP = 5e-4  # s; of the difference quotient
 # By how much a motion that was found without an IMU errs within a window, one sigma.
@@ -168,21 +168,40 @@ def demodulate_predicted(
         return _without_motion(operator, samples.measured_sensor, site.platform.magnetometer.offset)
     centre, path = as_trajectory([predicted]), as_trajectory([before, predicted])
     found = demodulate_about(operator, samples.measured_sensor, centre, imu, calibration, path)
+    length = receiver.settings.window
     if not blind:
         return found
-    cov = found.fields.phasor_cov + _missed_cov(predicted, receiver.settings.window)
-    return replace(found, fields=replace(found.fields, phasor_cov=cov))
+    fields = noisier(found.fields, np.ones(1, dtype=bool), centre, calibration, length)
+    return replace(found, fields=fields)
 
 
-def _missed_cov(state: State, window: float) -> Array:
-    """Return the covariance of phasors, shape (channels, 3, 3), by a shape that was missed (T^2).
+def noisier(
+    samples: FieldSamples,
+    blind: BoolArray,
+    states: Trajectory,
+    calibration: Calibration,
+    window: float,
+) -> FieldSamples:
+    """Return phasors with the noise of a shape of the motion that was missed.
 
     It moves all channels alike: that they are taken for independent must not average it out.
+
+    Parameters
+    ----------
+    blind : bool ndarray, shape (n,)
+        Windows in which the motion was found without an IMU.
+    states : Trajectory
+        At their centres.
+    window : float
+        Length of the windows (s).
     """
-    time, turned = np.array([state.time]), state.world_from_body[None]
-    place = state.position_world[None]
-    _, by_pose, _ = linearize_channels(state.calibration, (), time, turned, place)
+    rows = np.flatnonzero(blind)
+    pose = states.world_from_body[rows], states.position_world[rows]
+    _, by_pose, _ = linearize_channels(calibration, (), states.time[rows], *pose)
     # The mean over the window of half the square of time.
     shape = window**2 / 24.0 * np.repeat([MISSED_SPIN, MISSED_PUSH], 3)
-    by = (by_pose[0] * shape).reshape(-1, 2, 3, 6)
-    return np.asarray(0.5 * len(by) * np.einsum("ckxi,ckyi->cxy", by, by))
+    channels = len(samples.channels)
+    by = (by_pose * shape).reshape(len(rows), channels, 2, 3, 6)
+    cov = samples.phasor_cov.copy()
+    cov[rows] += 0.5 * channels * np.einsum("nckxi,nckyi->ncxy", by, by)
+    return replace(samples, phasor_cov=cov)

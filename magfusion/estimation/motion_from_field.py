@@ -4,8 +4,9 @@ A window of the lock-in is long against a fast turn: without the gyro the Earth 
 every tone.  But each sample holds the Earth field, whose direction gives two angles at once, and
 the tones, which give the third and the place.  A filter over the samples, from the last state that
 is known, and back again (Rauch, Tung and Striebel), follows a turn of several radians a second.
-What it finds takes the place of inertial samples: as the shape of the motion only, with the noise
-of a stretch that has none.
+Where the gyro is heard, before a gap and behind it, the filter takes its rates: a short gap is as
+good as interpolated.  What it finds takes the place of inertial samples: as the shape of the motion
+only, with the noise of a stretch that has none.
 """
 
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ from magfusion.estimation.state import MOTION, State
 from magfusion.model.field import observe_earth
 from magfusion.model.parameters import Calibration, linearize_channels
 from magfusion.model.samples import ImuSamples, Waveform
+from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
 TURN_NOISE = 20.0  # rad/s^2/sqrt(Hz); of a hand that turns as fast as it can
@@ -25,7 +27,7 @@ FASTEST_TURN = 5.0  # rad/s; of which the rate at the beginning is one sigma
 STEADY_ERROR = 3e-4  # of the steady field: vibration, which no path follows
 FIELD_ERROR = 1e-2  # of the beacons' fields: iron, and the calibration
 FIRST_STEADY = 1e-6  # T; how far the steady field may be from what the first sample says
-LONGEST = 2.0  # s; that the filter runs from a known state
+GYRO_ERROR = 0.05  # rad/s; of a rate between two samples of a gyro: vibration
 WORST_MISFIT = 5.0  # mean squared innovation, in units of its expectation
 FEWEST = 8  # samples
 TURN, PLACE, SPEED, RATE, STEADY = (slice(3 * k, 3 * k + 3) for k in range(5))
@@ -83,8 +85,27 @@ class _Motion:
         return moved, by
 
 
-def motion_from_field(state: State, waveform: Waveform) -> ImuSamples | None:
-    """Return what an IMU would have measured while a magnetometer did; None where it is not told.
+@dataclass(frozen=True, eq=False)
+class FieldMotion:
+    """How the platform moved by the field.
+
+    Parameters
+    ----------
+    imu : ImuSamples
+        What an IMU would have measured, at the times of the magnetometer's samples on the log's
+        clock, with the biases of the state that it was followed from.
+    path : Trajectory
+        Poses and velocities at the same times.
+    """
+
+    imu: ImuSamples
+    path: Trajectory
+
+
+def motion_from_field(
+    state: State, waveform: Waveform, imu: ImuSamples | None = None, longest_step: float = 0.0
+) -> FieldMotion | None:
+    """Return how the platform moved while a magnetometer measured; None where that is not told.
 
     Parameters
     ----------
@@ -92,21 +113,23 @@ def motion_from_field(state: State, waveform: Waveform) -> ImuSamples | None:
         At or before the first sample.
     waveform : Waveform
         Samples that follow.
-
-    Returns
-    -------
-    ImuSamples
-        At the times of the magnetometer's samples, on the log's clock, with the state's biases.
+    imu : ImuSamples, optional
+        Of the same stretch, on the log's clock: what there is.
+    longest_step : float
+        Between two inertial samples (s); a longer one is a gap.
     """
     time, calibration = waveform.time, state.calibration
-    if len(time) < FEWEST or time[-1] - state.time > LONGEST:
+    if len(time) < FEWEST:
         return None
     motion, before, misfit = _begin(state, waveform), state.time, []
     found: list[_Motion] = []
     predictions: list[tuple[_Motion, Array]] = []
-    for now, measured in zip(time.tolist(), waveform.measured_sensor, strict=True):
+    rates = _rates_at(time, imu, longest_step) - state.gyro_bias_body
+    for now, measured, rate in zip(time.tolist(), waveform.measured_sensor, rates, strict=True):
         predictions.append(motion.after(now - before))
         motion, square = _updated(predictions[-1][0], calibration, now, measured)
+        if np.isfinite(rate[0]):
+            motion = _turning(motion, rate)
         found.append(motion)
         misfit.append(square)
         before = now
@@ -117,12 +140,35 @@ def motion_from_field(state: State, waveform: Waveform) -> ImuSamples | None:
         gain = np.linalg.solve(ahead.cov, by @ found[k].cov).T
         found[k] = found[k].moved(gain @ ahead.step_to(found[k + 1]), found[k].cov)
     velocity = np.stack([one.velocity_world for one in found])
-    gained = np.gradient(velocity, time, axis=0)
-    force = gained + np.array([0.0, 0.0, calibration.site.gravity])
-    body_from_world = np.stack([one.world_from_body.T for one in found])
+    force = np.gradient(velocity, time, axis=0) + np.array([0.0, 0.0, calibration.site.gravity])
+    turned = np.stack([one.world_from_body for one in found])
     rate = np.stack([one.rate_body for one in found])
-    accel = (body_from_world @ force[..., None])[..., 0]
-    return ImuSamples(time, rate + state.gyro_bias_body, accel + state.accel_bias_body)
+    accel = (np.swapaxes(turned, 1, 2) @ force[..., None])[..., 0]
+    place = np.stack([one.position_world for one in found])
+    return FieldMotion(
+        ImuSamples(time, rate + state.gyro_bias_body, accel + state.accel_bias_body),
+        Trajectory(time, turned, place, velocity),
+    )
+
+
+def _rates_at(time: Array, imu: ImuSamples | None, longest_step: float) -> Array:
+    """Return the gyro's rates at some times, shape (n, 3); NaN where it is silent (rad/s)."""
+    if imu is None or len(imu) == 0:
+        return np.full((len(time), 3), np.nan)
+    step = np.concatenate([[np.inf], np.diff(imu.time), [np.inf]])
+    span = step[np.searchsorted(imu.time, time)]
+    rates = np.stack([np.interp(time, imu.time, axis) for axis in imu.gyro_body.T], axis=1)
+    return np.asarray(np.where(span[:, None] <= longest_step, rates, np.nan))
+
+
+def _turning(motion: _Motion, rate: Array) -> _Motion:
+    """Return a motion whose rate was measured (rad/s)."""
+    spread = motion.cov[RATE, RATE] + GYRO_ERROR**2 * np.eye(3)
+    gain = np.linalg.solve(spread, motion.cov[RATE]).T
+    left = np.eye(MOTION)
+    left[:, RATE] -= gain
+    cov = left @ motion.cov @ left.T + GYRO_ERROR**2 * gain @ gain.T
+    return motion.moved(gain @ (rate - motion.rate_body), cov)
 
 
 def _begin(state: State, waveform: Waveform) -> _Motion:

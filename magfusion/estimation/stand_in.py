@@ -6,9 +6,10 @@ from magfusion.estimation.motion_from_field import motion_from_field
 from magfusion.estimation.state import State
 from magfusion.estimation.stream_buffer import Buffer
 from magfusion.model.samples import ImuSamples, Waveform
-from magfusion.receiver.admission import Admission, silences
+from magfusion.receiver.admission import Admission, longest_step, silences
 from magfusion.units import Array
 
+LONGEST = 2.0  # s; that is followed from a known state
 REACH = 0.5  # s; of inertial samples about a stretch, to know whether one is missing
 
 
@@ -49,7 +50,7 @@ class StandIn:
         offset : float
             Added to the IMU's stamps (s).
         """
-        stamps = imu.between(state.time - offset - REACH, until - offset + REACH)[0]
+        stamps, heard = imu.between(state.time - offset - REACH, until - offset + REACH)
         begin, end = silences(stamps + offset, admission.imu_step, admission.imu_margin)
         # What is behind the newest sample is silent from it on.
         begin[-1] -= admission.imu_margin
@@ -58,12 +59,16 @@ class StandIn:
             return
         time, rows = waveform.rows()
         within = (time > state.time) & (time < until)
-        found = motion_from_field(state, Waveform(time[within], rows[within]))
         kept = self.time <= state.time - offset
         self.time, self.rows = self.time[kept], self.rows[kept]
-        if found is None:
+        if until - state.time > LONGEST:
             return
-        step = admission.imu_step
+        inertial = ImuSamples(stamps + offset, heard[:, :3], heard[:, 3:])
+        part, step = Waveform(time[within], rows[within]), admission.imu_step
+        followed = motion_from_field(state, part, inertial, longest_step(step))
+        if followed is None:
+            return
+        found = followed.imu
         silent = np.zeros(len(found), dtype=bool)
         for first, last in zip(begin[meets], end[meets], strict=True):
             silent |= (found.time > first + 0.5 * step) & (found.time < last - 0.5 * step)

@@ -50,9 +50,21 @@ class Windows:
     def __len__(self) -> int:
         return len(self.number)
 
-    def rows(self, kept: BoolArray | slice) -> "Windows":
+    def rows(self, kept: BoolArray | IntArray | slice) -> "Windows":
         """Return some windows."""
         return Windows(self.number[kept], self.centre[kept], self.first[kept], self.count[kept])
+
+    def joined(self, others: "Windows") -> "Windows":
+        """Return these and others of the same grid, in order."""
+        rows = zip(vars(self).values(), vars(others).values(), strict=True)
+        both = Windows(*(np.concatenate(pair) for pair in rows))
+        return both.rows(np.argsort(both.number))
+
+    @staticmethod
+    def none() -> "Windows":
+        """Return no windows."""
+        whole = np.zeros(0, dtype=np.int64)
+        return Windows(whole, np.zeros(0), whole, whole)
 
 
 @dataclass(frozen=True)
@@ -189,7 +201,7 @@ class Admission:
         time, step = waveform.time, self.magnetometer_step
         gap = np.flatnonzero(np.diff(time) > 1.5 * step)
         # From just before the first missing sample to just after the last.
-        lacking = _meets(time[gap] + 0.75 * step, time[gap + 1] - 0.75 * step, begin, end)
+        lacking = meets(time[gap] + 0.75 * step, time[gap + 1] - 0.75 * step, begin, end)
         few = windows.count * step < self.least_share * grid.length
         asked = lacking & ~few
         if np.any(asked):
@@ -203,8 +215,13 @@ class Admission:
         drop(NO_INERTIAL, begin < self.imu_begin - self.imu_margin)
         if self.needs_turn:
             silence = silences(imu_time, self.imu_step, self.imu_margin)
-            drop(INERTIAL_GAP, _meets(*silence, begin, end - LATEST_USE * step))
+            drop(INERTIAL_GAP, meets(*silence, begin, end - LATEST_USE * step))
         return found
+
+
+def longest_step(step: float) -> float:
+    """Return the longest time between two inertial samples that is no gap, of the usual one (s)."""
+    return max(3.0 * step, LONGEST_GAP)
 
 
 def silences(imu_time: Array, step: float, margin: float) -> tuple[Array, Array]:
@@ -215,7 +232,7 @@ def silences(imu_time: Array, step: float, margin: float) -> tuple[Array, Array]
     step, margin : float
         As of `Admission` (s).
     """
-    gap = np.flatnonzero(np.diff(imu_time) > max(3.0 * step, LONGEST_GAP))
+    gap = np.flatnonzero(np.diff(imu_time) > longest_step(step))
     begin = np.append(imu_time[gap], imu_time[-1:] + margin)
     return begin, np.append(imu_time[gap + 1], np.inf)
 
@@ -233,9 +250,9 @@ def meets_silence(
         As from `silences`.
     """
     begin, end = windows.centre - length / 2.0, windows.centre + length / 2.0
-    return _meets(*silence, begin, end - LATEST_USE * float(np.median(np.diff(time))))
+    return meets(*silence, begin, end - LATEST_USE * float(np.median(np.diff(time))))
 
 
-def _meets(begin: Array, end: Array, window_begin: Array, window_end: Array) -> BoolArray:
-    """Return which windows meet at least one of the stretches, which are sorted and apart."""
-    return np.searchsorted(begin, window_end) > np.searchsorted(end, window_begin)
+def meets(begin: Array, end: Array, span_begin: Array, span_end: Array) -> BoolArray:
+    """Return which spans meet at least one of some stretches, which are sorted and apart (s)."""
+    return np.searchsorted(begin, span_end) > np.searchsorted(end, span_begin)

@@ -58,6 +58,8 @@ class WindowOperator:
     unseen : bool ndarray, shape (windows,)
         Where the gyro is silent: the ramps follow a turn that it does not see, and what the
         square of it does is noise.
+    apart : bool ndarray, shape (windows,)
+        Whose noise is not that of their neighbours: there the turn was found without a gyro.
     """
 
     settings: LockinSettings
@@ -70,6 +72,7 @@ class WindowOperator:
     measured_from_still: Array
     declared_noise: float
     unseen: BoolArray
+    apart: BoolArray
 
     def apply(self, measured_sensor: Array) -> ComplexArray:
         """Return the phasors of a waveform given at the same sample times.
@@ -119,7 +122,7 @@ class WindowOperator:
         )
         centre, settings = self.windows.centre, self.settings
         smooth = smoothed_over_windows(
-            noise, centre, settings.step, settings.noise_windows, self.unseen
+            noise, centre, settings.step, settings.noise_windows, self.unseen | self.apart
         )
         smooth = not_below(smooth, self.declared_noise)
         samples = FieldSamples(
@@ -224,6 +227,7 @@ def window_operator(
         measured_from_still=measured_from_still(windows.centre),
         declared_noise=site.platform.magnetometer.noise_density * float(np.sqrt(nyquist_hz)),
         unseen=meets_silence(windows, settings.window, waveform.time, silence),
+        apart=np.zeros(len(windows), dtype=bool),
     )
 
 

@@ -15,6 +15,7 @@ from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.admission import (
+    INERTIAL_GAP,
     REASONS,
     ROUNDING,
     Admission,
@@ -60,6 +61,8 @@ class Receiver(ABC):
         Reason to number of windows.
     needs_turn : bool
         Whether windows without inertial samples are of no use.
+    without_turn : Windows
+        Of those that were judged last, which lack nothing else.
     """
 
     grid: Grid | None
@@ -68,9 +71,11 @@ class Receiver(ABC):
     recent: IntArray
     dropped: Counter[str]
     needs_turn: bool
+    without_turn: Windows
 
     def __init__(self, site: Site) -> None:
         self.needs_turn = True
+        self.without_turn = Windows.none()
         self.site = site
         self.grid = self.admission = None
         self.next_number = 0
@@ -247,6 +252,7 @@ class Receiver(ABC):
         verdict = self.admission.verdicts(self.grid, windows, waveform, stamps, self._growth)
         for k, reason in enumerate(REASONS):
             self._count(reason, int(np.sum(verdict == k)))
+        self.without_turn = windows.rows(verdict == REASONS.index(INERTIAL_GAP))
         return windows.rows(verdict < 0)
 
     def _count(self, reason: str, dropped: int) -> None:

@@ -62,8 +62,8 @@ def simulate_imu(
     duration: float,
     rng: np.random.Generator,
     time_offset: float = 0.0,
-    clock_rate: float = 0.0,
     instability: BiasInstability | None = None,
+    clock_rate: float = 0.0,
 ) -> SimulatedImu:
     """Return inertial samples: the exact values of one instant, bias and white noise.
 
@@ -81,10 +81,10 @@ def simulate_imu(
         (s); stamps run from 0 to less than this.
     time_offset : float
         The sample stamped t is taken at t + time_offset on the log's clock (s), the first one.
-    clock_rate : float
-        What that grows by in each second.
     instability : BiasInstability, optional
         Added to the bias walk.
+    clock_rate : float
+        What the time offset grows by in each second.
 
     Raises
     ------

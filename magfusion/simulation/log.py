@@ -141,8 +141,8 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         config.duration,
         imu_rng,
         true_site.platform.imu.time_offset,
-        true_site.platform.imu.clock_rate,
         config.instability,
+        true_site.platform.imu.clock_rate,
     )
     waveform = simulate_waveform(
         motion,
