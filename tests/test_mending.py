@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.estimation.batch import smooth
+from magfusion.estimation.batch import SmootherSettings, smooth
 from magfusion.estimation.integrity.mending import mended
 from magfusion.model.trust import Verdict
 from magfusion.results.errors import trajectory_errors
@@ -44,3 +44,24 @@ def test_a_false_magnetometer_sample_is_a_missing_one() -> None:
     assert good.waveform is not None
     np.testing.assert_array_equal(good.waveform.time, np.delete(log.waveform.time, rows))
     assert [finding.code for finding in good.noticed] == ["false_samples"]
+
+
+def test_an_imu_that_hung_is_one_that_fell_silent() -> None:
+    site, rng = demo_site(coil_radius=None), np.random.default_rng(8)
+    plan = SimulationConfig(DEMO_BOX_WORLD, duration=8.0, magnetometer_rate_hz=200.0)
+    log = simulate_log(site, plan, rng).log
+    hung = slice(700, 1000)  # 1.5 s
+    gyro, accel = log.imu.gyro_body.copy(), log.imu.accel_body.copy()
+    gyro[hung], accel[hung] = gyro[700], accel[700]
+    spoilt = replace(log, imu=replace(log.imu, gyro_body=gyro, accel_body=accel))
+    good = mended(spoilt, site)
+    np.testing.assert_array_equal(good.imu.time, np.delete(log.imu.time, np.arange(701, 1000)))
+    assert {finding.code for finding in good.noticed} == {"frozen_imu"}
+    assert all(finding.verdict is Verdict.TRUSTWORTHY for finding in good.noticed)
+    result = smooth(spoilt, site, SmootherSettings(tune=False))
+    errors = trajectory_errors(result.states, log.truth)
+    inside = (errors.time > log.imu.time[700]) & (errors.time < log.imu.time[1000])
+    assert errors.nees is not None
+    assert np.sum(inside) >= 7  # windows
+    assert np.max(np.linalg.norm(errors.position_world[inside], axis=1)) < 0.1  # m
+    assert np.mean(errors.nees[inside]) < 12.0

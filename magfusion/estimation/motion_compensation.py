@@ -203,5 +203,9 @@ def noisier(
     channels = len(samples.channels)
     by = (by_pose * shape).reshape(len(rows), channels, 2, 3, 6)
     cov = samples.phasor_cov.copy()
-    cov[rows] += 0.5 * channels * np.einsum("nckxi,nckyi->ncxy", by, by)
+    missed = 0.5 * channels * np.einsum("nckxi,nckyi->ncxy", by, by)
+    # What is found of the noise of a beacon is not of this.
+    beacons = calibration.site.beacons
+    factor = np.concatenate([np.full(len(b.tones), b.noise_factor) for b in beacons])
+    cov[rows] += missed / factor[:, None, None] ** 2
     return replace(samples, phasor_cov=cov)

@@ -25,7 +25,7 @@ from magfusion.model.parameters import Calibration
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.units import Array
+from magfusion.units import Array, BoolArray
 
 PRIOR = float(np.log(2.0))  # of the logarithm of a declared sigma
 LEAST, MOST = 0.1, 1e3  # of a factor; that a noise is smaller yet, no log tells for sure
@@ -113,7 +113,8 @@ def noise_of(
     """Return the noise of a log whose graph was solved with some phasors; see `tune`."""
     samples, here = log.samples if wave is None else wave.fields, log.at_fields(states)
     alike = alike_in_batch(here.position_world, declared.model_error_length)
-    return tune(graph, estimate, samples, here, declared, overlap(samples), alike)
+    blind = log.demodulation.blind
+    return tune(graph, estimate, samples, here, declared, overlap(samples), alike, blind)
 
 
 def tune(
@@ -124,6 +125,7 @@ def tune(
     declared: Site,
     windows: float,
     alike: Array,
+    blind: BoolArray | None = None,
 ) -> tuple[Tuned, ...]:
     """Return the noise that the residuals of a solved graph are likeliest with.
 
@@ -139,12 +141,15 @@ def tune(
         How many windows hold each sample.
     alike : ndarray, shape (n,)
         How many epochs have the same model error.
+    blind : bool ndarray, shape (n,), optional
+        Epochs whose noise is another: of a motion that was found without an IMU.
     """
     system, now = Leavings(graph, estimate, samples, poses, windows), estimate.calibration.site
     lag = max(1, round(windows))
     found: list[Tuned] = []
     for i, beacon in enumerate(now.beacons):
-        square, expected, near = _by_scale(system.channels_of(i), alike, lag)
+        channels = [_without(own, blind) for own in system.channels_of(i)]
+        square, expected, near = _by_scale(channels, alike, lag)
         if not len(square):
             continue
         prior = declared.beacons[i]
@@ -168,6 +173,16 @@ def tune(
             factor = min(float(np.exp(log[1])), FAULT)  # faults come first
             found.append(Tuned(beacon.name, "model_error", usual, factor * usual))
     return (*found, *_tuned_imu(system, now, declared))
+
+
+def _without(own: ChannelErrors, blind: BoolArray | None) -> ChannelErrors:
+    if blind is None:
+        return own
+    kept = ~blind[own.epoch]
+    noise, model, inertial = (part[kept] for part in own.left)
+    variance = own.variance[0][kept], own.variance[1][kept]
+    left = noise, model, inertial
+    return replace(own, epoch=own.epoch[kept], seen=own.seen[kept], left=left, variance=variance)
 
 
 def _by_scale(channels: list[ChannelErrors], alike: Array, lag: int) -> tuple[Array, Array, Array]:

@@ -155,6 +155,17 @@ def _freeze(stream: Stream, where: str, found: Runs) -> Finding:
     )
 
 
+def frozen_rows(stream: Stream) -> IntArray:
+    """Return the samples of a stream that hung: all of a stretch but its first.
+
+    None of one that hung for most of the log: there is no stream to bridge.
+    """
+    found = _all_frozen(stream)
+    rows = [np.arange(a + 1, b + 1) for a, b in zip(found.first, found.last, strict=True)]
+    hung = np.concatenate([np.zeros(0, dtype=np.int64), *rows])
+    return hung if len(hung) < DEAD * len(stream.time) else hung[:0]
+
+
 def repeated_samples(log: Log, site: Site | None) -> Iterator[Finding]:
     """Yield the instruments that are read faster than they measure."""
     for stream in streams(log):
