@@ -112,13 +112,13 @@ def _motion(truth: bool = True) -> Motion:
 
 
 def _figures() -> Figures:
-    shift = Estimate(
-        "{beacon}.position_x_m", 0.25, "m", EVIL, label="position", sigma=0.01, prior_sigma=0.05
-    )
+    known = {"label": "position", "sigma": 0.01, "prior_sigma": 0.05}
+    shift = Estimate("{beacon}.position_x_m", 0.25, "m", EVIL, declared=-6.0, **known)
+    turn = Estimate("{beacon}.rotation_x_deg", -0.1, "deg", EVIL, **known)
     return (
         heading("smooth", f"log of {EVIL}")
         | trust_figures(TRUST)
-        | Figures(Figure("ate_m", 0.0123, "m"), shift)
+        | Figures(Figure("ate_m", 0.0123, "m"), shift, turn)
         | dropped_figures({"saturated": 17, "too short": 0})
     )
 
@@ -167,7 +167,8 @@ def test_the_verdict_comes_first_with_its_reasons(page: Page) -> None:
 
 
 def test_the_page_says_what_was_found_refused_and_how_it_was_run(page: Page) -> None:
-    assert "0 ± 0.05 +0.250 ± 0.01 +5.00 yes" in page.text  # 0.25 m of a sigma of 0.05
+    assert "-6.000 ± 0.05 -5.750 ± 0.01 +5.00 yes" in page.text  # 0.25 m of a sigma of 0.05
+    assert "declared ± 0.05 declared -0.100 ± 0.01 -2.00 yes" in page.text
     assert "windows dropped saturated 17" in page.text
     refused = page.text[page.text.index("What was refused") : page.text.index("How it was run")]
     assert "too short" not in refused
@@ -192,6 +193,21 @@ def test_a_page_of_hardly_any_states_is_written(states: int, tmp_path: Path) -> 
     few = {name: part[:states] for name, part in vars(motion.states).items() if part is not None}
     write_report(tmp_path, _figures(), Motion(motion.site, Trajectory(**few)))
     Page(tmp_path / PAGE).check()
+
+
+def test_a_direction_that_is_open_hides_nothing(tmp_path: Path) -> None:
+    motion = _motion()
+    assert motion.states.pose_cov is not None
+    for value in (1e12, np.inf, np.nan):
+        cov = motion.states.pose_cov.copy()
+        cov[5, 3, 3] = value
+        states = replace(motion.states, pose_cov=cov)
+        assert motion.errors is not None
+        errors = replace(motion.errors, pose_cov=cov)
+        write_report(tmp_path, _figures(), replace(motion, states=states, errors=errors))
+        found = Page(tmp_path / PAGE)
+        found.check()
+        assert "error (mm)" in found.text
 
 
 def test_of_a_failed_job_the_page_lies_with_what_was_found(tmp_path: Path) -> None:

@@ -184,8 +184,11 @@ def _estimates(found: _Calibrated) -> list[Estimate]:
     left_open = np.any(np.abs(found.refined.open_beacon) > 0.5, axis=0)
     coils = [f"_{i}" for i in range(len(size[0]))] if len(size[0]) > 1 else [""]
 
-    def of(kind: str, unit: str, tails: list[str], *values: Array) -> list[Estimate]:
-        rows = zip(tails, *(np.broadcast_to(v, len(tails)) for v in values), strict=True)
+    def of(
+        kind: str, unit: str, tails: list[str], *values: Array, former: Array | None = None
+    ) -> list[Estimate]:
+        known = [None] * len(tails) if former is None else former.tolist()
+        rows = zip(tails, *(np.broadcast_to(v, len(tails)) for v in values), known, strict=True)
         return [
             Estimate(
                 f"{{beacon}}.{kind}{tail}",
@@ -196,8 +199,9 @@ def _estimates(found: _Calibrated) -> list[Estimate]:
                 sigma=float(sigma),
                 prior_sigma=float(prior),
                 is_open=bool(is_open),
+                declared=value,
             )
-            for tail, change, sigma, prior, is_open in rows
+            for tail, change, sigma, prior, is_open, value in rows
         ]
 
     place = new.position_world - old.position_world
@@ -212,6 +216,7 @@ def _estimates(found: _Calibrated) -> list[Estimate]:
             sigma.position_world,
             prior.position_world,
             closed,
+            former=old.position_world,
         ),
         *of(
             "rotation",

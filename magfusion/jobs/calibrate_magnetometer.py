@@ -125,7 +125,9 @@ def _estimates(found: LogCalibration, declared: Magnetometer) -> list[Estimate]:
     vectors = [("magnetometer.matrix", "", 1.0)] * 9
     vectors += [("magnetometer.offset", "nT", NANOTESLA)] * 3
     change = np.concatenate([(fit.matrix - declared.matrix).ravel(), fit.offset - declared.offset])
-    rows = zip(names, vectors, change, np.diagonal(fit.cov), np.diagonal(prior.cov), strict=True)
+    former = np.concatenate([declared.matrix.ravel(), declared.offset])
+    variances = np.diagonal(fit.cov), np.diagonal(prior.cov)
+    rows = zip(names, vectors, change, *variances, former, strict=True)
     return [
         Estimate(
             name,
@@ -134,8 +136,9 @@ def _estimates(found: LogCalibration, declared: Magnetometer) -> list[Estimate]:
             label=label,
             sigma=float(np.sqrt(variance) / scale),
             prior_sigma=float(np.sqrt(before) / scale),
+            declared=float(value / scale),
         )
-        for name, (label, unit, scale), moved, variance, before in rows
+        for name, (label, unit, scale), moved, variance, before, value in rows
     ]
 
 

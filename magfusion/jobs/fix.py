@@ -196,7 +196,8 @@ def write_fix_result(
         trust=trust,
         states=states,
     )
-    motion = Motion(site, best, log.truth, errors, trust=states)
+    residual = fixes.residual_rms[:, 0]
+    motion = Motion(site, best, log.truth, errors, trust=states, residual=residual)
     write_report(directory, figures | compared, motion)
     return figures | compared
 

@@ -112,12 +112,15 @@ class Estimate(Figure):
         Posterior and prior standard deviation; a prior of zero is none.
     is_open : bool
         Whether the measurements leave it open, whatever its sigma.
+    declared : float, optional
+        Its value before, where it has one: of a rotation only the change is a number.
     """
 
     section: Section = Section.CALIBRATION
     sigma: float = 0.0
     prior_sigma: float = 0.0
     is_open: bool = False
+    declared: float | None = None
 
     @property
     def change(self) -> float:

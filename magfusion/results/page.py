@@ -160,20 +160,27 @@ def _calibration(figures: Figures) -> str:
     rows: list[list[str]] = []
     far: set[int] = set()
     for one in estimates:
-        before = f"0 ± {number_text(one.prior_sigma, 2)}" if one.prior_sigma else "not known"
+        known = one.prior_sigma > 0.0
+        before = f"{_value(one, 0.0)} ± {number_text(one.prior_sigma, 2)}" if known else "not known"
         change = one.change / one.prior_sigma if one.prior_sigma else None
         if change is not None and abs(change) > FAR:
             far.add(len(rows))
-        name = f"{one.key} ({one.unit})" if one.unit else one.key
-        after = f"{as_sure(one.change, one.sigma)} ± {number_text(one.sigma, 2)}"
+        after = f"{_value(one, one.change)} ± {number_text(one.sigma, 2)}"
         told = "" if change is None else f"{change:+.2f}"
-        rows.append([name, before, after, told, "yes" if one.determined else "no"])
+        rows.append([one.key, before, after, told, "yes" if one.determined else "no"])
     said = (
-        "<p>Deviations from what was declared, which is the zero of each line, with one sigma;"
-        " the change is in sigmas of what was declared, and marked beyond"
-        f" {FAR:g}. A parameter that these data do not determine stays where it was.</p>"
+        "<p>Each with one sigma; the change is in sigmas of what was declared, and marked beyond"
+        f" {FAR:g}. What these data do not determine stays as uncertain as it was.</p>"
     )
     return said + _table([head, *rows], far)
+
+
+def _value(one: Estimate, change: float) -> str:
+    """Return a parameter after a change, to the second digit of its smaller sigma."""
+    sigma = min(filter(None, (one.sigma, one.prior_sigma)), default=0.0)
+    if one.declared is None:
+        return f"declared {as_sure(change, sigma)}" if change else "declared"
+    return as_sure(one.declared + change, sigma).removeprefix("+")
 
 
 def _refused(figures: Figures, motion: Motion | None) -> str:

@@ -21,7 +21,13 @@ _GAP = 10.0  # times the usual step; a line across it would invent states
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A trajectory with what is known of it; as `magfusion.results.recording.write_recording`."""
+    """A trajectory with what is known of it; as `magfusion.results.recording.write_recording`.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n,), optional
+        Of each state, RMS over all beacons, where those of each are not known.
+    """
 
     site: Site
     states: Trajectory
@@ -29,6 +35,7 @@ class Motion:
     errors: TrajectoryErrors | None = None
     innovations: Mapping[str, tuple[Array, Array]] | None = None
     trust: StateTrust | None = None
+    residual: Array | None = None
 
 
 def path_section(motion: Motion) -> str:
@@ -46,11 +53,13 @@ def path_section(motion: Motion) -> str:
     start = Mark(float(first[0]), float(first[1]), "start", "start")
     plan = Chart("Plan", "x (m)", "y (m)", tuple(lines), marks=(*beacons, start), equal=True)
     bands: tuple[Band, ...] = ()
-    sigma = _sigma_world(motion.states)
-    if sigma is not None:
-        high = motion.states.position_world[:, 2]
+    high, limits = motion.states.position_world[:, 2], None
+    if motion.states.pose_cov is not None:
+        sigma, _ = _sigmas(motion.states.pose_cov, motion.states.world_from_body)
         bands = (Band(time, high - 3.0 * sigma[:, 2], high + 3.0 * sigma[:, 2], "3 sigma"),)
-    height = Chart("Height", TIME, "z (m)", tuple(upright), bands)
+        room = 0.05 * float(np.ptp(high)) + 3.3 * _most(sigma[:, 2], 95.0) + 1e-3
+        limits = (float(high.min()) - room, float(high.max()) + room)
+    height = Chart("Height", TIME, "z (m)", tuple(upright), bands, y_limits=limits)
     note = f"<p>Outside the plan: {escape(', '.join(away))}.</p>" if away else ""
     return f'<div class="charts">{svg(plan)}{svg(height)}</div>{note}'
 
@@ -72,19 +81,19 @@ def error_section(motion: Motion) -> tuple[str, str]:
 
 def residual_section(motion: Motion) -> str:
     """Return a chart for each beacon; one scale, so that the worst stands out."""
-    found = motion.innovations or {}
+    found = {f"Beacon {name}": rows for name, rows in (motion.innovations or {}).items()}
+    if motion.residual is not None:
+        found["All beacons together"] = (motion.states.time, motion.residual)
     if not found:
         return ""
-    every = np.concatenate([rms for _, rms in found.values()])
-    most = max(3.0, 1.3 * float(np.nanpercentile(every, 99.5)))
+    most = max(3.0, 1.3 * _most(np.concatenate([rms for _, rms in found.values()]), 99.5))
     charts = []
-    for name, (time, rms) in list(found.items())[:MOST_BEACONS]:
+    for title, (time, rms) in list(found.items())[:MOST_BEACONS]:
         ends = time[[0, -1]]
         lines = (
             Line(ends, np.ones(2), "", "expected"),
             Line(time, rms, "", dots=True),
         )
-        title = f"Beacon {name}"
         charts.append(
             Chart(title, TIME, "residual", lines, y_limits=(0.0, most), width=330, height=190)
         )
@@ -115,10 +124,7 @@ def _of_axes(errors: TrajectoryErrors) -> list[Chart]:
     """Return the errors by axis with their bands: of position in the world, of attitude in body."""
     position_sigma = attitude_sigma = None
     if errors.pose_cov is not None:
-        turn = errors.world_from_body
-        cov_world = turn @ errors.pose_cov[:, 3:, 3:] @ turn.swapaxes(1, 2)
-        position_sigma = np.sqrt(np.diagonal(cov_world, axis1=1, axis2=2))
-        attitude_sigma = np.sqrt(np.diagonal(errors.pose_cov[:, :3, :3], axis1=1, axis2=2))
+        position_sigma, attitude_sigma = _sigmas(errors.pose_cov, errors.world_from_body)
     size, unit = _unit_of(errors.position_world, position_sigma)
     charts = []
     for k, axis in enumerate("xyz"):
@@ -136,7 +142,12 @@ def _of_axes(errors: TrajectoryErrors) -> list[Chart]:
 def _error(title: str, unit: str, time: Array, value: Array, sigma: Array | None) -> Chart:
     bands = () if sigma is None else (Band(time, -3.0 * sigma, 3.0 * sigma, "3 sigma"),)
     line = Line(time, value, "error", "error")
-    return Chart(title, TIME, f"error ({unit})", (line,), bands, width=330, height=200)
+    reach = _most(np.abs(value), 100.0)
+    if sigma is not None:
+        reach = max(reach, 3.0 * _most(sigma, 95.0))  # an open direction's would hide all others
+    limits = (-1.1 * reach, 1.1 * reach) if reach > 0.0 else None
+    label = f"error ({unit})"
+    return Chart(title, TIME, label, (line,), bands, y_limits=limits, width=330, height=200)
 
 
 def _sizes(motion: Motion) -> list[Chart]:
@@ -149,7 +160,7 @@ def _sizes(motion: Motion) -> list[Chart]:
         ("Position", slice(3, 6), "m", 1.0),
         ("Attitude", slice(0, 3), "deg", DEGREE),
     ):
-        largest = np.linalg.eigvalsh(states.pose_cov[:, part, part])[:, -1]
+        largest = _largest(states.pose_cov[:, part, part])
         radius = 3.0 * np.sqrt(np.maximum(largest, 0.0)) / size
         lines = [Line(states.time, radius, "3 sigma, worst direction", "sigma")]
         if trust is not None:
@@ -164,16 +175,31 @@ def _sizes(motion: Motion) -> list[Chart]:
     return charts
 
 
-def _sigma_world(states: Trajectory) -> Array | None:
-    if states.pose_cov is None:
-        return None
-    turn = states.world_from_body
-    cov_world = turn @ states.pose_cov[:, 3:, 3:] @ turn.swapaxes(1, 2)
-    return np.sqrt(np.diagonal(cov_world, axis1=1, axis2=2))
+def _sigmas(pose_cov: Array, world_from_body: Array) -> tuple[Array, Array]:
+    """Return sigmas of position in the world and attitude in body axes; NaN where there is none."""
+    known = np.isfinite(pose_cov).all(axis=(1, 2), keepdims=True)
+    cov = np.where(known, pose_cov, np.nan)
+    cov_world = world_from_body @ cov[:, 3:, 3:] @ world_from_body.swapaxes(1, 2)
+    parts = (cov_world, cov[:, :3, :3])
+    position, attitude = (np.sqrt(np.diagonal(part, axis1=1, axis2=2)) for part in parts)
+    return position, attitude
+
+
+def _largest(cov: Array) -> Array:
+    """Return the largest eigenvalue of each covariance; NaN of one that is not finite."""
+    out = np.full(len(cov), np.nan)
+    known = np.isfinite(cov).all(axis=(1, 2))
+    out[known] = np.linalg.eigvalsh(cov[known])[:, -1]
+    return out
+
+
+def _most(values: Array, percentile: float) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.percentile(known, percentile)) if len(known) else 0.0
 
 
 def _unit_of(values: Array, sigma: Array | None) -> tuple[float, str]:
-    largest = max(np.max(np.abs(values)), 0.0 if sigma is None else 3.0 * float(np.max(sigma)))
+    largest = max(_most(np.abs(values), 100.0), 0.0 if sigma is None else 3.0 * _most(sigma, 95.0))
     return (1e-3, "mm") if largest < 0.1 else (1.0, "m")
 
 

@@ -34,15 +34,22 @@ def parameter_estimates(
             label=block.name,
             sigma=float(sigma[row] / block.parameter.unit.size),
             prior_sigma=float(prior / block.parameter.unit.size),
+            declared=None if before is None else float(before / block.parameter.unit.size),
         )
         for block in blocks
-        for name, row, prior in zip(
+        for name, row, prior, before in zip(
             _component_names(block),
             range(block.columns.start, block.columns.stop),
             block.sigma,
+            _values(declared, block),
             strict=True,
         )
     ]
+
+
+def _values(declared: Calibration, block: Block) -> list[float | None]:
+    value = block.parameter.value(declared, block.owner)
+    return [None] * len(block.sigma) if value is None else [*value.tolist()]
 
 
 def _is_of_beacon(block: Block) -> bool:

@@ -165,6 +165,10 @@ class Parameter:
         name, zero = f"{owner}.{self.kind}", np.zeros(1)
         return new.others.get(name, zero) - old.others.get(name, zero)
 
+    def value(self, calibration: Calibration, owner: str) -> Array | None:
+        """Return what it is, flat, in the unit of a step; None where only changes are numbers."""
+        return None
+
     def refined(self, site: Site, calibration: Calibration, owner: str, sigma: Array) -> Site:
         """Return the site of a fitted calibration with its value and posterior sigma."""
         return site
@@ -234,6 +238,13 @@ class SiteParameter(Parameter):
         if self.is_rotation:
             return Rotation.from_matrix(a.T @ b).as_rotvec()
         return ((b - a) / self.si).ravel()
+
+    def value(self, calibration: Calibration, owner: str) -> Array | None:
+        """Return the attribute; a rotation is no list of numbers."""
+        if self.is_rotation or not hasattr(self, "attribute"):
+            return None
+        found = getattr(self.part(calibration.site, owner), self.attribute)
+        return np.asarray(found / self.si).ravel()
 
     def refined(self, site: Site, calibration: Calibration, owner: str, sigma: Array) -> Site:
         """Return the site with the posterior sigma; the value is in it."""

@@ -111,6 +111,9 @@ class _TimeOffset(Parameter):
     def sigma(self, site: Site, owner: str) -> Array:
         return np.array([site.platform.imu.time_offset_sigma])
 
+    def value(self, calibration: Calibration, owner: str) -> Array | None:
+        return np.array([calibration.time_offset])
+
     def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
         return replace(calibration, time_offset=calibration.time_offset + float(step[0]))
 
