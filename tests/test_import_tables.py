@@ -96,6 +96,9 @@ NOW_NS = 1_700_000_000_123_456_789
         (pa.array(["2023-11-14T22:13:20.123456789"]), "iso", NOW_NS),
         (pa.array(["2023-11-14 22:13:20.123456789Z"]), "iso", NOW_NS),
         (pa.array(["2023-11-14T23:13:20.123456789+01:00"]), "iso", NOW_NS),
+        (pa.array(["14.11.2023 22:13:20,123456789"]), "iso", NOW_NS),
+        (pa.array(["2023/11/14 22:13:20.123456789"]), "iso", NOW_NS),
+        (pa.array(["01:00:00.5"]), "iso", 3_600_500_000_000),
         (pa.array([""]), "iso", NO_STAMP),
         (np.array(["2023-11-14T22:13:20.123456789"], dtype="M8[ns]"), "iso", NOW_NS),
     ],
@@ -106,7 +109,7 @@ def test_a_stamp_is_exact_to_the_nanosecond(raw: object, unit: str, expected: in
     assert to_nanoseconds(raw, known).tolist() == [expected]
 
 
-@pytest.mark.parametrize("text", ["noon", "1.2.3", "14.11.2023 22:13:20", "12:00:00"])
+@pytest.mark.parametrize("text", ["noon", "1.2.3", "14/11/2023 22:13:20", "12h"])
 @pytest.mark.parametrize("unit", ["s", "iso"])
 def test_what_is_no_stamp_is_told(text: str, unit: str) -> None:
     known = parse_unit(unit, TIME)
@@ -138,6 +141,9 @@ def test_what_is_no_stamp_is_told(text: str, unit: str) -> None:
         ("Magnetic field z (µT)", "magnetometer", "field_z", "uT"),
         ("field.magnetic_field.x", "magnetometer", "field_x", None),
         ("x", "magnetometer", "field_x", None),
+        ("magnetometer_ga[1]", "magnetometer", "field_y", "gauss"),
+        ("accelerometer_m_s2[2]", "imu", "accel_z", "m/s^2"),
+        ("gyro_rad[0]", "imu", "gyro_x", None),
         ("timestamp [ns]", "magnetometer", "time", "ns"),
         ("t_ms", "imu", "time", "ms"),
         ("Time (s)", "imu", "time", "s"),
@@ -216,6 +222,11 @@ WRITINGS: dict[str, tuple[str, str, str]] = {
     "no header": ("1|2.5|3\n2|3.5|4\n", "utf-8", "delimiter pipe, data from line 1"),
     "empty last column": ("t,x,y,\n1,2.5,3,\n2,3.5,4,\n", "utf-8", "delimiter comma, data from"),
     "torn rows": ("t,x,y\n1,2.5,3\n7,8\n\n2,3.5,4\n9,9", "utf-8", "delimiter comma, data from"),
+    "quoted decimal comma": (
+        't,x,y\n"1,0","2,5","3,0"\n"2,0","3,5","4,0"\n',
+        "utf-8",
+        "delimiter comma, decimal comma, data from line 2",
+    ),
     "exponents": ("t,x,y\n1.0e0,+2.5E+00,3.\n2,.35e1,4\n", "utf-8", "delimiter comma, data from"),
 }
 
@@ -228,7 +239,7 @@ def test_a_table_is_read_in_whatever_way_it_is_written(name: str, tmp_path: Path
     source = text_source(path)
     assert source.form.startswith(form)
     parts = list(source.read([0, 1, 2], {0}))
-    assert [t.strip() for p in parts for t in p.columns[0].to_pylist()][-1] in ("2", "2.0")
+    assert [t.strip() for p in parts for t in p.columns[0].to_pylist()][-1] in ("2", "2,0")
     np.testing.assert_array_equal(np.concatenate([p.columns[1] for p in parts]), [2.5, 3.5])
     np.testing.assert_array_equal(np.concatenate([p.columns[2] for p in parts]), [3.0, 4.0])
     torn = sum(p.left_out.get(TORN, 0) for p in parts)
@@ -246,6 +257,7 @@ def test_units_of_a_second_row_are_those_of_the_columns(tmp_path: Path) -> None:
     [
         (b"", "is empty"),
         (b"\x93NUMPY\x01\0v\0", "is no text; name a binary table by its suffix"),
+        (b"PK\3\4\x14\0\6\0", "is a spreadsheet or an archive; save its table as CSV"),
         (b"Dear Sir,\nplease find attached\n", "holds no table of numbers .first line: 'Dear"),
     ],
 )
@@ -278,6 +290,52 @@ def test_rows_are_sorted_and_what_is_left_out_is_counted(tmp_path: Path) -> None
     written = pa.parquet.read_table(tmp_path / "m.parquet")
     assert written["time_ns"].to_pylist() == [10_000_000 * k for k in range(50)]
     np.testing.assert_allclose(written["field_z"].to_numpy(), 3e-9, rtol=1e-15, atol=0)
+
+
+def test_rows_of_other_streams_are_no_missing_samples(tmp_path: Path) -> None:
+    """Of a table of two rates; a sample of which one number is missing is missing."""
+    rows = [[5.0 * k, *([k, k, k] if k % 4 == 0 else ["", "", ""])] for k in range(400)]
+    rows[8][2] = ""
+    text = "\n".join(",".join(map(str, row)) for row in rows)
+    (tmp_path / "all.csv").write_text(f"t_ms,Bx_nT,By_nT,Bz_nT\n{text}\n")
+    plan = plan_stream("magnetometer", text_source(tmp_path / "all.csv"), (), None, Findings())
+    assert plan is not None
+    counts = write_stream(plan, tmp_path / "m.parquet", shared=True)
+    assert (counts.read, counts.written, counts.missing) == (400, 100, 1)
+    assert counts.left_out == {"that are of other streams": 300}
+    with pytest.raises(InputError, match="301 of 400 rows lack a number"):
+        write_stream(plan, tmp_path / "m.parquet")
+
+
+@pytest.mark.parametrize(
+    ("names", "columns", "maps"),
+    [
+        ("", "cgggaaa", ["imu.time=0[ms]", "imu.gyro=1,2,3[deg/s]", "imu.accel=4,5,6[g]"]),
+        ("", "aaagggc", ["imu.time=6[ms]", "imu.gyro=3,4,5[deg/s]", "imu.accel=0,1,2[g]"]),
+        (
+            "n;p [°/s];q [°/s];r [°/s];u [g];v [g];w [g]",
+            "cgggaaa",
+            ["imu.time=n[ms]", "imu.gyro=p [°/s],q [°/s],r [°/s][deg/s]"],
+        ),
+        ("Uhr;a;b;c;d;e;f", "dgggaaa", ["imu.time=Uhr[iso]", "imu.gyro=a,b,c[deg/s]"]),
+    ],
+)
+def test_columns_of_unknown_names_are_proposed_by_unit_place_and_size(
+    names: str, columns: str, maps: list[str], tmp_path: Path
+) -> None:
+    rng = np.random.default_rng(6)
+    values = {
+        "c": [f"{5 * k}" for k in range(300)],
+        "d": [f"03.05.2024 12:00:{5 * k // 1000:02d},{5 * k % 1000:03d}" for k in range(300)],
+        "g": rng.normal(0.0, 30.0, 300).astype(str).tolist(),
+        "a": rng.normal(0.57, 0.01, 300).astype(str).tolist(),
+    }
+    rows = zip(*(values[kind] for kind in columns), strict=True)
+    lines = [";".join(row) for row in rows]
+    (tmp_path / "i.csv").write_text("\n".join(filter(None, [names, *lines])))
+    told = Findings()
+    assert plan_stream("imu", text_source(tmp_path / "i.csv"), (), None, told) is None
+    assert told.proposals[: len(maps)] == maps
 
 
 def test_truth_leaves_out_what_holds_no_pose(tmp_path: Path) -> None:

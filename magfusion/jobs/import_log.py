@@ -108,7 +108,8 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         for k, (stream, plan) in enumerate(found.plans.items()):
             report(f"importing {stream}", k, len(found.plans) + 1)
             try:
-                counts[stream] = write_stream(plan, directory / f"{stream}.parquet")
+                shared = sum(p.source is plan.source for p in found.plans.values()) > 1
+                counts[stream] = write_stream(plan, directory / f"{stream}.parquet", shared)
             except InputError as error:
                 told.problems.append(str(error))
         _refuse_apart(counts, told)

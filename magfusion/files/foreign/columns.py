@@ -213,7 +213,7 @@ def _untagged(name: str) -> str:
 
 def _own_unit(column: Column, place: int, dimension: Dimension, sign: float) -> Unit:
     """Return the unit that the file names; a number has none."""
-    tag = re.search(r"[\[(]([^\[\]()]*)[\])]\s*$", column.name)
+    tag = re.search(r"[\[(]([^\[\]()]*[^\[\]()\d][^\[\]()]*)[\])]\s*$", column.name)
     said = column.unit or (tag[1] if tag else "")
     unit = parse_unit(said, dimension) if said or dimension is Dimension.NUMBER else None
     if unit is None and dimension is Dimension.NUMBER:

@@ -53,8 +53,13 @@ class Counts:
             self.left_out[reason] = self.left_out.get(reason, 0) + count
 
 
-def write_stream(plan: Plan, path: Path) -> Counts:
+def write_stream(plan: Plan, path: Path, shared: bool = False) -> Counts:
     """Write the table of a stream as Parquet, sorted by time.
+
+    Parameters
+    ----------
+    shared : bool
+        Whether the table holds other streams, too: rows without any number of this one are theirs.
 
     Raises
     ------
@@ -74,7 +79,13 @@ def write_stream(plan: Plan, path: Path) -> Counts:
             raw = dict(zip(places, part.columns, strict=True))
             stamps = _stamps(plan, raw, part)
             values = _values(plan, raw, names, len(part.rows))
-            stamps, values = _kept(plan, names, stamps, values, part.rows, counts)
+            rows = part.rows
+            if shared:
+                own = ~np.isnan(values).all(axis=1)
+                counts.read += int(np.sum(~own))
+                counts.leave_out("that are of other streams", int(np.sum(~own)))
+                stamps, values, rows = stamps[own], values[own], rows[own]
+            stamps, values = _kept(plan, names, stamps, values, rows, counts)
             columns = [stamps, *values.T]
             writer.write_table(
                 pa.table(dict(zip(schema.names, columns, strict=True))),
@@ -211,7 +222,7 @@ def _check(plan: Plan, counts: Counts) -> None:
         found = f"none of {counts.read} rows can be used ({reasons})" if counts.read else "no rows"
         raise InputError(f"{place}: {found} for {stream}; record it again, or map other columns.")
     twice = counts.left_out.get("with the stamp of another", 0)
-    if twice > MOST_TWICE * counts.read:
+    if twice > MOST_TWICE * (counts.written + twice):
         raise InputError(
             f"{place}: {twice} of {counts.read} rows have the stamp of another: the times are"
             f" coarser than the sampling; map a finer column to {stream}.time, or give --rate-hz"

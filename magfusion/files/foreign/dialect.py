@@ -25,7 +25,8 @@ _NUMBER = {
     )
     for sign in ".,"
 }
-_DATE = re.compile(r"\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[-+]\d\d:?\d\d)?)?")
+_CLOCK = r"\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[-+]\d\d:?\d\d)?"
+_DATE = re.compile(rf"(\d{{4}}[-/]\d\d[-/]\d\d|\d\d\.\d\d\.\d{{4}})([T ]{_CLOCK})?|{_CLOCK}")
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,10 @@ def _encoding(content: bytes, path: Path) -> tuple[str, int]:
     ):
         if content.startswith(mark):
             return name, len(mark)
+    if content.startswith((b"PK\3\4", b"\x1f\x8b", b"\xd0\xcf\x11\xe0")):
+        raise InputError(
+            f"{path}: is a spreadsheet or an archive; save its table as CSV, or unpack it."
+        )
     if b"\0" in content:
         raise InputError(
             f"{path}: is no text; name a binary table by its suffix: .npy, .npz, .wav, .h5, .hdf5,"
@@ -148,7 +153,7 @@ def _way_of_writing(
         width = Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
         if width < 2:
             continue
-        for decimal in ".," if sign != "," else ".":
+        for decimal in ".,":
             cells = [cell for row in rows if len(row) == width for cell in row]
             numbers = sum(_is_number(cell, decimal) for cell in cells)
             score = numbers / sum(map(len, rows))

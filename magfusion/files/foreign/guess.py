@@ -40,7 +40,17 @@ _SHORT = {
     "velocity": ("v",),
     "q": ("q",),
 }
-_TIMES = ("time", "timestamp", "timestamps", "stamp", "epoch", "clock", "elapsed", "datetime")
+_TIMES = (
+    "time",
+    "timestamp",
+    "timestamps",
+    "stamp",
+    "epoch",
+    "timefine",
+    "clock",
+    "elapsed",
+    "datetime",
+)
 _SHORT_TIMES = ("t", "ts", "utc", "sec", "seconds", "date", "zeit", "temps", "tiempo", "tempo")
 # Of messages of ROS written as text, whose stamps are in two columns.
 _WHOLE = re.compile(r"stamp\W*(secs?|seconds)$", re.I)
@@ -103,8 +113,6 @@ def _named(place: int, column: Column, stream: str) -> Named | None:
         unit = parse_unit(text, dimension) if text or dimension is Dimension.NUMBER else None
         if unit is not None or not text:
             return Named(place, target, unit)
-        if column.unit or name != column.name:
-            continue
     bare = _readings(column)[0][0]
     target = _target(bare, stream)
     return None if target is None else Named(place, target, None)
@@ -112,6 +120,11 @@ def _named(place: int, column: Column, stream: str) -> Named | None:
 
 def _readings(column: Column) -> list[tuple[str, str]]:
     """Return the ways to part a name from its unit, the surest first."""
+    indexed = re.fullmatch(r"(.*)(?:\[([012])\]|:([012]))", column.name)
+    if indexed is not None:
+        axis = "xyz"[int(indexed[2] or indexed[3])]
+        parts = _readings(Column(indexed[1], column.unit))
+        return [(f"{name}_{axis}", unit) for name, unit in parts]
     name = column.name
     tag = re.fullmatch(r"(.*?)\s*[\[(]([^\[\]()]*)[\])]\s*", name)
     if column.unit:
@@ -128,8 +141,7 @@ def _readings(column: Column) -> list[tuple[str, str]]:
 
 
 def _target(name: str, stream: str) -> str | None:
-    indexed = re.sub(r":([012])$", lambda m: "xyz"[int(m[1])], name)
-    norm = re.sub(r"[^a-z0-9]", "", indexed.casefold())
+    norm = re.sub(r"[^a-z0-9]", "", name.casefold())
     if norm in _SHORT_TIMES or norm.endswith(_TIMES):
         return TIME
     for stem in _SHORT:
@@ -220,34 +232,54 @@ def likely_time_unit(raw: Raw) -> Unit:
     return Unit("s", Dimension.TIME)
 
 
-def by_place(stream: str, samples: Sequence[Array]) -> dict[str, tuple[int, Unit]]:
-    """Return what the columns of a table without names may be, by their number and sizes.
+def by_place(
+    stream: str, columns: Sequence[Column], samples: Sequence[Array], dates: Sequence[bool]
+) -> dict[str, tuple[int, Unit]]:
+    """Return what columns of unknown names may be, by their units, places and sizes.
 
     Parameters
     ----------
     samples : sequence of ndarray
-        The first values of each column.
+        The first values of each column; none where they are no numbers.
+    dates : sequence of bool
+        Whether a column holds dates.
     """
-    clocks = [k for k, values in enumerate(samples) if len(values) > 1 and _is_clock(values)]
-    if not clocks:
-        return {}
-    first = clocks[0]
-    found = {TIME: (first, likely_time_unit(samples[first]))}
-    others = [k for k in range(len(samples)) if k != first]
-    triples = [others[k : k + 3] for k in range(0, len(others) - len(others) % 3, 3)]
+    places = range(len(columns))
+    clocks = [k for k in places if dates[k] or (len(samples[k]) > 1 and _is_clock(samples[k]))]
+    found: dict[str, tuple[int, Unit]] = {}
+    if clocks:
+        iso = Unit(ISO, Dimension.TIME)
+        found[TIME] = (clocks[0], iso if dates[clocks[0]] else likely_time_unit(samples[clocks[0]]))
+    free = [k for k in places if k not in clocks[:1] and len(samples[k])]
     stems = {"imu": ("gyro", "accel"), "magnetometer": ("field",)}.get(stream, ())
+    for stem in stems:
+        dimension = STREAMS[stream][f"{stem}_x"]
+        units = {k: _unit_in(columns[k], dimension) for k in free}
+        tagged = [(k, unit) for k, unit in units.items() if unit is not None]
+        if len(tagged) == 3:
+            found |= {f"{stem}_{a}": one for a, one in zip("xyz", tagged, strict=True)}
+            free = [k for k in free if units[k] is None]
+    stems = tuple(stem for stem in stems if f"{stem}_x" not in found)
+    triples = [free[k : k + 3] for k in range(0, len(free) - len(free) % 3, 3)]
     if not stems or len(triples) < len(stems):
         return found
     sizes = [_sizes([samples[k] for k in triple]) for triple in triples]
     # Gravity keeps its size while a body moves.
     steady = min(range(len(triples)), key=lambda k: float(np.std(sizes[k]) / np.mean(sizes[k])))
-    order = [1 - steady, steady] if stream == "imu" and len(triples) == 2 else range(len(stems))
+    both = stems == ("gyro", "accel") and len(triples) == 2
+    order = [1 - steady, steady] if both else range(len(stems))
     for stem, k in zip(stems, order, strict=False):
         dimension = STREAMS[stream][f"{stem}_x"]
         unit = likely_unit(dimension, sizes[k])
         for axis, place in zip("xyz", triples[k], strict=True):
             found[f"{stem}_{axis}"] = (place, unit)
     return found
+
+
+def _unit_in(column: Column, dimension: Dimension) -> Unit | None:
+    """Return the unit of a dimension that a column of unknown name has."""
+    units = (parse_unit(text, dimension) for _, text in _readings(column) if text)
+    return next((unit for unit in units if unit is not None), None)
 
 
 def _is_clock(values: Array) -> bool:

@@ -233,10 +233,12 @@ class _Planning:
         used = {term.place for terms in self.terms.values() for term in terms}
         used |= {place for place, _, _ in self.open.values()}
         free = [k for k in range(len(self.source.columns)) if k not in used]
+        columns = [self.source.columns[k] for k in free]
         samples = [_numbers(self.source, k) for k in free]
+        dates = [is_date(_sample(self.source, k, True)) for k in free]
         terms: Terms = {
             target: (Term(free[place], unit),)
-            for target, (place, unit) in by_place(self.stream, samples).items()
+            for target, (place, unit) in by_place(self.stream, columns, samples, dates).items()
             if target in self.absent
         }
         self.told.proposals += as_options(self.stream, self.source, terms)

@@ -79,7 +79,7 @@ _SPELLINGS = {
         **dict.fromkeys(("millitesla",), "mT"),
         **dict.fromkeys(("microtesla",), "uT"),
         **dict.fromkeys(("nanotesla", "gamma"), "nT"),
-        **dict.fromkeys(("g", "gs"), "gauss"),
+        **dict.fromkeys(("g", "gs", "ga"), "gauss"),
         **dict.fromkeys(("mgauss", "milligauss"), "mG"),
         **dict.fromkeys(("ugauss", "microgauss"), "uG"),
     },
@@ -88,6 +88,12 @@ _SPELLINGS = {
     Dimension.NUMBER: {"": "1", "-": "1"},
 }
 _ISO = r"^\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.]\d{1,9})?)?(Z|[-+]\d\d:?\d\d)?$"
+# Dates with the day or slashes first are turned to ISO; a time of day is one of the first day.
+_WRITTEN = (
+    (r"^(\d\d)\.(\d\d)\.(\d{4})", r"\3-\2-\1"),
+    (r"^(\d{4})/(\d\d)/(\d\d)", r"\1-\2-\3"),
+    (r"^(\d\d:\d\d:\d\d)", r"1970-01-01T\1"),
+)
 _SCALED = re.compile(r"(?P<factor>[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?)\*(?P<unit>.*)", re.I)
 
 
@@ -243,12 +249,15 @@ def _dates(raw: Raw) -> IntArray:
     text = pc.utf8_trim_whitespace(raw)
     text = pc.if_else(_missing(text), pa.scalar(None, pa.string()), text)
     text = pc.replace_substring(text, ",", ".")
+    written = text
+    for pattern, plain in _WRITTEN:
+        text = pc.replace_substring_regex(text, pattern, plain)
     for zone in (None, "UTC"):
         try:
             return _of_timestamps(pc.cast(text, pa.timestamp("ns", zone)))
         except pa.ArrowInvalid:
             continue
-    bad = pc.filter(text, pc.invert(pc.fill_null(pc.match_substring_regex(text, _ISO), True)))
+    bad = pc.filter(written, pc.invert(pc.fill_null(pc.match_substring_regex(text, _ISO), True)))
     raise ValueError(bad[0].as_py() if len(bad) else "dates of several kinds")
 
 
@@ -280,4 +289,5 @@ def is_date(raw: Raw) -> bool:
     if not isinstance(raw, pa.Array | pa.ChunkedArray):
         return np.issubdtype(np.asarray(raw).dtype, np.datetime64)
     known = raw.drop_null()
-    return len(known) > 0 and re.match(r"\s*\d{4}-\d\d-\d\d[T ]", known[0].as_py()) is not None
+    dated = r"\s*(\d{4}[-/]\d\d[-/]\d\d[T ]|\d\d\.\d\d\.\d{4} |\d\d:\d\d:\d\d)"
+    return len(known) > 0 and re.match(dated, known[0].as_py()) is not None
