@@ -9,6 +9,7 @@ from magfusion.units import Array
 
 LARGEST_FIELD = 1e-3  # T; twenty times the Earth's
 LARGEST_RATE = 50.0  # rad/s; beyond the range of common gyroscopes
+FASTEST_RATE = 80.0  # rad/s; beyond the range of any
 LARGEST_RATE_IN_DEGREES = 6000.0  # deg/s, and as much written for rad/s
 LARGEST_FORCE = 1e4  # m/s^2
 SOUND = 0.98  # of the samples, by size
@@ -33,12 +34,13 @@ def check_imu(imu: ImuSamples, place: str) -> None:
     turning = np.sum(imu.gyro_body**2, axis=1)
     turning = turning[turning <= np.quantile(turning, SOUND)]
     rate, changes = float(np.sqrt(np.mean(turning))), bool(np.ptp(turning) > 0.0)
-    if LARGEST_RATE < rate < LARGEST_RATE_IN_DEGREES and changes:
+    fast = rate > FASTEST_RATE or (rate > LARGEST_RATE and not _keeps_its_direction(imu))
+    if fast and rate < LARGEST_RATE_IN_DEGREES and changes:
         raise InputError(
             f"{place}: the angular rate is {rate:.3g} rad/s (RMS), so it is probably in deg/s;"
             " multiply it by pi/180."
         )
-    if rate > LARGEST_RATE:
+    if rate > FASTEST_RATE:
         raise InputError(
             f"{place}: the angular rate is {rate:.3g} rad/s (RMS), which no gyroscope measures;"
             " repair the sensor, or give its rates in rad/s."

@@ -7,7 +7,7 @@ quarter turn of one instrument, or iron on the body show in the first seconds, w
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -123,7 +123,7 @@ def wrong_compasses(
     means = still_means(log, site)
     if len(means) == 0:
         return
-    of_force = list(wrong_force(means, site))
+    of_force = list(_turned_by_gyroscope(log, means, site)) or list(wrong_force(means, site))
     yield from of_force
     failed = any(finding.verdict is Verdict.FAILED for finding in of_force)
     if site is None or failed:
@@ -139,6 +139,33 @@ def wrong_compasses(
         yield from wrong_dip(means, site, mounted=agrees(log, site), upright=upright)
     elif not tilted:
         yield from wrong_field(here, site)
+
+
+def _turned_by_gyroscope(log: Log, means: StillMeans, site: Site | None) -> Iterator[Finding]:
+    """Yield that it is the gyroscope by which a specific force of gravity's size keeps no way."""
+    gravity = STANDARD_GRAVITY if site is None else site.gravity
+    body = float(np.median(np.linalg.norm(log.imu.accel_body, axis=1)))
+    still = float(np.median(np.linalg.norm(means.force_body, axis=1)))
+    if still > MISSING * gravity or abs(body / gravity - 1.0) > UNIT:
+        return
+    said = (
+        f"gyroscope: the specific force has the size of gravity ({body:.3g} m/s^2) and no direction"
+        f" in the axes that the gyroscope keeps still (mean {still:.3g} m/s^2)"
+    )
+    slower = replace(log, imu=replace(log.imu, gyro_body=DEGREE * log.imu.gyro_body))
+    mended = still_means(slower, site).force_body
+    if float(np.median(np.linalg.norm(mended, axis=1))) > (1.0 - UNIT) * body:
+        yield Finding(
+            "gyro_units", f"{said}: it is in deg/s. Multiply it by pi/180.", Verdict.FAILED, 2e3
+        )
+        return
+    yield Finding(
+        "gyro_sign",
+        f"{said}: the gyroscope's signs, axes or unit are wrong. Turn it about each axis by a right"
+        " angle and compare.",
+        Verdict.FAILED,
+        2e3,
+    )
 
 
 def wrong_force(means: StillMeans, site: Site | None) -> Iterator[Finding]:
@@ -162,8 +189,8 @@ def wrong_force(means: StillMeans, site: Site | None) -> Iterator[Finding]:
     if size < MISSING * gravity:
         yield Finding(
             "gravity_missing",
-            f"{said}: gravity has been removed from it, as some drivers do ('linear acceleration')."
-            " Record the raw specific force.",
+            f"{said}: gravity has been removed from it, as some drivers do ('linear acceleration'),"
+            " or the platform falls freely. Record the raw specific force.",
             Verdict.FAILED,
             2e3,
         )
