@@ -1,5 +1,6 @@
 """What is built of the tree holds the package whole, and knows of which commit it is."""
 
+import re
 import subprocess
 import sys
 import tarfile
@@ -70,3 +71,10 @@ def test_every_python_that_the_package_accepts_is_tried() -> None:
     assert f'requires-python = ">={tried[0]}"' in project
     steps = workflow["jobs"]["oldest-dependencies"]["steps"]
     assert any("lowest-direct" in step.get("run", "") for step in steps)
+
+
+def test_the_changelog_is_headed_by_the_version() -> None:
+    version = re.findall(r'^version = "(.+)"$', (ROOT / "pyproject.toml").read_text(), re.M)
+    first = re.search(r"^## (\S+?),? ", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    assert first is not None
+    assert version == [first[1]]

@@ -7,6 +7,7 @@ of a finding is followed by what the code means.  Formulas become MathML, which 
 
 import dataclasses
 import importlib
+import inspect
 import re
 from collections.abc import Iterable
 from typing import Any
@@ -38,6 +39,14 @@ def _default(field: dataclasses.Field[Any], option: Option) -> str:
     return "" if nothing else "yes" if value is True else f"`{value}`"
 
 
+def _output(command: Command) -> str:
+    if command.output_required:
+        return "must be given"
+    if command.output_optional:
+        return "nothing is written"
+    return f"`{command.output}`" if command.output else "the log's name and the job's"
+
+
 def option_table(path: str) -> str:
     """Return what a command takes, from the fields of its job's settings.
 
@@ -56,7 +65,10 @@ def option_table(path: str) -> str:
             shown += f", `--no-{name}`"
         rows.append((shown, option.sentence.replace("|", "\\|"), _default(field, option)))
     title = f"**`magfusion {path}`**: {sentence}"
-    rows.append(("`--help`", "Show the rest, as where the results go.", ""))
+    if "output" in inspect.signature(command.run).parameters:
+        rows.append(("`-o`, `--output`", f"{command.output_help}.", _output(command)))
+    if command.reports:
+        rows.append(("`--json`", "Print the report as the last line.", ""))
     return f"{title}\n\n{_table(('option', 'what', 'default'), rows)}"
 
 
