@@ -208,13 +208,11 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
             log = Path(os.path.realpath(own["log"])).name if "log" in own else ""
             output = Path(command.output or f"{log}_{path.split()[-1].replace('-', '_')}")
         earlier = _stamp(output)
-        with _progress() as report:
-            given = _given(context)
+        given = _given(context)
+        with _progress() as report, recorded_as(_run(context, settings, given)):
             offered = {"output": output, "report": report, "given": given}
             try:
-                with recorded_as(_run(context, settings, given)):
-                    kept = {k: v for k, v in offered.items() if k in wanted}
-                    figures = command.run(settings, **kept)
+                figures = command.run(settings, **{k: v for k, v in offered.items() if k in wanted})
             except EstimationError as error:
                 if output is not None:
                     from magfusion.jobs.failure import failed_figures

@@ -14,6 +14,8 @@ from conftest import run_command
 from matplotlib.image import imread
 from scipy.spatial.transform import Rotation
 
+from magfusion.cli import main
+from magfusion.errors import EstimationError
 from magfusion.jobs.coverage import CoverageSettings
 from magfusion.jobs.settings import Command
 from magfusion.model.site import Site
@@ -248,6 +250,23 @@ def test_a_command_tells_its_page_how_it_was_called(
     assert f"{site} 3 {ABC}" in found.text
     assert "height 1.0 given" in found.text
     assert "spacing default" in found.text
+
+
+def test_a_command_that_fails_tells_it_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run(settings: CoverageSettings, output: Path) -> Figures:
+        raise EstimationError(f"{settings.site}: there is none in {output}")
+
+    monkeypatch.setattr("magfusion.jobs.coverage.COMMAND", Command(CoverageSettings, run))
+    (tmp_path / "site.yaml").write_text("abc")
+    with pytest.raises(SystemExit) as ended:
+        main(["coverage", str(tmp_path / "site.yaml"), "-o", str(tmp_path / "reach")])
+    assert ended.value.code == 1
+    assert "there is none" in capsys.readouterr().err
+    found = Page(tmp_path / "reach" / FAILED / PAGE)
+    assert f"magfusion coverage {tmp_path / 'site.yaml'}" in found.text
+    assert "there is none" in found.text
 
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), "")

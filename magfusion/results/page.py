@@ -35,8 +35,8 @@ LARGEST = 4_500_000  # bytes, of which a mail takes one
 FAR = 3.0  # sigmas; a change beyond is marked
 _MEANING = {
     "trustworthy": "Nothing in the data speaks against it; its claimed accuracy holds.",
-    "doubtful": "It can be used with care: what it claims of its accuracy has been widened until it"
-    " covers what is wrong.",
+    "doubtful": "Use it with care, for these reasons; what is claimed of the accuracy of a pose has"
+    " been widened to cover them.",
     "failed": "It must not be used: what is shown below is kept for diagnosis only.",
 }
 _CAPTIONS = {
