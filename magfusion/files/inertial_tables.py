@@ -19,8 +19,8 @@ Stream = TypeVar("Stream", FieldSamples, Trajectory)
 _GYRO = ("gyro_x", "gyro_y", "gyro_z")
 _ACCEL = ("accel_x", "accel_y", "accel_z")
 _FIELD = ("field_x", "field_y", "field_z")
-_IMU_LAYOUT = Layout(numbers=(*_GYRO, *_ACCEL), repeats=True)
-_FIELD_LAYOUT = Layout(numbers=_FIELD, repeats=True)
+IMU_LAYOUT = Layout(numbers=(*_GYRO, *_ACCEL), repeats=True)
+FIELD_LAYOUT = Layout(numbers=_FIELD, repeats=True)
 MOST_MISSING, MOST_TWICE = 0.5, 0.1  # of the rows; more is a mistake of the recording
 
 
@@ -39,7 +39,7 @@ def read_imu(
     InputError
         As `read_table` and `check_imu`; or where the span holds no sample.
     """
-    table = read_table(path, _IMU_LAYOUT, span, names)
+    table = read_table(path, IMU_LAYOUT, span, names)
     if not len(table):
         raise InputError(f"{path}: holds no row {span}; choose a span that the log covers.")
     time, values, noticed = _measured(table, (*_GYRO, *_ACCEL), "IMU")
@@ -73,7 +73,7 @@ def read_waveform(
     """
     if path is None:
         return None, ()
-    table = read_table(path, _FIELD_LAYOUT, span, names)
+    table = read_table(path, FIELD_LAYOUT, span, names)
     if not len(table):
         return None, ()
     time, values, noticed = _measured(table, _FIELD, "magnetometer")

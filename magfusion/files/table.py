@@ -233,7 +233,7 @@ def read_table(path: Path, layout: Layout, span: Span, names: tuple[str, ...] = 
         raise InputError(f"{path}: cannot be read ({reason}); write the file again.") from error
     whole = Table(path, data, np.empty(len(data), dtype=np.int64), np.empty(len(data)), first_row)
     time_ns = whole.integers(TIME)
-    _check_times(whole, time_ns, layout, span)
+    check_times(whole, time_ns, layout, span)
     begin, end = np.searchsorted(time_ns, span.bounds_ns)
     inside = data.slice(begin, end - begin)
     within = time_ns[begin:end]
@@ -308,7 +308,8 @@ def _read_csv(path: Path, layout: Layout, renamed: tuple[str, ...]) -> pa.Table:
     return data
 
 
-def _check_times(whole: Table, time_ns: IntArray, layout: Layout, span: Span) -> None:
+def check_times(whole: Table, time_ns: IntArray, layout: Layout, span: Span) -> None:
+    """Refuse times that are no nanoseconds, or not sorted."""
     far = np.abs(time_ns) > LARGEST_TIME_NS
     whole.refuse(far, TIME, time_ns, "write nanoseconds")
     step = np.diff(time_ns, prepend=time_ns[:1] - 1)

@@ -22,6 +22,10 @@ JOBS = {
         "init",
         "Write a commented site file: from options, the tones of a recording, or questions.",
     ),
+    "allan": (
+        "allan",
+        "Measure the noise of the instruments at rest, in the keys of a site, by Allan deviations.",
+    ),
     "navigate": (
         "navigate",
         "Navigate online: along a log, or by records on standard input (-).",

@@ -83,6 +83,7 @@ _WRITTEN = {
     "calibrate fieldmap": _SITE | {"field_map.png", "report.json"},
     "calibrate magnetometer": _SITE | {"magnetometer.png", "report.json"},
     "calibrate attitude-database": {"attitudes.parquet", "attitudes.png", "report.json"},
+    "allan": _SITE | {"allan.png", "report.json", FAILED},
     "check": {"check.png", "report.json", FAILED},
     "match": {"attitude.parquet", "attitude.png", "report.json"},
     "coverage": {"coverage.parquet", "coverage.png", "run.rrd", "report.json"},

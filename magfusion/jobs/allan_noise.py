@@ -1,0 +1,346 @@
+"""What a log at rest says of its instruments: their noise, and what speaks against it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from magfusion.calibration.allan import AllanVariance
+from magfusion.calibration.allan_fit import MISFIT, AllanFit, fit_allan
+from magfusion.calibration.rest import QUANTISED, RestStream
+from magfusion.errors import InputError
+from magfusion.estimation.integrity.samples import (
+    clipped_samples,
+    false_samples,
+    frozen_samples,
+    repeated_samples,
+)
+from magfusion.estimation.integrity.stamps import uneven_stamps
+from magfusion.files.table_stream import Piece, pieces
+from magfusion.jobs.inputs import Job
+from magfusion.model.progress import Report
+from magfusion.model.samples import ImuSamples, Log, Waveform
+from magfusion.model.site import MotionModel, Site
+from magfusion.model.trust import Finding, Trust, Unverified, Verdict
+from magfusion.units import DEGREE, Array
+
+WITNESSES = (uneven_stamps, frozen_samples, repeated_samples, clipped_samples, false_samples)
+# Stamps say little of noise that is evenly sampled; what is missing is known as such.
+COPED = frozenset({"jitter", "samples_lost", "repeated_stamps", "missing_samples"})
+MOST_LOST = 0.05  # share of the samples, from which it matters after all
+MOVED = 0.2  # share of the time, from which it was no rest
+STANDARD_GRAVITY, GRAVITY_UNSURE = 9.80665, 0.03  # m/s^2, without a site
+DENSITY = np.sqrt(2.0)  # one-sided density over what an Allan deviation shows
+HALF = 0.5
+# What steps larger than the noise look like.
+OF_STEPS = frozenset({"false_samples", "imu_spikes", "repeated_samples", "frozen_imu"})
+LEAST_SAMPLES = 200
+AXES = "xyz"
+
+
+@dataclass(frozen=True, eq=False)
+class Instrument:
+    """Three axes of one instrument.
+
+    Parameters
+    ----------
+    key : str
+        As the keys of a site begin: ``gyro``, ``accel``, ``magnetometer``.
+    fits : tuple of AllanFit or None
+    """
+
+    key: str
+    name: str
+    unit: str
+    variance: AllanVariance
+    fits: tuple[AllanFit | None, ...]
+    mean: Array
+    repeated: Array
+
+    @property
+    def coarse(self) -> bool:
+        """Whether its steps hide its noise."""
+        return bool(np.max(self.repeated) > QUANTISED)
+
+    @property
+    def known(self) -> list[AllanFit]:
+        """The fits of the axes that have one."""
+        return [fit for fit in self.fits if fit is not None]
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What was found.
+
+    Parameters
+    ----------
+    keys : dict
+        Of a site: the worst axis.
+    intervals : dict
+        Of 95 %, of that axis.
+    """
+
+    trust: Trust
+    duration: float
+    samples: dict[str, int]
+    instruments: tuple[Instrument, ...]
+    keys: dict[str, float] = field(default_factory=dict)
+    intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
+
+    def plotted(self) -> list[tuple[str, str, AllanVariance, tuple[AllanFit | None, ...]]]:
+        """Return title, unit, variance and fits of each instrument."""
+        return [(one.name, one.unit, one.variance, one.fits) for one in self.instruments]
+
+
+@dataclass
+class _Said:
+    """What the pieces of a stream said, the worst of each kind."""
+
+    pieces: int = 0
+    worst: dict[tuple[str, str], tuple[int, Finding]] = field(default_factory=dict)
+
+    def add(self, findings: Iterable[Finding]) -> None:
+        self.pieces += 1
+        for finding in findings:
+            key = finding.code, finding.text.partition(":")[0]
+            count, before = self.worst.get(key, (0, finding))
+            worse = finding if finding.weight > before.weight else before
+            self.worst[key] = count + 1, worse
+
+    def findings(self, lost: float) -> Iterator[Finding]:
+        for count, finding in self.worst.values():
+            verdict = finding.verdict
+            if verdict is Verdict.FAILED and count <= HALF * self.pieces:
+                verdict = Verdict.DOUBTFUL
+            if finding.code in COPED and lost < MOST_LOST:
+                verdict = Verdict.TRUSTWORTHY
+            where = ""
+            if self.pieces > 1:
+                where = f" In {count} of {self.pieces} parts of the log; this is the worst."
+            yield replace(finding, text=finding.text + where, verdict=verdict)
+
+
+def measured(job: Job, site: Site | None, report: Report) -> Measured:
+    """Measure the noise of a log at rest.
+
+    Raises
+    ------
+    InputError
+    """
+    motion = MotionModel() if site is None else site.platform.motion
+    findings: list[Finding] = []
+    instruments: list[Instrument] = []
+    samples: dict[str, int] = {}
+    duration = 0.0
+    for k, (stream, parts) in enumerate(_STREAMS.items()):
+        report(f"reading {stream}", k, 3)
+        rest, said = RestStream(3 * len(parts)), _Said()
+        for piece in _pieces(job, stream):
+            rest.add(piece.time, piece.values)
+            said.add(_of_piece(stream, piece))
+        if len(rest) < LEAST_SAMPLES:
+            if said.pieces:
+                raise InputError(
+                    f"{job.log_path}: {stream} has {len(rest)} samples in the part to use; record"
+                    " at rest for some minutes at least, better for hours"
+                )
+            continue
+        samples[stream] = len(rest)
+        duration = max(duration, rest.duration)
+        own = list(said.findings(rest.lost))
+        if stream == "imu":
+            own += _moved(rest, motion)
+        found = _instruments(_without_motion(rest, job, stream, motion), parts)
+        coarse = tuple(one.name for one in found if one.coarse)
+        findings += [f for f in own if f.code not in OF_STEPS or not f.text.startswith(coarse)]
+        instruments += found
+    if not instruments:
+        raise InputError(f"{job.log_path}: holds neither inertial nor magnetometer samples")
+    for one in instruments:
+        findings += _judged(one, duration)
+    keys, intervals, units = _keys(instruments, site)
+    held = tuple(_held(keys)) if "accel_bias_sigma" in keys else ()
+    trust = Trust(tuple(findings), held)
+    return Measured(trust, duration, samples, tuple(instruments), keys, intervals, units)
+
+
+def _pieces(job: Job, stream: str) -> Iterator[Piece]:
+    return pieces(job.log_path, stream, job.start, job.end, job.topics)
+
+
+def _limits(rest: RestStream, motion: MotionModel) -> Array:
+    """Return by how much each axis may leave its middle at rest."""
+    inertial = np.repeat([motion.rest_gyro, motion.rest_accel], 3)
+    return inertial if len(rest.mean) == len(inertial) else np.full(len(rest.mean), np.inf)
+
+
+def _without_motion(rest: RestStream, job: Job, stream: str, motion: MotionModel) -> RestStream:
+    """Return a stream without the stretches that were shaken, knocked or frozen."""
+    blocks = rest.blocks()
+    unlike = blocks.unlike() | blocks.departed(_limits(rest, motion))
+    if not unlike.any() or np.mean(unlike) > MOVED:
+        return rest
+    begin, end = blocks.begin[unlike], blocks.end[unlike]
+    quiet = RestStream(len(rest.mean))
+    for piece in _pieces(job, stream):
+        at = np.searchsorted(begin, piece.time, side="right") - 1
+        inside = (at >= 0) & (piece.time < end[np.maximum(at, 0)])
+        quiet.add(piece.time, np.where(inside[:, None], np.nan, piece.values))
+    return quiet
+
+
+# Of each stream, the instruments whose axes its columns are.
+_STREAMS = {
+    "imu": (("gyro", "gyroscope", "rad/s"), ("accel", "accelerometer", "m/s^2")),
+    "magnetometer": (("magnetometer", "magnetometer", "T"),),
+}
+
+
+def _instruments(rest: RestStream, parts: tuple[tuple[str, str, str], ...]) -> list[Instrument]:
+    variance = rest.allan_variance()
+    out = []
+    for k, (key, name, unit) in enumerate(parts):
+        axes = slice(3 * k, 3 * k + 3)
+        own = replace(variance, variance=variance.variance[:, axes])
+        fits = tuple(fit_allan(own, axis) for axis in range(3))
+        out.append(Instrument(key, name, unit, own, fits, rest.mean[axes], rest.repeated[axes]))
+    return out
+
+
+def _of_piece(stream: str, piece: Piece) -> list[Finding]:
+    there = np.isfinite(piece.values).all(axis=1)
+    fresh = np.diff(piece.time, prepend=-np.inf) > 0.0
+    time, values = piece.time[there & fresh], piece.values[there & fresh]
+    nothing = np.zeros((0, 3))
+    imu, wave = ImuSamples(np.zeros(0), nothing, nothing), None
+    if stream == "imu":
+        imu = ImuSamples(time, values[:, :3], values[:, 3:])
+    else:
+        wave = Waveform(time, values)
+    log = Log("piece", 0, "", imu, wave)
+    return [finding for witness in WITNESSES for finding in witness(log, None)]
+
+
+def _moved(rest: RestStream, motion: MotionModel) -> Iterator[Finding]:
+    """Yield where an inertial sensor was not at rest."""
+    blocks = rest.blocks()
+    if len(blocks.begin) == 0:
+        return
+    away = blocks.departed(_limits(rest, motion))
+    moved = away | blocks.unlike()
+    share = float(np.mean(moved))
+    if not moved.any():
+        return
+    edge = np.diff(np.concatenate([[0], moved.astype(np.int8), [0]]))
+    first, last = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1) - 1
+    longest = np.sort(np.argsort(first - last)[:3])
+    places = ", ".join(
+        f"{blocks.begin[first[k]]:.0f} to {blocks.end[last[k]]:.0f} s" for k in longest
+    )
+    more = f" and {len(first) - 3} times more" if len(first) > 3 else ""
+    far = float(np.mean(away)) > MOVED
+    yield Finding(
+        "not_at_rest",
+        f"imu: it moved or was shaken from {places}{more}, {100.0 * share:.2g} % of the"
+        f" time{': that is no rest' if far else ', which is left out'}. Record where nothing moves,"
+        " or cut it out by --start and --end.",
+        Verdict.FAILED if far else Verdict.DOUBTFUL,
+        1e3 * share + 10.0,
+    )
+
+
+def _judged(one: Instrument, duration: float) -> Iterator[Finding]:
+    """Yield what is to be said of the Allan deviations of an instrument."""
+    if len(one.known) < 3:
+        yield Finding(
+            "few_data",
+            f"{one.name}: {duration:.0f} s are too few for its noise, or an axis stands still;"
+            " record at rest for some minutes at least.",
+            Verdict.DOUBTFUL,
+            50.0,
+        )
+        return
+    worst = max(one.known, key=lambda fit: fit.misfit)
+    if worst.misfit > MISFIT:
+        tones = ", as where beacons or mains transmit" if one.key == "magnetometer" else ""
+        yield Finding(
+            "noise_shape",
+            f"{one.name}: the Allan deviation of axis {AXES[one.fits.index(worst)]} is"
+            f" {worst.worst:.2g} times what white noise, flicker and a walk explain at"
+            f" {worst.worst_tau:.3g} s: there is a vibration, a warming up, or a tone{tones}."
+            " Look at allan.png; record again without it.",
+            Verdict.DOUBTFUL,
+            worst.misfit,
+        )
+    if one.coarse:
+        often = float(np.max(one.repeated))
+        yield Finding(
+            "quantised",
+            f"{one.name}: axis {AXES[int(np.argmax(one.repeated))]} repeats its value in"
+            f" {100.0 * often:.0f} % of the samples: its steps are larger than its noise, which"
+            " they hide. Choose a smaller range, or let the instrument give more digits.",
+            Verdict.DOUBTFUL,
+            20.0 * often,
+        )
+    if one.key == "magnetometer":
+        return
+    open_ = [axis for axis, fit in zip(AXES, one.known, strict=True) if not fit.walk.found]
+    if open_:
+        high = max(fit.walk.high for fit in one.known if not fit.walk.found)
+        yield Finding(
+            "few_data",
+            f"{one.name}: the log of {_span(duration)} is too short for the walk of its bias on"
+            f" {'axis' if len(open_) == 1 else 'axes'} {', '.join(open_)}: it is below {high:.2g}"
+            f" {one.unit}/sqrt(s) (95 %), which is taken for it. Record longer at rest, ten times"
+            " as long at least.",
+            Verdict.DOUBTFUL,
+            5.0,
+        )
+
+
+def _span(duration: float) -> str:
+    for unit, name in ((3600.0, "h"), (60.0, "min")):
+        if duration > 2.0 * unit:
+            return f"{duration / unit:.3g} {name}"
+    return f"{duration:.3g} s"
+
+
+def _keys(
+    instruments: list[Instrument], site: Site | None
+) -> tuple[dict[str, float], dict[str, tuple[float, float]], dict[str, str]]:
+    """Return keys of a site with the worst axis, its interval, and units."""
+    keys: dict[str, float] = {}
+    intervals: dict[str, tuple[float, float]] = {}
+    units: dict[str, str] = {}
+    for one in instruments:
+        if not one.known:
+            continue
+        loud = max(one.known, key=lambda fit: fit.white.value)
+        if one.key == "magnetometer":
+            if max(fit.misfit for fit in one.known) < MISFIT:
+                key = "noise_density_t_rthz"
+                keys[key], units[key] = float(DENSITY * loud.white.value), "T/sqrt(Hz)"
+                intervals[key] = DENSITY * loud.white.low, DENSITY * loud.white.high
+            continue
+        noise, walk, sigma = f"{one.key}_noise", f"{one.key}_bias_walk", f"{one.key}_bias_sigma"
+        keys[noise] = loud.white.value if loud.white.found else loud.white.high
+        units[noise] = f"{one.unit}/sqrt(Hz)"
+        intervals[noise] = loud.white.low, loud.white.high
+        keys[walk], units[walk] = max(fit.covering_walk for fit in one.known), f"{one.unit}/sqrt(s)"
+        units[sigma] = one.unit
+        if one.key == "gyro":
+            keys[sigma] = float(np.max(np.abs(one.mean)))
+        else:
+            unsure = GRAVITY_UNSURE if site is None else 0.0
+            gravity = STANDARD_GRAVITY if site is None else site.gravity
+            keys[sigma] = float(abs(np.linalg.norm(one.mean) - gravity)) + unsure
+    return keys, intervals, units
+
+
+def _held(keys: dict[str, float]) -> Iterator[Unverified]:
+    sigma = keys["accel_bias_sigma"]
+    tilt = sigma / STANDARD_GRAVITY / DEGREE
+    yield Unverified("imu.accel_bias across gravity", f"{sigma:.3g} m/s^2", 0.0, tilt)

@@ -1,0 +1,47 @@
+"""Allan deviations of the instruments as a picture, with what they are made of."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from magfusion.calibration.allan import AllanVariance
+from magfusion.calibration.allan_fit import AllanFit
+
+COLOURS = ("tab:red", "tab:green", "tab:blue")
+Plotted = tuple[str, str, AllanVariance, tuple[AllanFit | None, ...]]
+
+
+def write_allan_plot(path: Path, instruments: Sequence[Plotted]) -> None:
+    """Write a PNG of the Allan deviation of each axis with its fit, an instrument a panel."""
+    figure = Figure(figsize=(5.5 * len(instruments), 5.5))
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(instruments), squeeze=False)[0]
+    margin = 0.8 / (5.5 * len(instruments))
+    figure.subplots_adjust(left=margin, right=1.0 - 0.2 * margin, top=0.93, bottom=0.1, wspace=0.22)
+    for panel, (name, unit, found, fits) in zip(panels, instruments, strict=True):
+        for axis, (colour, fit) in enumerate(zip(COLOURS, fits, strict=True)):
+            deviation = np.sqrt(found.variance[:, axis])
+            seen = deviation > 0.0
+            spread = np.minimum(deviation / np.sqrt(2.0 * found.clusters), 0.9 * deviation)
+            panel.errorbar(
+                found.tau[seen],
+                deviation[seen],
+                spread[seen],
+                fmt=".",
+                ms=3,
+                lw=0.6,
+                color=colour,
+                label="xyz"[axis],
+            )
+            if fit is not None:
+                tau = np.geomspace(fit.first_tau, found.tau[-1], 200)
+                panel.plot(tau, fit.deviation(tau), lw=1.0, color=colour)
+        panel.set(xscale="log", yscale="log", title=name, xlabel="cluster time (s)")
+        panel.set_ylabel(f"Allan deviation ({unit})")
+        panel.minorticks_off()
+        panel.grid(visible=True, lw=0.3, alpha=0.6)
+        panel.legend(loc="upper right")
+    figure.savefig(path, dpi=110, metadata={"Software": None})
