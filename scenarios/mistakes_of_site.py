@@ -326,7 +326,7 @@ MISTAKES = (
     ),
     Mistake("earth_hemisphere", "site", _earth(lambda e: e * [1.0, 1.0, -1.0]), _EARTH),
     Mistake("earth_in_gauss", "site", _earth(lambda e: 1e4 * e), _EARTH),
-    Mistake("two_undeclared", "site", _fewer(2), ("undeclared_line",)),
+    Mistake("two_undeclared", "site", _fewer(2), ("undeclared_line", "fitted_line")),
     Mistake("one_never_on", "site", _one_too_many, ("silent_beacon",)),
     Mistake("imu_noise_10x_less", "site", _densities(0.1, 0.1), ("imu_noise", "noise_tuned")),
     Mistake("imu_noise_10x_more", "site", _densities(10.0, 10.0), ("noise_tuned",)),
