@@ -132,7 +132,9 @@ def test_the_sweep_agrees_with_the_graph_and_with_a_log_without_the_beacon() -> 
         moved = without.states.position_world - result.states.position_world
         body = np.swapaxes(result.states.world_from_body, 1, 2) @ moved[..., None]
         expected = found.step[:, beacon, 3:]
-        assert np.max(np.abs(body[..., 0] - expected)) < 0.1 * np.max(sigma[:, 3:])
+        # What is left is of second order: it grows with the step, which is up to 1.6 sigma here.
+        step = max(np.max(sigma[:, 3:]), np.max(np.abs(expected)))
+        assert np.max(np.abs(body[..., 0] - expected)) < 0.1 * step
         assert without.states.pose_cov is not None
         np.testing.assert_allclose(
             np.einsum("nii->ni", found.subset_cov[:, beacon]),

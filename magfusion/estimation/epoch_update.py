@@ -188,7 +188,7 @@ class EpochUpdate:
             accel = gained / elapsed + before.world_from_body @ before.accel_bias_body
         steady = None if found is None else found.steady
         repeats = 1.0 if found is None else found.repeats
-        self.witness.hear(state, self.gate, Heard(accel, steady, repeats))
+        self.witness.hear(state, self.gate, Heard(accel, elapsed, steady, repeats))
 
     def _separate(
         self, predicted: Propagated | None, measurements: list[Measurement], state: State

@@ -22,6 +22,7 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
 
 MEMORY = 10.0  # s; of the innovations and of the compasses
+LEAST_SPAN = 1.0  # s; of inertial data, before gravity is judged
 FADES = 20.0  # s; what was said of the beginning and may have passed since
 PASSING = {"not_converged", "diverged", "field_residuals", "geometry", "gap", "separation"}
 RESTARTS_MEMORY = 60.0  # s
@@ -47,6 +48,8 @@ class Heard:
     accel_world : ndarray, shape (3,), optional
         Mean acceleration since the epoch before by the raw accelerometer, in world axes, as far as
         gravity leaves one (m/s^2).
+    elapsed : float
+        Since that epoch (s).
     steady : SteadyFields, optional
         The steady field of the window.
     repeats : float
@@ -54,6 +57,7 @@ class Heard:
     """
 
     accel_world: Array | None = None
+    elapsed: float = 0.0
     steady: SteadyFields | None = None
     repeats: float = 1.0
 
@@ -110,7 +114,8 @@ class OnlineWitness:
             self._refused[name] = before.with_sample(share, time, MEMORY)
         self._repeats = heard.repeats
         if heard.accel_world is not None:
-            self._gravity = self._gravity.with_sample(heard.accel_world, time, MEMORY)
+            accel, weight = heard.accel_world, heard.elapsed
+            self._gravity = self._gravity.with_sample(accel, time, MEMORY, weight)
         if heard.steady is not None:
             self._hear_steady(state, heard.steady)
 
@@ -166,7 +171,7 @@ class OnlineWitness:
             self._of_fields(),
             self._of_biases(state),
             self._of_calibration(state),
-            self._of_gravity(state),
+            self._of_gravity(),
             self._of_earth(),
             self._of_what_happened(state.time),
             self._of_fixes(),
@@ -295,13 +300,13 @@ class OnlineWitness:
         self._prior = Judgement(tuple(found), inflation=inflation)
         return self._prior
 
-    def _of_gravity(self, state: State) -> Judgement:
+    def _of_gravity(self) -> Judgement:
         """Judge what is left of the mean specific force: no platform falls for seconds."""
-        if self._gravity.weight * 1.0 < 5.0:
+        span = self._gravity.weight  # s that are heard, without the gaps of the IMU
+        if span < LEAST_SPAN:
             return Judgement()
         left = float(np.linalg.norm(self._gravity.mean))
         motion, imu = self.site.platform.motion, self.site.platform.imu
-        span = min(MEMORY, state.time - self._began) or 1.0
         sigma = np.hypot(np.sqrt(2.0) * motion.speed_sigma / span, imu.accel_bias_sigma)
         score = left / sigma
         if score < DOUBT:
