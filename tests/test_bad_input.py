@@ -93,6 +93,7 @@ STREAMS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mistake", STREAMS)
 def test_a_stream_that_is_none_is_refused_by_its_place(mistake: str, worked: Worked) -> None:
     form, given, pattern = STREAMS[mistake]
@@ -157,6 +158,7 @@ def test_a_loop_of_links_is_no_output(worked: Worked, tmp_path: Path, refuse: Re
     assert "no such file" in refuse("fix", tmp_path / "a", "-o", tmp_path / "run")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blocks", [12, 60])
 def test_a_full_disk_is_told_with_the_file_and_leaves_nothing(
     blocks: int, worked: Worked, tmp_path: Path

@@ -63,6 +63,7 @@ def targets() -> Array:
 # A room of smooth gain errors ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_cross_validated_error_falls_fivefold(fit: MapFit) -> None:
     for name in NAMES:
         assert fit.points[name] == len(SURVEYED.grid_world())
@@ -108,6 +109,7 @@ def test_a_fix_with_the_map_is_better_than_without(
     assert left < without / 3.0
 
 
+@pytest.mark.slow
 def test_attitudes_and_unknown_phases_of_the_survey_make_no_difference(
     world: World, survey: Survey, targets: Array
 ) -> None:

@@ -178,6 +178,7 @@ def test_a_run_killed_at_any_moment_ends_as_if_it_had_not_been(
     _ends_alike(phasors, uninterrupted, tmp_path / "run", [moment])
 
 
+@pytest.mark.slow
 def test_killed_before_the_first_checkpoint_it_begins_again(
     phasors: Path, uninterrupted: Path, tmp_path: Path
 ) -> None:

@@ -182,6 +182,7 @@ def resumed(request, tmp_path_factory):
     return whole, again, once_more
 
 
+@pytest.mark.slow
 def test_a_run_that_was_interrupted_ends_with_the_same_figures(resumed):
     whole, again, _ = resumed
     for field in fields(ErrorSeries):

@@ -384,6 +384,7 @@ def recovers(
         assert np.max(error[(time > 12.0) & (time <= end)]) < 1.0  # m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("estimator", BOTH)
 def test_it_recovers_from_all_at_once(estimator: Estimator) -> None:
     recovers(estimator, online_log(5, 70.0, every=1.0), (20.0, 50.0), (38.0, 50.0))

@@ -29,7 +29,7 @@ def silent_log(seed: int, motion: str = "static", rests: Rests | None = None) ->
     return replace(log, waveform=Waveform(time[kept], log.waveform.measured_sensor[kept]))
 
 
-@pytest.fixture(scope="module", params=[1, 2])
+@pytest.fixture(scope="module", params=[1, pytest.param(2, marks=pytest.mark.slow)])
 def resting(request: pytest.FixtureRequest) -> tuple[Log, Smoothed, Trajectory]:
     log = silent_log(request.param)
     result = smooth(log, demo_site(coil_radius=None))

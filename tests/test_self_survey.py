@@ -188,6 +188,7 @@ def test_a_place_is_either_given_or_unknown(tmp_path: Path) -> None:
         load_site(tmp_path / "neither.yaml", unknown=True)
 
 
+@pytest.mark.slow
 def test_the_command_places_a_beacon_and_writes_a_whole_site(
     walk: SimulatedLog, tmp_path: Path, refuse: Refuse, capfd: pytest.CaptureFixture[str]
 ) -> None:

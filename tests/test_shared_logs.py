@@ -67,6 +67,7 @@ def position_inside_3_sigma(errors: TrajectoryErrors) -> float:
     return float(np.mean(square < THREE_SIGMA_SQUARE))
 
 
+@pytest.mark.slow
 @needs_shared_logs
 def test_a_walk_with_an_exact_survey_is_found_to_millimetres(walk: Result) -> None:
     assert walk.report["converged"]
@@ -75,6 +76,7 @@ def test_a_walk_with_an_exact_survey_is_found_to_millimetres(walk: Result) -> No
     assert position_inside_3_sigma(walk.errors) >= 0.99
 
 
+@pytest.mark.slow
 @needs_shared_logs
 def test_the_report_says_what_the_written_trajectory_is(walk: Result) -> None:
     errors = walk.errors
@@ -84,6 +86,7 @@ def test_the_report_says_what_the_written_trajectory_is(walk: Result) -> None:
     assert np.isfinite([v for v in walk.report.values() if isinstance(v, float)]).all()
 
 
+@pytest.mark.slow
 @needs_shared_logs
 def test_evo_finds_the_same_errors_in_the_tum_file(walk: Result) -> None:
     estimate = file_interface.read_tum_trajectory_file(walk.directory / "trajectory.tum")
@@ -108,6 +111,7 @@ def test_evo_finds_the_same_errors_in_the_tum_file(walk: Result) -> None:
     assert angle == pytest.approx(walk.errors.attitude_rmse_deg, rel=1e-3)
 
 
+@pytest.mark.slow
 @needs_shared_logs
 def test_the_written_site_can_be_fed_back_in(walk: Result, tmp_path: Path) -> None:
     site = load_site(walk.directory / "site.yaml")
