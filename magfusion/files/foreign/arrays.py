@@ -124,7 +124,7 @@ def fields_of(name: str, array: Any, unit: str = "", by_column: bool = False) ->
 def _source(
     place: str, fields: list[_Field], rate_hz: float | None = None, form: str = ""
 ) -> Source:
-    def read(wanted: Sequence[int], texts: Collection[int]) -> Iterator[Part]:  # noqa: ARG001
+    def read(wanted: Sequence[int], _texts: Collection[int]) -> Iterator[Part]:
         chosen = [fields[k] for k in wanted]
         for begin in range(0, max((f.rows for f in chosen), default=0), ROWS):
             blocks: dict[int, AnyArray] = {}

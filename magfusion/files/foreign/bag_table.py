@@ -223,7 +223,7 @@ def _plan(path: Path, role: str, topic: Topic, field_unit: Unit) -> Plan:
     place = f"{path} topic {topic.name}"
     columns = _COLUMNS[role]
 
-    def read(wanted: Sequence[int], texts: Collection[int]) -> Iterator[Part]:  # noqa: ARG001
+    def read(wanted: Sequence[int], _texts: Collection[int]) -> Iterator[Part]:
         row = 0
         for stamps, values in _rows(path, place, role, topic):
             table = [stamps, *values.T]

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 
+from pydantic import Field
+
 from magfusion.errors import InputError
 from magfusion.files.foreign.columns import STREAMS, Entry, parse_entry
 from magfusion.files.foreign.plan import Findings, Rate
@@ -20,8 +22,8 @@ class MapFile(StrictModel):
     truth: str | None = None
     delimiter: str | None = None
     epoch: str | int | None = None
-    rate_hz: dict[str, float | int | str] = {}  # noqa: RUF012 - a field of pydantic's
-    map: dict[str, str | int] = {}  # noqa: RUF012
+    rate_hz: dict[str, float | int | str] = Field(default_factory=dict)
+    map: dict[str, str | int] = Field(default_factory=dict)
 
 
 @dataclass(frozen=True)

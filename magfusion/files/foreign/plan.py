@@ -19,6 +19,7 @@ from magfusion.files.foreign.columns import (
     resolve,
 )
 from magfusion.files.foreign.guess import (
+    Named,
     by_place,
     likely_time_unit,
     likely_unit,
@@ -171,7 +172,7 @@ class _Planning:
                 said = "" if "is no unit" in str(reason) else "is not said"
                 self.open[entry.column] = (reason.place, reason.sign, said)
 
-    def guess(self, target: str, named: Sequence, optional: bool) -> None:  # type: ignore[type-arg]
+    def guess(self, target: str, named: Sequence[Named], optional: bool) -> None:
         if target == TIME and (parted := parted_stamp(self.source.columns)):
             self.terms[target] = parted
             self.guessed.append(target)
