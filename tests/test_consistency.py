@@ -1,6 +1,6 @@
 """Whether the smoother's sigmas are honest: normalised errors over many simulated runs.
 
-Every run draws its own calibration from the prior, its own time offset, motion, IMU and noise.
+Every run draws its own calibration from the prior, its own IMU clock, motion, IMU and noise.
 Where the survey is uncertain, the errors of one run are nearly one error (correlation 0.5 to 0.8
 between instants 4 s apart), so that only runs count as independent; with an exact survey the
 instants are independent too, which is tested.
@@ -69,12 +69,15 @@ def surveyed(scale: float, *, synchronised: bool = True) -> Site:
 
 
 def recorded(site: Site, rng: np.random.Generator, imu_noise: float = 1.0) -> SimulatedLog:
-    offset = float(rng.normal(0.0, site.platform.imu.time_offset_sigma))
+    imu = site.platform.imu
+    offset = float(rng.normal(0.0, imu.time_offset_sigma))
+    rate = float(rng.normal(0.0, imu.clock_rate_sigma))
     config = SimulationConfig(
         DEMO_BOX_WORLD,
         duration=DURATION,
         motion="turn",
         time_offset=offset,
+        clock_rate=rate,
         noise_scale=imu_noise,
     )
     return simulate_log(site, config, rng)
@@ -144,8 +147,10 @@ def honest(nees: np.ndarray, independent: int) -> bool:
 def calibration_is_honest(outcomes: list[Outcome]) -> bool:
     """Tell whether the parameters that the data determined err as their sigmas say."""
     z = np.concatenate([o.z[o.determined] for o in outcomes])
-    # A single parameter is drawn once a run: its scatter is known no better than that.
-    low, high = (0.85, 1.15) if len(z) > RUNS else np.sqrt(average_nees_bounds(1, RUNS, CONFIDENCE))
+    # One clock's offset and rate are drawn once a run: their scatter is known no better than that.
+    low, high = np.sqrt(average_nees_bounds(1, RUNS, CONFIDENCE))
+    if len(z) > 2 * RUNS:
+        low, high = 0.85, 1.15
     beyond = int(np.sum(np.abs(z) > 3.0))
     rms = float(np.sqrt(np.mean(z**2)))
     return bool(low < rms < high and beyond <= binom.ppf(0.999, len(z), 0.0027))
