@@ -26,6 +26,7 @@ from algorithms_compared import (
 
 DISTURBED = ("S1", "F1", "F2", "P0", "P1", "P2")
 A1, A2, A3 = PUBLISHED
+UNMAPPED = tuple(name for name in METHODS if name != MAPPED)
 Found = Mapping[str, Sequence[Outcome]]
 
 
@@ -116,7 +117,13 @@ def test_one_world_has_no_standard_error_and_is_refused(
 
 @pytest.fixture(scope="module")
 def full() -> dict[str, list[Outcome]]:
-    return run(Config())
+    return run(Config(), methods=UNMAPPED)
+
+
+@pytest.fixture(scope="module")
+def mapped() -> dict[str, list[Outcome]]:
+    """Three rooms of each kind: a map takes five times as long to learn as all else."""
+    return run(Config(worlds=3, scenarios=DISTURBED))
 
 
 @pytest.mark.slow
@@ -131,9 +138,9 @@ def test_the_algorithms_err_in_the_fitted_rooms_as_the_paper_prints(full: Found)
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", DISTURBED)
 def test_a_map_and_relative_weights_halve_the_best_published_error(
-    full: Found, scenario: str
+    mapped: Found, scenario: str
 ) -> None:
-    overall, worst = worst_ratio(full[scenario], MAPPED)
+    overall, worst = worst_ratio(mapped[scenario], MAPPED)
     assert overall <= 0.5
     assert worst < 1.0  # better in every single room
 
@@ -149,9 +156,9 @@ def test_likelihood_meets_the_bound_over_all_quiet_rooms(full: Found) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("scenario", "expected_m"), [("S1", 0.152), ("F1", 0.087), ("P0", 0.028)])
 def test_plain_likelihood_loses_to_algorithm_3_where_the_model_is_wrong(
-    full: Found, scenario: str, expected_m: float
+    full: Found, mapped: Found, scenario: str, expected_m: float
 ) -> None:
     assert position(full[scenario], ML) == pytest.approx(expected_m, rel=0.35)
     assert position(full[scenario], ML) > position(full[scenario], A3)
-    told = report({scenario: full[scenario]}, {})
+    told = report({scenario: mapped[scenario]}, {})
     assert "plain ML is WORSE than the paper" in told
