@@ -184,7 +184,7 @@ def test_one_table_with_two_clocks_gives_each_stream_its_own() -> None:
         "gt_qw",
     ]
     columns = [Column(name) for name in names]
-    assert streams_of(columns) == {"imu", "magnetometer"}
+    assert streams_of(columns, "all") == {"imu", "magnetometer"}
     for stream, place in (("imu", 0), ("magnetometer", 3), ("truth", 5)):
         assert [n.place for n in named_columns(columns, stream)["time"]] == [place]
 

@@ -33,6 +33,12 @@ class ImportSettings(Settings):
         note="csv, tsv, txt, parquet, npy, npz, wav, mat, h5; one table may be given for several",
         metavar="FILE",
     )
+    gyro: Path | None = option(
+        None, "Table of the gyro, where the accelerometer has its own", metavar="FILE"
+    )
+    accel: Path | None = option(
+        None, "Table of the accelerometer, where the gyro has its own", metavar="FILE"
+    )
     magnetometer: Path | None = option(None, "Table of the magnetometer", metavar="FILE")
     truth: Path | None = option(None, "Table of true poses, or a TUM file", metavar="FILE")
     map: tuple[str, ...] = option(
@@ -40,18 +46,30 @@ class ImportSettings(Settings):
         "Which column of the file is which of the log, in which unit",
         note="e.g. 'imu.gyro_x=-GyrY[deg/s]', 'truth.quaternion=qx,qy,qz,qw[xyzw]'; columns"
         " without names are counted from 0; of a bag e.g. imu=/imu/data, magnetometer=/mag[uT],"
-        " truth=/tf:map->base_link",
+        " truth=/tf:map->base_link; of an attitude in"
+        " angles truth.euler=roll,pitch,yaw[deg] (turned by yaw, then pitch, then roll)",
         metavar="TABLE.COLUMN=NAME[UNIT]",
     )
     map_file: Path | None = option(
         None,
-        "YAML file with map: {TABLE.COLUMN: NAME[UNIT]}, imu, magnetometer, ...",
+        "YAML file with map: {TABLE.COLUMN: NAME[UNIT]}, imu, offset, rows, ...",
         metavar="FILE",
     )
     rate_hz: tuple[str, ...] = option(
         (),
         "Rate of a table without times, from its first row at 0 s or at SECONDS",
         metavar="TABLE=HZ[@SECONDS]",
+    )
+    offset: tuple[str, ...] = option(
+        (),
+        "What is added to the times of a table, of which another clock was read",
+        metavar="TABLE=SECONDS",
+    )
+    rows: tuple[str, ...] = option(
+        (),
+        "Of a table that holds several sensors one below the other, the rows of one",
+        note="e.g. 'gyro=sensor:gyroscope', the file given by --gyro, --accel, --magnetometer",
+        metavar="TABLE=COLUMN:VALUE",
     )
     delimiter: str | None = option(
         None,
@@ -76,8 +94,10 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
     InputError
         With every problem that was found, and options that would decide what is undecided.
     """
+    from magfusion.files.foreign.columns import STREAMS
     from magfusion.files.foreign.convert import write_stream
     from magfusion.files.foreign.gather import gather
+    from magfusion.files.foreign.halves import HALVES, join_halves
     from magfusion.files.foreign.map_file import asked
     from magfusion.files.foreign.plan import Findings
     from magfusion.jobs.inputs import claim
@@ -86,7 +106,7 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
     claimed, told = claim(output, "import"), Findings()
     if settings.site is not None and not settings.site.is_file():
         told.problems.append(f"{settings.site}: there is no such file; give the path of a site.")
-    files = {"imu": settings.imu, "magnetometer": settings.magnetometer, "truth": settings.truth}
+    files = {stream: getattr(settings, stream) for stream in STREAMS}
     if not settings.sources and not any(files.values()) and settings.map_file is None:
         raise InputError(
             "nothing to import; give a bag, a folder or tables, or --imu FILE --magnetometer FILE"
@@ -95,6 +115,8 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         files,
         settings.map,
         settings.rate_hz,
+        settings.offset,
+        settings.rows,
         settings.delimiter,
         settings.epoch,
         settings.map_file,
@@ -112,6 +134,10 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
                 counts[stream] = write_stream(plan, directory / f"{stream}.parquet", shared)
             except InputError as error:
                 told.problems.append(str(error))
+        resampled = ""
+        if set(HALVES) <= set(counts) and not told.problems:
+            joined = join_halves(directory, counts)
+            counts["imu"], resampled = joined.counts, joined.resampled
         _refuse_apart(counts, told)
         _refuse(told)
         epoch_ns = counts["imu"].first if epoch == FIRST else int(epoch)
@@ -119,7 +145,7 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         report("checking", len(found.plans), len(found.plans) + 1)
         figures = _checked(directory, output, found, settings.site)
         figures = heading("import", output.resolve().name) | figures
-        figures |= _figures(found, counts, epoch_ns, epoch == FIRST)
+        figures |= _figures(found, counts, epoch_ns, epoch == FIRST, resampled)
         write_report(directory, figures)
     return figures
 
@@ -180,7 +206,7 @@ def _refuse_apart(counts: dict[str, Counts], told: Findings) -> None:
 
     if not {"imu", "magnetometer"} <= set(counts):
         return
-    for name in set(counts) - {"imu"}:
+    for name in set(counts) - {"imu", "gyro", "accel"}:
         one, other = counts["imu"], counts[name]
         if one.last < other.first or other.last < one.first:
             spans = [
@@ -189,7 +215,8 @@ def _refuse_apart(counts: dict[str, Counts], told: Findings) -> None:
             ]
             told.problems.append(
                 f"the times of imu and {name} have no moment in common ({', '.join(spans)}): bring"
-                " them to one clock, by the unit of a time or --rate-hz TABLE=HZ@SECONDS."
+                " them to one clock, by the unit of a time, --offset TABLE=SECONDS or --rate-hz"
+                " TABLE=HZ@SECONDS."
             )
 
 
@@ -212,7 +239,9 @@ def _checked(directory: Path, output: Path, found: Gathered, site: Path | None) 
         figures = run_check(CheckSettings(log=directory, site=site))
     except InputError as error:
         sentence = str(error)
-        for stream, plan in found.plans.items():
+        halves = [plan for stream, plan in found.plans.items() if stream in ("gyro", "accel")]
+        plans = found.plans | ({"imu": halves[0]} if halves else {})
+        for stream, plan in plans.items():
             file = str(directory / f"{stream}.parquet")
             if file in sentence:
                 # The remedy of a log's reader is to change the numbers.
@@ -226,7 +255,9 @@ def _place(plan: Plan) -> str:
     return f"{plan.source.place} as {plan.stream} by {', '.join(plan.options())}"
 
 
-def _figures(found: Gathered, counts: dict[str, Counts], epoch_ns: int, is_first: bool) -> Figures:
+def _figures(
+    found: Gathered, counts: dict[str, Counts], epoch_ns: int, is_first: bool, resampled: str
+) -> Figures:
     """Return what was read, what was left out, and what was understood."""
     figures = Figures(
         Figure("epoch_ns", epoch_ns, "ns", label="epoch" + (", first sample" * is_first))
@@ -254,14 +285,19 @@ def _figures(found: Gathered, counts: dict[str, Counts], epoch_ns: int, is_first
         Figure("map", lines, section=Section.REPORT),
         Figure("understood", shown, section=Section.REMARKS),
     )
+    notes = []
+    if resampled:
+        notes.append(
+            f"The {resampled} was interpolated linearly to the times of the other half of the"
+            " inertial sensor, which is sampled faster."
+        )
     if not is_first and abs(counts["imu"].first - epoch_ns) * 1e-9 > LATE:
         begin = (counts["imu"].first - epoch_ns) * 1e-9
-        text = (
+        notes.append(
             f"The log begins {begin:.9g} s after its epoch, to which the drive phases refer; if"
             " they refer to its first sample, import it with --epoch first."
         )
-        figures |= Figures(Figure("notes", [text], section=Section.NOTES))
-    return figures
+    return figures | Figures(*[Figure("notes", notes, section=Section.NOTES)] * bool(notes))
 
 
 def _where_some(stream: str, key: str, count: int, words: str) -> list[Figure]:

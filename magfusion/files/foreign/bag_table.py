@@ -112,7 +112,7 @@ def plan_bag(
     plans = []
     with _opened(path) as reader:
         found = sorted({(c.topic, c.msgtype) for c in reader.connections})
-        for role in STREAMS:
+        for role in _COLUMNS:
             if role in others:
                 continue
             topic = _chosen(path, role, entries.get(role, ()), found, reader, told)

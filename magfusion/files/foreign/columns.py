@@ -18,6 +18,7 @@ def _vector(stem: str, dimension: Dimension) -> dict[str, Dimension]:
 
 
 QUATERNION = ("qw", "qx", "qy", "qz")
+EULER = ("roll", "pitch", "yaw")
 VELOCITY = ("velocity_x", "velocity_y", "velocity_z")
 STREAMS: dict[str, dict[str, Dimension]] = {
     "imu": {
@@ -25,11 +26,15 @@ STREAMS: dict[str, dict[str, Dimension]] = {
         **_vector("gyro", Dimension.RATE),
         **_vector("accel", Dimension.FORCE),
     },
+    # Of an inertial sensor whose two halves are in two tables.
+    "gyro": {TIME: Dimension.TIME, **_vector("gyro", Dimension.RATE)},
+    "accel": {TIME: Dimension.TIME, **_vector("accel", Dimension.FORCE)},
     "magnetometer": {TIME: Dimension.TIME, **_vector("field", Dimension.FIELD)},
     "truth": {
         TIME: Dimension.TIME,
         **_vector("position", Dimension.LENGTH),
         **dict.fromkeys(QUATERNION, Dimension.NUMBER),
+        **dict.fromkeys(EULER, Dimension.ANGLE),
         **_vector("velocity", Dimension.SPEED),
     },
 }
@@ -39,6 +44,7 @@ GROUPS = {
     **{stem: tuple(f"{stem}_{a}" for a in _AXES) for stem in ("gyro", "accel", "field")},
     **{stem: tuple(f"{stem}_{a}" for a in _AXES) for stem in ("position", "velocity")},
     "quaternion": QUATERNION,
+    "euler": EULER,
 }
 ORDERS = {"wxyz": (0, 1, 2, 3), "xyzw": (3, 0, 1, 2)}  # where w, x, y and z stand
 
@@ -156,7 +162,7 @@ def resolve(entry: Entry, columns: Sequence[Column]) -> tuple[Term, ...]:
     """
     dimension = STREAMS[entry.stream][entry.column]
     parts = [entry.value]
-    if dimension is Dimension.TIME and _found(entry.value, columns) is None:
+    if dimension is Dimension.TIME and place_of(entry.value, columns) is None:
         parts = re.split(r"(?<=\])\s*\+\s*", entry.value)
     return tuple(_term(part.strip(), columns, dimension, entry) for part in parts)
 
@@ -166,11 +172,11 @@ def _term(text: str, columns: Sequence[Column], dimension: Dimension, entry: Ent
         if not text.startswith(lead):
             continue
         bare = text[len(lead) :].strip()
-        place = _found(bare, columns)
+        place = place_of(bare, columns)
         if place is not None:
             return Term(place, _own_unit(columns[place], place, dimension, sign), sign)
         tagged = re.fullmatch(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]", bare)
-        place = None if tagged is None else _found(tagged["name"], columns)
+        place = None if tagged is None else place_of(tagged["name"], columns)
         if tagged is not None and place is not None:
             unit = parse_unit(tagged["unit"], dimension)
             if unit is None:
@@ -183,8 +189,14 @@ def _term(text: str, columns: Sequence[Column], dimension: Dimension, entry: Ent
     raise Undecided(_not_there(text, columns, entry))
 
 
-def _found(name: str, columns: Sequence[Column]) -> int | None:
-    """Return the place of the column that a name means, or None."""
+def place_of(name: str, columns: Sequence[Column]) -> int | None:
+    """Return the place of the column that a name means, or None.
+
+    Raises
+    ------
+    Undecided
+        Where several columns have it.
+    """
     exact = [k for k, column in enumerate(columns) if column.name == name]
     bare = [k for k, c in enumerate(columns) if _loose(c.name) == _loose(name)]
     untagged = [k for k, c in enumerate(columns) if _loose(_untagged(c.name)) == _loose(name)]

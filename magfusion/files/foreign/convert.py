@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.files.foreign.columns import QUATERNION, TIME, Term
+from magfusion.files.foreign.columns import EULER, QUATERNION, TIME, Term
 from magfusion.files.foreign.plan import Plan
 from magfusion.files.foreign.source import Part
 from magfusion.files.foreign.units import NO_STAMP, Raw, to_nanoseconds
@@ -19,7 +20,10 @@ from magfusion.files.table import TIME as TIME_NS
 from magfusion.units import NANOSECOND, AnyArray, Array, BoolArray, IntArray
 
 MOST_BACK = 1.0  # s; further back, a clock was set or wrapped around
-STEPS = {"imu": (SHORTEST_STEP, 0.5), "magnetometer": (1e-6, 0.5)}  # s
+STEPS = {  # s
+    **dict.fromkeys(("imu", "gyro", "accel"), (SHORTEST_STEP, 0.5)),
+    "magnetometer": (1e-6, 0.5),
+}
 LEAST_QUATERNION = 1e-6  # of its length; trackers write zeros where they see nothing
 
 
@@ -67,7 +71,8 @@ def write_stream(plan: Plan, path: Path, shared: bool = False) -> Counts:
         Naming file, column and row, where the table is no recording of one clock.
     """
     counts = Counts()
-    names = [name for name in plan.terms if name != TIME]
+    mapped = [name for name in plan.terms if name != TIME]
+    names = list(dict.fromkeys(one for name in mapped for one in _written(name)))
     schema = pa.schema([(TIME_NS, pa.int64()), *((name, pa.float64()) for name in names)])
     places = sorted({term.place for terms in plan.terms.values() for term in terms})
     texts = {term.place for term in plan.terms.get(TIME, ())}
@@ -78,7 +83,7 @@ def write_stream(plan: Plan, path: Path, shared: bool = False) -> Counts:
                 counts.leave_out(reason, count)
             raw = dict(zip(places, part.columns, strict=True))
             stamps = _stamps(plan, raw, part)
-            values = _values(plan, raw, names, len(part.rows))
+            values = _values(plan, raw, names)
             rows = part.rows
             if shared:
                 own = ~np.isnan(values).all(axis=1)
@@ -99,7 +104,7 @@ def write_stream(plan: Plan, path: Path, shared: bool = False) -> Counts:
 
 def _stamps(plan: Plan, raw: dict[int, Raw], part: Part) -> IntArray:
     if plan.rate is not None:
-        start = round(plan.rate.start_s * 10**9)
+        start = plan.shift_ns + round(plan.rate.start_s * 10**9)
         step = float(10**9 / plan.rate.hz)
         return start + np.rint(part.rows * step).astype(np.int64)
     total = np.zeros(len(part.rows), dtype=np.int64)
@@ -116,14 +121,27 @@ def _stamps(plan: Plan, raw: dict[int, Raw], part: Part) -> IntArray:
             ) from None
         absent |= stamps == NO_STAMP
         total += np.where(absent, 0, int(term.sign) * stamps)
-    return np.where(absent, NO_STAMP, total)
+    return np.where(absent, NO_STAMP, total + plan.shift_ns)
 
 
-def _values(plan: Plan, raw: dict[int, Raw], names: list[str], rows: int) -> Array:
-    values = np.empty((rows, len(names)))
-    for k, name in enumerate(names):
-        (term,) = plan.terms[name]
-        values[:, k] = _si(raw[term.place], term)
+def _written(name: str) -> tuple[str, ...]:
+    """Return the columns of a log that a mapped one becomes."""
+    return QUATERNION if name in EULER else (name,)
+
+
+def _values(plan: Plan, raw: dict[int, Raw], names: list[str]) -> Array:
+    found = {
+        name: _si(raw[terms[0].place], terms[0])
+        for name, terms in plan.terms.items()
+        if name != TIME
+    }
+    if EULER[0] in found:
+        angles = np.stack([found.pop(name) for name in reversed(EULER)], axis=1)
+        known = np.isfinite(angles).all(axis=1)
+        turned = np.full((len(angles), 4), np.nan)
+        turned[known] = Rotation.from_euler("ZYX", angles[known]).as_quat(scalar_first=True)
+        found |= dict(zip(QUATERNION, turned.T, strict=True))
+    values = np.stack([found[name] for name in names], axis=1)
     values[~(np.abs(values) < LARGEST_NUMBER)] = np.nan
     return values
 

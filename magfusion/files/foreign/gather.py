@@ -1,7 +1,7 @@
 """From what lies on the disk to the plans of a log's streams, every problem told at once."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from magfusion.errors import InputError
@@ -9,10 +9,11 @@ from magfusion.files.bag import is_bag
 from magfusion.files.euroc import find_magnetometer, is_euroc
 from magfusion.files.foreign.arrays import ARRAYS, array_source
 from magfusion.files.foreign.bag_table import plan_bag
-from magfusion.files.foreign.columns import STREAMS, TIME, Term
+from magfusion.files.foreign.columns import EULER, STREAMS, TIME, Term, Undecided, place_of
 from magfusion.files.foreign.guess import streams_of
 from magfusion.files.foreign.map_file import Asked
 from magfusion.files.foreign.plan import Findings, Plan, Terms, plan_stream
+from magfusion.files.foreign.rows import rows_where
 from magfusion.files.foreign.source import Source
 from magfusion.files.foreign.text import text_source
 from magfusion.files.foreign.units import Dimension, Unit, parse_unit
@@ -73,9 +74,12 @@ def gather(paths: Sequence[Path], wanted: Asked, told: Findings) -> Gathered:
         except InputError as error:
             told.problems.append(str(error))
             attempted |= set(STREAMS)
+    attempted |= _halves(found, attempted, set(wanted.files))
     for stream in ("imu", "magnetometer"):
         if stream not in attempted:
             told.problems.append(f"No table is given for the {stream}; give --{stream} FILE.")
+    for stream, plan in found.plans.items():
+        found.plans[stream] = replace(plan, shift_ns=wanted.shifts_ns.get(stream, 0))
     for stream in wanted.entries:
         if stream not in attempted:
             told.problems.append(
@@ -83,6 +87,30 @@ def gather(paths: Sequence[Path], wanted: Asked, told: Findings) -> Gathered:
                 f" --{stream} FILE."
             )
     return found
+
+
+def _halves(found: Gathered, attempted: set[str], named: set[str]) -> set[str]:
+    """Return whether gyro and accelerometer of two tables make the inertial stream."""
+    halves = {"gyro", "accel"}
+    if "imu" in attempted:
+        for stream in halves & set(found.plans):
+            if stream in named and "imu" in named:
+                found.told.problems.append(
+                    f"--imu and --{stream} are given; leave out one of them."
+                )
+            elif stream in named:
+                place = found.plans["imu"].source.place if "imu" in found.plans else "another table"
+                found.told.problems.append(
+                    f"--{stream} is given, and {place} holds a whole imu; leave out one of them."
+                )
+            del found.plans[stream]
+        return set()
+    for stream in halves - attempted if halves & attempted else ():
+        found.told.problems.append(
+            f"The {stream} is lacking beside the other half of the inertial sensor; give --{stream}"
+            " FILE."
+        )
+    return {"imu"} if halves & attempted else set()
 
 
 def _add(path: Path, wanted: Asked, found: Gathered) -> set[str]:
@@ -117,7 +145,7 @@ def _add_table(file: Path, wanted: Asked, found: Gathered, among_others: bool) -
     source = _opened(file, wanted, found)
     if source is None:
         return set(STREAMS)
-    streams = {"truth"} if file.suffix.lower() == ".tum" else streams_of(source.columns)
+    streams = {"truth"} if file.suffix.lower() == ".tum" else streams_of(source.columns, file.stem)
     for stream in sorted(streams - set(wanted.files)):
         found.add(_table(stream, file, source, wanted, found.told))
     if streams or among_others:
@@ -157,6 +185,21 @@ def _opened(path: Path, wanted: Asked, found: Gathered) -> Source | None:
 
 
 def _table(stream: str, path: Path, source: Source, wanted: Asked, told: Findings) -> Plan | None:
+    if stream in wanted.rows:
+        column, value = wanted.rows[stream]
+        try:
+            place = place_of(column, source.columns)
+        except Undecided as reason:
+            told.problems.append(f"{source.place}: --rows {stream}={column}:{value}: {reason}.")
+            return None
+        if place is None:
+            names = ", ".join(one.name for one in source.columns[:30])
+            told.problems.append(
+                f"{source.place}: --rows {stream}={column}:{value}: there is no column {column}"
+                f" (found {names})."
+            )
+            return None
+        source = rows_where(source, place, value)
     usual = None
     if path.suffix.lower() == ".tum" and stream == "truth":
         usual = _by_place(stream, (TIME, *_TUM), source, {Dimension.TIME: "s"})
@@ -194,7 +237,7 @@ def _add_euroc(path: Path, wanted: Asked, found: Gathered) -> set[str]:
         streams.add(stream)
         if stream in wanted.files or (source := _opened(table, wanted, found)) is None:
             continue
-        names = [*STREAMS[stream]]
+        names = [name for name in STREAMS[stream] if name not in EULER]
         usual = _by_place(stream, names, source)
         if len(usual) < len(names):
             usual = {name: terms for name, terms in usual.items() if "velocity" not in name}

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.files.foreign.columns import STREAMS, TIME, Term
+from magfusion.files.foreign.columns import EULER, STREAMS, TIME, Term
 from magfusion.files.foreign.source import Column
 from magfusion.files.foreign.units import (
     ISO,
@@ -60,6 +60,13 @@ _OF_STREAM = {
     "imu": re.compile(r"imu|gyr|acc|inertial"),
     "magnetometer": re.compile(r"mag|field|fgm|flux"),
     "truth": re.compile(r"truth|gt|ref|mocap|vicon|opti|pose|odom"),
+}
+# What columns are that are called x, y and z alone.
+_BARE = {"gyro": "gyro", "accel": "accel", "magnetometer": "field", "truth": "position"}
+_OF_FILE = {
+    "gyro": re.compile(r"gyr|angular"),
+    "accel": re.compile(r"acc"),
+    "magnetometer": re.compile(r"mag"),
 }
 _TYPICAL = {Dimension.FORCE: STANDARD_GRAVITY, Dimension.FIELD: 5e-5}  # SI
 FAST = 8.0  # rad/s; a body that turns so fast on the mean is more likely measured in degrees
@@ -144,6 +151,9 @@ def _target(name: str, stream: str) -> str | None:
     norm = re.sub(r"[^a-z0-9]", "", name.casefold())
     if norm in _SHORT_TIMES or norm.endswith(_TIMES):
         return TIME
+    for angle in EULER:
+        if angle in STREAMS[stream] and norm.endswith(angle):
+            return angle
     for stem in _SHORT:
         axes = "wxyz" if stem == "q" else "xyz"
         for axis in axes:
@@ -156,8 +166,7 @@ def _target(name: str, stream: str) -> str | None:
 def _is(norm: str, stem: str, axis: str, stream: str) -> bool:
     if norm in [f"{short}{axis}" for short in _SHORT[stem]]:
         return True
-    bare = {"magnetometer": "field", "truth": "position"}.get(stream)
-    if stem == bare and norm == axis:
+    if stem == _BARE.get(stream) and norm == axis:
         return True
     long = (*_STEMS[stem], *_MORE.get(stem, ()))
     return norm.endswith(tuple(f"{one}{axis}" for one in long)) or (
@@ -169,32 +178,41 @@ def _nearest(named: list[Named], columns: Sequence[Column], stream: str) -> list
     """Return, of several, the ones whose name says of which stream they are."""
     if len(named) < 2:
         return named
-    others = [pattern for name, pattern in _OF_STREAM.items() if name != stream]
+    own = "imu" if stream in ("gyro", "accel") else stream
+    others = [pattern for name, pattern in _OF_STREAM.items() if name != own]
 
     def score(one: Named) -> int:
         name = columns[one.place].name.casefold()
-        return bool(_OF_STREAM[stream].search(name)) - any(p.search(name) for p in others)
+        return bool(_OF_STREAM[own].search(name)) - any(p.search(name) for p in others)
 
     best = max(map(score, named))
     return [one for one in named if score(one) == best]
 
 
-def streams_of(columns: Sequence[Column]) -> set[str]:
-    """Return the streams that the names of a file's columns make whole."""
+def streams_of(columns: Sequence[Column], file_stem: str) -> set[str]:
+    """Return the streams that the names of a file and of its columns make whole."""
     found = set()
+    said = {name for name, text in _OF_FILE.items() if text.search(file_stem.casefold())}
     for stream, needed in (
         ("imu", ("gyro_x", "accel_x")),
+        ("gyro", ("gyro_x",)),
+        ("accel", ("accel_x",)),
         ("magnetometer", ("field_x",)),
         ("truth", ("position_x", "qw")),
+        ("truth", ("position_x", "roll")),
     ):
         named = named_columns(columns, stream)
-        bare = {"field_x": "x"}
-        if all(
-            any(columns[n.place].name.casefold() != bare.get(target) for n in named[target])
-            for target in needed
-        ):
+        if all(any(_sure(n, columns, stream, said) for n in named[one]) for one in needed):
             found.add(stream)
-    return found
+    return found - {"gyro", "accel"} if "imu" in found else found
+
+
+def _sure(named: Named, columns: Sequence[Column], stream: str, said: set[str]) -> bool:
+    """Tell whether a column is of a stream; of an x alone its file or its unit has to say so."""
+    bare, _ = _readings(columns[named.place])[0]
+    if stream == "truth" or bare.strip().casefold() != "x":
+        return True
+    return stream in said if said else named.unit is not None
 
 
 def likely_unit(dimension: Dimension, values: Array) -> Unit:
@@ -251,7 +269,12 @@ def by_place(
         iso = Unit(ISO, Dimension.TIME)
         found[TIME] = (clocks[0], iso if dates[clocks[0]] else likely_time_unit(samples[clocks[0]]))
     free = [k for k in places if k not in clocks[:1] and len(samples[k])]
-    stems = {"imu": ("gyro", "accel"), "magnetometer": ("field",)}.get(stream, ())
+    stems = {
+        "imu": ("gyro", "accel"),
+        "gyro": ("gyro",),
+        "accel": ("accel",),
+        "magnetometer": ("field",),
+    }.get(stream, ())
     for stem in stems:
         dimension = STREAMS[stream][f"{stem}_x"]
         units = {k: _unit_in(columns[k], dimension) for k in free}

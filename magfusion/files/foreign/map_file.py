@@ -13,16 +13,22 @@ from magfusion.files.foreign.columns import STREAMS, Entry, parse_entry
 from magfusion.files.foreign.plan import Findings, Rate
 from magfusion.files.yaml_files import StrictModel, read_yaml
 
+MOST_SHIFT = 10**10  # s
+
 
 class MapFile(StrictModel):
     """What the file of ``--map-file`` may hold, by the names of the options."""
 
     imu: str | None = None
+    gyro: str | None = None
+    accel: str | None = None
     magnetometer: str | None = None
     truth: str | None = None
     delimiter: str | None = None
     epoch: str | int | None = None
     rate_hz: dict[str, float | int | str] = Field(default_factory=dict)
+    offset: dict[str, float | int | str] = Field(default_factory=dict)
+    rows: dict[str, str] = Field(default_factory=dict)
     map: dict[str, str | int] = Field(default_factory=dict)
 
 
@@ -36,6 +42,10 @@ class Asked:
         Of streams that are named.
     entries : dict
         By stream.
+    shifts_ns : dict
+        Added to the times of a stream.
+    rows : dict
+        Column, and the value that rows of the stream have in it.
     """
 
     files: dict[str, Path]
@@ -43,12 +53,16 @@ class Asked:
     rates: dict[str, Rate] = field(default_factory=dict)
     delimiter: str | None = None
     epoch: str | None = None
+    shifts_ns: dict[str, int] = field(default_factory=dict)
+    rows: dict[str, tuple[str, str]] = field(default_factory=dict)
 
 
 def asked(
     files: Mapping[str, Path | None],
     maps: Sequence[str],
     rates: Sequence[str],
+    offsets: Sequence[str],
+    rows: Sequence[str],
     delimiter: str | None,
     epoch: str | None,
     map_file: Path | None,
@@ -77,12 +91,16 @@ def asked(
             seen.add((entry.stream, entry.column))
             entries[entry.stream][entry.column] = entry
     every = [f"{name}={hz}" for name, hz in model.rate_hz.items()] + list(rates)
+    late = [f"{name}={value}" for name, value in model.offset.items()] + list(offsets)
+    chosen = [f"{name}={value}" for name, value in model.rows.items()] + list(rows)
     return Asked(
         named,
         {stream: list(those.values()) for stream, those in entries.items()},
         _rates(every, told),
         model.delimiter if delimiter is None else delimiter,
         epoch if epoch is not None or model.epoch is None else str(model.epoch),
+        _shifts(late, told),
+        _rows(chosen, told),
     )
 
 
@@ -112,4 +130,37 @@ def _rates(lines: Sequence[str], told: Findings) -> dict[str, Rate]:
             )
         else:
             found[stream] = rate
+    return found
+
+
+def _shifts(lines: Sequence[str], told: Findings) -> dict[str, int]:
+    found = {}
+    for line in lines:
+        stream, _, value = (part.strip() for part in line.partition("="))
+        try:
+            seconds = Fraction(value)
+        except (ValueError, ZeroDivisionError):
+            seconds = None
+        if stream not in STREAMS or seconds is None or abs(seconds) > MOST_SHIFT:
+            told.problems.append(
+                f"--offset {line!r}: write TABLE=SECONDS with a table of {', '.join(STREAMS)};"
+                " the seconds are added to its times."
+            )
+        else:
+            found[stream] = round(seconds * 10**9)
+    return found
+
+
+def _rows(lines: Sequence[str], told: Findings) -> dict[str, tuple[str, str]]:
+    found = {}
+    for line in lines:
+        stream, _, value = (part.strip() for part in line.partition("="))
+        column, _, wanted = (part.strip() for part in value.rpartition(":"))
+        if stream not in STREAMS or not column or not wanted:
+            told.problems.append(
+                f"--rows {line!r}: write TABLE=COLUMN:VALUE with a table of {', '.join(STREAMS)},"
+                " as 'gyro=sensor:gyroscope'."
+            )
+        else:
+            found[stream] = (column, wanted)
     return found

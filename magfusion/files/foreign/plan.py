@@ -9,8 +9,10 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.files.foreign.columns import (
+    EULER,
     GROUPS,
     OPTIONAL,
+    QUATERNION,
     STREAMS,
     TIME,
     Entry,
@@ -56,12 +58,19 @@ class Rate:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """How a table becomes a stream."""
+    """How a table becomes a stream.
+
+    Parameters
+    ----------
+    shift_ns : int
+        Added to its times.
+    """
 
     stream: str
     source: Source
     terms: Terms
     rate: Rate | None = None
+    shift_ns: int = 0
 
     def options(self) -> list[str]:
         """Return the map as options, in the order of the stream's columns."""
@@ -134,7 +143,10 @@ def plan_stream(
     given = {entry.column: entry for entry in entries}
     named = named_columns(source.columns, stream)
     velocity = any(name in given for name in OPTIONAL)
+    without = _other_rotation(given, named)
     for target in STREAMS[stream]:
+        if target in without:
+            continue
         if target in given:
             own.say(given[target])
         elif usual is not None:
@@ -142,6 +154,17 @@ def plan_stream(
         elif target != TIME or rate is None:
             own.guess(target, named[target], target in OPTIONAL and not velocity)
     return own.plan(velocity)
+
+
+def _other_rotation(
+    given: Mapping[str, Entry], named: Mapping[str, Sequence[Named]]
+) -> tuple[str, ...]:
+    """Return the columns of the form of an attitude, quaternion or angles, that is not used."""
+    said = {name for names in (given, named) for name in names if name in given or named[name]}
+    if any(name in given for name in EULER):
+        return QUATERNION
+    angles = said.issuperset(EULER) and said.isdisjoint(QUATERNION)
+    return QUATERNION if angles else EULER
 
 
 class _Planning:

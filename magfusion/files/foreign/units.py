@@ -34,6 +34,7 @@ class Dimension(StrEnum):
     FORCE = "specific force"
     FIELD = "field"
     LENGTH = "length"
+    ANGLE = "angle"
     SPEED = "speed"
     NUMBER = "number"
 
@@ -53,6 +54,7 @@ UNITS: dict[Dimension, dict[str, float]] = {
         **{"gauss": 1e-4, "mG": 1e-7, "uG": 1e-10},
     },
     Dimension.LENGTH: {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3, "ft": 0.3048},
+    Dimension.ANGLE: {"rad": 1.0, "mrad": 1e-3, "deg": DEGREE},
     Dimension.SPEED: {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6},
     Dimension.NUMBER: {"1": 1.0},
 }
@@ -84,6 +86,10 @@ _SPELLINGS = {
         **dict.fromkeys(("ugauss", "microgauss"), "uG"),
     },
     Dimension.LENGTH: {**dict.fromkeys(("meter", "metre", "meters", "metres"), "m")},
+    Dimension.ANGLE: {
+        **dict.fromkeys(("radian", "radians"), "rad"),
+        **dict.fromkeys(("degree", "degrees"), "deg"),
+    },
     Dimension.SPEED: {**dict.fromkeys(("mps", "m_s", "ms", "ms-1", "m/sec"), "m/s")},
     Dimension.NUMBER: {"": "1", "-": "1"},
 }

@@ -1,0 +1,53 @@
+"""Tables that hold several sensors one below the other: the rows of one of them."""
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from magfusion.files.foreign.source import Part, Source
+from magfusion.files.foreign.units import Raw
+from magfusion.units import BoolArray
+
+
+def rows_where(source: Source, place: int, value: str) -> Source:
+    """Return a table of the rows that have a value in a column.
+
+    Parameters
+    ----------
+    place : int
+        Of the column.
+    value : str
+        As it is written in the file.
+    """
+
+    def read(wanted: Sequence[int], texts: Collection[int]) -> Iterator[Part]:
+        places = sorted({*wanted, place})
+        for part in source.read(places, {*texts, place}):
+            columns = dict(zip(places, part.columns, strict=True))
+            own = _equal(columns[place], value)
+            kept: list[Raw] = [_taken(columns[k], own) for k in wanted]
+            yield replace(part, columns=kept, rows=part.rows[own])
+
+    name = source.columns[place].name
+    return replace(source, place=f"{source.place}, rows with {value} in {name}", read=read)
+
+
+def _equal(raw: Raw, value: str) -> BoolArray:
+    if isinstance(raw, pa.Array | pa.ChunkedArray):
+        text = pc.utf8_trim_whitespace(raw.cast(pa.string()))
+        same = pc.fill_null(pc.equal(text, value), False)
+        return np.asarray(same.to_numpy(zero_copy_only=False), dtype=bool)
+    found = np.asarray(raw)
+    if found.dtype.kind not in "biuf":
+        return np.asarray(found.astype(str) == value)
+    try:
+        return np.asarray(found == float(value))
+    except ValueError:
+        return np.zeros(len(found), dtype=bool)
+
+
+def _taken(raw: Raw, own: BoolArray) -> Raw:
+    return raw.filter(pa.array(own)) if isinstance(raw, pa.Array | pa.ChunkedArray) else raw[own]
