@@ -203,7 +203,7 @@ def test_most_mistakes_in_motion_are_named_rightly_and_few_wrongly(
     monkeypatch.setattr(mistake_case, "DURATION", 30.0)
     good_case.cache_clear()
     right, wrong, asked = 0, [], 0
-    for name, mistake in MISTAKES.items():
+    for name, mistake in list(MISTAKES.items())[::2]:  # each takes seconds
         if not mistake.codes or name not in NAMED:
             continue
         case = mistake.change(good_case("rough", 3))

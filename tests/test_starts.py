@@ -146,10 +146,10 @@ def test_a_swap_of_a_stretch_is_undone() -> None:
 
 
 @pytest.mark.slow
-def test_twenty_lone_rotating_beacons_are_found_and_honest() -> None:
+def test_lone_rotating_beacons_are_found_and_honest() -> None:
     """What a survey errs by is the same for a whole log: its NEES is one draw, not many."""
     nees = []
-    for seed in range(20):
+    for seed in range(8):
         case = lone(seed, 30.0)
         result, trust = judged(smooth(case.made.log, case.site), case.made.log)
         truth = case.made.log.truth
@@ -159,7 +159,7 @@ def test_twenty_lone_rotating_beacons_are_found_and_honest() -> None:
         assert case.wrong(result.states) == 0.0
         if trust.verdict is Verdict.TRUSTWORTHY:
             nees.append(float(np.mean(errors.nees)))
-    assert len(nees) >= 15
+    assert len(nees) >= 6
     assert np.sum(np.array(nees) > 12.0) <= binom.isf(1e-3, len(nees), chi2.sf(12.0, 6))
     assert 3.0 < np.mean(nees) < 8.0
 

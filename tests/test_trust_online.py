@@ -12,6 +12,7 @@ from online_log import OnlineLog, navigate, online_log
 from test_checkpoint import _rest, same
 from test_navigate_stream import answered, records
 
+import magfusion.estimation.navigator as navigator_module
 from magfusion.cli import main
 from magfusion.estimation.integrity.judgement import JudgedState, Judgement
 from magfusion.estimation.integrity.recovery import LONGEST_WAIT, Attempts
@@ -63,6 +64,30 @@ def test_a_clean_log_is_trustworthy_from_the_first_state_to_the_last(
     assert {state.verdict for state in states} == {Verdict.TRUSTWORTHY}
     assert navigator.summary.trust.findings == ()
     assert all(state.judgement.honest(state.cov) is state.cov for state in states)
+
+
+def test_states_are_carried_with_the_noise_that_the_samples_have(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    walk = online_log(21, 20.0, rate_hz=200.0)
+    imu = walk.site.platform.imu
+    quiet = replace(imu, gyro_noise=imu.gyro_noise / 10.0, accel_noise=imu.accel_noise / 10.0)
+    site = replace(walk.site, platform=replace(walk.site.platform, imu=quiet))
+
+    def found() -> tuple[set[str], float]:
+        _, states = navigated(replace(walk, site=site), "ekf")
+        nees = walk.errors(states).nees
+        assert nees is not None
+        return codes(states), float(np.mean(nees))
+
+    said, nees = found()
+    assert "imu_noise" in said
+    assert "beacon_excluded" not in said  # a fix better than the states is no reason to refuse it
+    assert nees < 9.0
+    monkeypatch.setattr(navigator_module, "measured_noise", lambda _, declared: (declared, []))
+    said, without = found()
+    assert "beacon_excluded" in said
+    assert without > 2.0 * nees
 
 
 @pytest.mark.parametrize("estimator", BOTH)

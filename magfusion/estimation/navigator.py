@@ -18,6 +18,7 @@ from magfusion.estimation.fixed_lag import SlidingWindow
 from magfusion.estimation.initialization.online import NoStart, find_online_start
 from magfusion.estimation.input_queue import Arrivals
 from magfusion.estimation.integrity.bank import SubsetBank
+from magfusion.estimation.integrity.inertial_noise import measured_noise
 from magfusion.estimation.integrity.judgement import JudgedState, Judgement, Told, judged_state
 from magfusion.estimation.integrity.summary import Summary
 from magfusion.estimation.measurements.earth import check_earth
@@ -79,6 +80,7 @@ class Navigator:
     _judgement: Judgement
     _made: list[JudgedState]
     _told: deque[Told]
+    _white: list[float]
     summary: Summary
     why_no_start: NoStart
     rival_chi_square: float | None
@@ -101,6 +103,8 @@ class Navigator:
         self._arrived = Arrivals(receiver, site.platform.imu.time_offset)
         self._estimator: Estimator | None = None
         self._next_start = self.settings.start_duration
+        imu = site.platform.imu
+        self._white = [imu.gyro_noise, imu.accel_noise]  # what states are carried with
         self._judgement, self._made, self._told = Judgement(), [], deque()
         self.summary = Summary()
         self.why_no_start = NoStart()
@@ -285,6 +289,8 @@ class Navigator:
         if start.ambiguous and self._next_start < longest:
             self._next_start += 0.5 * self.settings.start_duration
             return False
+        imu, _ = measured_noise(arrived.inertial_samples(), self.site.platform.imu)
+        self._white = [imu.gyro_noise, imu.accel_noise]
         self._arrived.start(start, self.settings.delay)
         self.rival_chi_square = start.rival_chi_square
         self._start_at(start.state)
@@ -370,8 +376,10 @@ class Navigator:
         offset, usual = self._arrived.applied_offset, self._arrived.usual
         imu = self._arrived.motion_samples(state.time - offset, time - offset)
         blind = self._arrived.stand_in.covers(state.time - offset, time - offset)
-        noise, blocks = self._process_noise, self.blocks
-        return propagate(state, imu, time, self.site, offset, noise, usual, blocks, blind=blind)
+        noise, blocks, (gyro, accel) = self._process_noise, self.blocks, self._white
+        model = replace(self.site.platform.imu, gyro_noise=gyro, accel_noise=accel)
+        site = replace(self.site, platform=replace(self.site.platform, imu=model))
+        return propagate(state, imu, time, site, offset, noise, usual, blocks, blind=blind)
 
 
 def restored(

@@ -1,7 +1,7 @@
 """What a navigation along a log comes to: trajectories with their verdicts, figures and files."""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -115,6 +115,15 @@ def no_start(seconds: float, why: NoStart) -> Trust:
     return why.trust | Trust((Finding("no_start", text, Verdict.FAILED, weight),))
 
 
+def _not_said_again(online: Trust, heard: tuple[Finding, ...]) -> Trust:
+    """Leave out what was said of the beginning and is said of the whole recording as well."""
+    every: dict[str, int] = {}
+    for finding in heard:
+        every[finding.code] = max(finding.verdict.rank, every.get(finding.code, 0))
+    kept = tuple(f for f in online.findings if f.verdict.rank > every.get(f.code, -1))
+    return replace(online, findings=kept)
+
+
 def _chosen(rows: dict[str, Array], trust: Trust, *, lagged: bool) -> BoolArray:
     own: BoolArray = rows["lagged"][:, 0] == lagged
     if trust.verdict is Verdict.FAILED:
@@ -156,7 +165,8 @@ def navigated(
     trusted = _part(rows, _chosen(rows, navigator.summary.trust, lagged=False), site)
     poses = None if trusted is None or settings.earth else trusted.states
     heard = recorded(log, site, BRIDGED, estimated=poses, beacons=True)
-    trust = with_cause(navigator.summary.trust | Trust(heard), log, site, settings.lockin)
+    said = _not_said_again(navigator.summary.trust, heard)
+    trust = with_cause(said | Trust(heard), log, site, settings.lockin)
     own = _chosen(rows, trust, lagged=False)
     current, lagged = _part(rows, own, site), None
     assert current is not None

@@ -1,11 +1,12 @@
 """The white noise of the inertial samples, from the samples alone, against what is declared."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
-from magfusion.model.samples import Log
-from magfusion.model.site import Site
+from magfusion.model.samples import ImuSamples, Log
+from magfusion.model.site import ImuModel, Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
 
@@ -39,23 +40,28 @@ def white_density(time: Array, value: Array) -> Array | None:
 
 def noisy_inertial(log: Log, site: Site | None) -> Iterator[Finding]:
     """Yield an inertial sensor whose samples scatter by far more than is declared of it."""
-    if site is None or len(log.imu) == 0:
-        return
-    imu = site.platform.imu
-    for name, key, unit, value, declared in (
-        ("gyroscope", "gyro_noise", "rad/s", log.imu.gyro_body, imu.gyro_noise),
-        ("accelerometer", "accel_noise", "m/s^2", log.imu.accel_body, imu.accel_noise),
+    if site is not None and len(log.imu):
+        yield from measured_noise(log.imu, site.platform.imu)[1]
+
+
+def measured_noise(samples: ImuSamples, declared: ImuModel) -> tuple[ImuModel, list[Finding]]:
+    """Return an inertial sensor with the noise that its samples have, where they have far more."""
+    findings, model = [], declared
+    for name, key, unit, value in (
+        ("gyroscope", "gyro_noise", "rad/s", samples.gyro_body),
+        ("accelerometer", "accel_noise", "m/s^2", samples.accel_body),
     ):
-        found = white_density(log.imu.time, value)
-        if found is None or not float(np.median(found)) > MORE * declared:
+        usual = float(getattr(declared, key))
+        found = white_density(samples.time, value)
+        if found is None or not float(np.median(found)) > MORE * usual:
             continue
         density = float(np.median(found))
-        yield Finding(
-            "imu_noise",
+        model = replace(model, **{key: density})
+        text = (
             f"{name}: even where it is quietest, its samples scatter by {density:.2g}"
-            f" {unit}/sqrt(Hz), {density / declared:.1f} times the declared {key}: what hangs on"
+            f" {unit}/sqrt(Hz), {density / usual:.1f} times the declared {key}: what hangs on"
             f" it is less sure than is claimed. Declare {key}: {density:.2g}, or what its data"
-            " sheet says.",
-            Verdict.DOUBTFUL,
-            50.0 + density / declared,
+            " sheet says."
         )
+        findings.append(Finding("imu_noise", text, Verdict.DOUBTFUL, 50.0 + density / usual))
+    return model, findings
