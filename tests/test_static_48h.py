@@ -1,6 +1,6 @@
 """Two days at rest: heat moves a fix and leaves it there, a clock turns it, a free phase does not.
 
-The whole of it, eight worlds with a fix a minute, is slow; one world a fix each half hour is not.
+The whole of it, eight worlds with a fix each two minutes, is slow; one world a fix each half hour is not.
 """
 
 import json
@@ -31,7 +31,7 @@ def world() -> World:
 
 @pytest.fixture(scope="module")
 def rows() -> dict[tuple[str, str], Row]:
-    config = Config()
+    config = Config(interval=120.0)
     worlds = run_many(static_48h.run_world, [config] * config.worlds, seed=config.seed, workers=1)
     return {(row.case, row.method): row for row in static_48h.summarise(config, worlds)}
 
