@@ -37,8 +37,10 @@ class Freed:
 
     Parameters
     ----------
-    step, cov, known_cov : ndarray, shape (h,), (h, h), (h, h)
-        In typical errors; the last of what the log determines better than those.
+    step : ndarray, shape (h,)
+        In typical errors.
+    direction, information : ndarray, shape (h, k), (k,)
+        Orthogonal combinations of what is held, and what the log tells of each.
     chi_square, freedom : float
         By how much twice the cost falls.
     moved : ndarray, shape (states, 6)
@@ -49,12 +51,24 @@ class Freed:
 
     suspect: Suspect
     step: Array
-    cov: Array
-    known_cov: Array
+    direction: Array
+    information: Array
     chi_square: float
     freedom: int
     moved: Array
     distance: Array
+
+    @property
+    def cov(self) -> Array:
+        """Covariance of the step, shape (h, h), in typical errors."""
+        return np.asarray((self.direction / self.information) @ self.direction.T)
+
+    @property
+    def known_cov(self) -> Array:
+        """The same of what the log determines better than those."""
+        known = self.information > 1.0
+        vector = self.direction[:, known]
+        return np.asarray((vector / self.information[known]) @ vector.T)
 
     @property
     def log_p(self) -> float:
@@ -118,12 +132,11 @@ def freed_by(
     step = vector @ (along / value)
     moved = score.by_pose @ step
     solved = np.linalg.solve(pose_cov, moved[..., None])[..., 0]
-    known = value > 1.0
     return Freed(
         suspect,
         step,
-        (vector / value) @ vector.T,
-        (vector[:, known] / value[known]) @ vector[:, known].T,
+        vector,
+        value,
         float(np.sum(along**2 / value)),
         int(np.sum(kept)),
         moved,

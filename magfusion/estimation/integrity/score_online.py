@@ -210,4 +210,4 @@ class OnlineScore:
 
 
 def _speaks(one: Freed) -> bool:
-    return one.log_p < np.log(SURE) and one.gain > 0.0 and float(one.distance[0]) > COVERED
+    return one.gain > 0.0 and float(one.distance[0]) > COVERED and one.log_p < np.log(SURE)
