@@ -128,10 +128,12 @@ class SlidingWindow:
         new = predicted.state if linearization_point is None else linearization_point
         self.nodes = [*nodes, Node(new, tuple(measurements), predicted.link)]
         try:
+            solved: gtsam.GaussianFactorGraph | None = None
             for _ in range(1 if linearization_point is None else ITERATIONS_FAR):
-                self._iterate()
+                solved = self._iterate()
             while self.nodes[-1].state.time - self.nodes[0].state.time > self.lag:
-                self._drop_first()
+                self._drop_first(solved)
+                solved = None
         except (RuntimeError, np.linalg.LinAlgError) as error:
             self.nodes, self.prior, self.state, self.lagged, self.left = kept
             reason = str(error).strip().splitlines()[0]
@@ -143,7 +145,8 @@ class SlidingWindow:
         self.nodes, self.prior = [], _prior_of(state)
         self.state = self.lagged = state
 
-    def _iterate(self) -> None:
+    def _iterate(self) -> gtsam.GaussianFactorGraph:
+        """Take a step; return the linear graph that it solved."""
         graph = self._linearized(self.nodes)
         last = len(self.nodes) - 1
         solved, rest = eliminate_partial(graph, _keys(range(last), None))
@@ -163,6 +166,7 @@ class SlidingWindow:
             nodes.append(replace(node, state=moved_to(node.state, calibration, motion)))
         self.nodes = nodes
         self.state = replace(nodes[-1].state, cov=0.5 * (cov + cov.T))
+        return graph
 
     @property
     def calibration_key(self) -> int | None:
@@ -195,18 +199,24 @@ class SlidingWindow:
         factor.getb()[...] = right
         return factor
 
-    def _cov_of_first(self) -> Array:
+    def _cov_of_first(self, graph: gtsam.GaussianFactorGraph) -> Array:
         """Return the covariance of the first state, the whole window and its past considered."""
         later = range(len(self.nodes) - 1, 0, -1)
-        _, rest = eliminate_partial(self._linearized(self.nodes), _keys(later, None))
+        _, rest = eliminate_partial(graph, _keys(later, None))
         information, _ = rest.hessian(_keys([0], self.calibration_key))
         cov = np.linalg.inv(information)
         return np.asarray(0.5 * (cov + cov.T))
 
-    def _drop_first(self) -> None:
-        """Leave the information of the first node as a prior of the second."""
+    def _drop_first(self, solved: gtsam.GaussianFactorGraph | None) -> None:
+        """Leave the information of the first node as a prior of the second.
+
+        Parameters
+        ----------
+        solved : gtsam.GaussianFactorGraph, optional
+            The window's, as its last step solved it: a step later it says the same of sigmas.
+        """
         first, second = self.nodes[:2]
-        cov = self._cov_of_first()
+        cov = self._cov_of_first(self._linearized(self.nodes) if solved is None else solved)
         graph = self._linearized([first, replace(second, measurements=())])
         _, rest = eliminate_partial(graph, _keys([0], None), orthogonal=True)
         sqrt_information, right = rest.jacobian(_keys([1], self.calibration_key))
