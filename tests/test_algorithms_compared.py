@@ -82,6 +82,7 @@ def test_with_a_smooth_gain_error_plain_likelihood_loses_to_algorithm_3() -> Non
     assert position(kept, ML) > 1.5 * position(kept, A3)
 
 
+@pytest.mark.slow
 def test_the_report_tells_where_plain_likelihood_is_worse_and_draws_both_figures(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -54,6 +54,7 @@ def report(calibrated: Path) -> dict[str, Any]:
     return read
 
 
+@pytest.mark.slow
 def test_the_command_writes_its_files_and_no_others(calibrated: Path) -> None:
     names = {path.name for path in calibrated.iterdir()}
     assert names == {

@@ -139,6 +139,7 @@ def short_run():
     return run_world(WorldTask(0, "ekf", SHORT, 1))
 
 
+@pytest.mark.slow
 def test_a_short_run_navigates_within_its_sigmas(short_run):
     errors = short_run.errors
     measured = errors.rows(errors.measured & (errors.time > 60.0))
@@ -192,6 +193,7 @@ def test_a_run_that_was_interrupted_ends_with_the_same_figures(resumed):
         assert np.array_equal(whole.pace[:, column], again.pace[:, column], equal_nan=True)
 
 
+@pytest.mark.slow
 def test_a_finished_run_is_not_run_again(resumed):
     _, again, once_more = resumed
     assert np.array_equal(again.errors.error, once_more.errors.error)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from magfusion.estimation.batch import SmootherSettings, smooth
 from magfusion.estimation.integrity.mending import mended
@@ -12,6 +13,7 @@ from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
 
 
+@pytest.mark.slow
 def test_false_inertial_samples_are_left_out_and_counted() -> None:
     site, rng = demo_site(), np.random.default_rng(6)
     log = simulate_log(site, SimulationConfig(DEMO_BOX_WORLD, duration=20.0), rng).log

@@ -84,6 +84,7 @@ def _in_iron(seed: int, length: float) -> float:
     return float(np.mean(nees))
 
 
+@pytest.mark.slow
 def test_declared_iron_is_honest_where_it_counts_once() -> None:
     """Spheres of a per cent or so: white, the error of a hundred epochs would average away."""
     together = [_in_iron(seed, LENGTH) for seed in range(2)]

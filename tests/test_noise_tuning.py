@@ -71,6 +71,7 @@ def test_the_dipole_model_is_found_to_be_better_than_declared(log: Log, plain: S
     assert better < 0.9 * before
 
 
+@pytest.mark.slow
 def test_densities_declared_too_small_are_found(log: Log) -> None:
     result = smooth(log, declared(imu=1.0 / 5.0))
     for kind, true in (("gyro_noise", 3e-4), ("accel_noise", 3e-3)):

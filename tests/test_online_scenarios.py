@@ -11,6 +11,7 @@ Monkey = pytest.MonkeyPatch
 Capture = pytest.CaptureFixture[str]
 
 
+@pytest.mark.slow
 def test_a_vehicle_comes_through_everything_that_goes_wrong(
     monkeypatch: Monkey, capsys: Capture
 ) -> None:

@@ -97,6 +97,7 @@ def with_unknown(*names: str, synchronised: bool = True) -> Site:
     return replace(site, beacons=beacons)
 
 
+@pytest.mark.slow
 def test_a_beacon_is_placed_by_a_short_walk_and_its_sigma_covers_the_error(
     walk: SimulatedLog,
 ) -> None:

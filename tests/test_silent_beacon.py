@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from magfusion.estimation.batch import smooth
 from magfusion.estimation.demodulation import demodulated
@@ -17,6 +18,7 @@ from magfusion.simulation.waveform import simulate_waveform
 OFF, ON = 6.0, 16.0  # s
 
 
+@pytest.mark.slow
 def test_a_beacon_that_is_off_for_a_while_costs_no_more_than_its_share() -> None:
     site = demo_site()
     config = SimulationConfig(DEMO_BOX_WORLD, duration=24.0)

@@ -485,6 +485,7 @@ def test_loose_coupling_agrees_with_tight_within_millimetres() -> None:
         assert trajectory_errors(result.states, small.truth, max_gap=1.0).ate < 0.01  # m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coupling", ["tight", "loose"])
 def test_the_sigmas_of_either_coupling_hold_the_error_of_the_survey(coupling: str) -> None:
     settings = SmootherSettings(coupling=coupling, estimate=())

@@ -1,6 +1,6 @@
 """Two days at rest: heat moves a fix and leaves it there, a clock turns it, a free phase does not.
 
-The whole of it, eight worlds with a fix each two minutes, is slow; one world a fix each half hour is not.
+Eight worlds with a fix each two minutes are slow; one world with one each half hour is not.
 """
 
 import json

@@ -256,6 +256,7 @@ def test_a_loss_that_was_found_again_makes_the_whole_doubtful(
     assert seen == {"A", "B", "C", "D"}
 
 
+@pytest.mark.slow
 def test_a_log_that_ends_lost_has_failed_and_leaves_no_result(
     walk: OnlineLog, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -173,6 +173,7 @@ def test_coils_of_46_cm_differ_from_dipoles_as_the_independent_analysis_found(
     assert rms(angle) / DEGREE == pytest.approx(direction_deg, rel=0.06)
 
 
+@pytest.mark.slow
 def test_larger_spheres_disturb_more_by_the_cube_of_their_radius() -> None:
     points = ROOM.draw_targets(np.random.default_rng(7), 50)
     clean = true_phasors(P0, points)
