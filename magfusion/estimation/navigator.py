@@ -5,13 +5,12 @@ on request at any time since.
 """
 
 from collections import Counter, deque
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.batch import LONGEST_STEP
 from magfusion.estimation.ekf import ErrorStateFilter
 from magfusion.estimation.epoch_update import EpochUpdate, Estimator
 from magfusion.estimation.fixed_lag import SlidingWindow
@@ -24,44 +23,16 @@ from magfusion.estimation.integrity.summary import Summary
 from magfusion.estimation.measurements.earth import check_earth
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.navigator_data import navigator_rules
+from magfusion.estimation.navigator_settings import NavigatorSettings as NavigatorSettings
 from magfusion.estimation.process_noise import calibration_process_noise
 from magfusion.estimation.propagation import Propagated, propagate
-from magfusion.estimation.settings import EstimatorSettings
 from magfusion.estimation.state import State
 from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
 from magfusion.model.parameters import dimension, placed
 from magfusion.model.samples import FieldSamples, SteadyFields
 from magfusion.model.site import Site
-from magfusion.model.trust import Risk
 from magfusion.receiver.receiver import Receiver
 from magfusion.units import Array
-
-
-@dataclass(frozen=True)
-class NavigatorSettings(EstimatorSettings):
-    """How to navigate.
-
-    Parameters
-    ----------
-    estimator : {'smoother', 'ekf'}
-    lag : float
-        Window of the smoother (s).
-    delay : float
-        How late samples may come and still be used in their order (s); so much later are states.
-    start_duration : float
-        Data gathered before the first state (s); longer where they leave it ambiguous.
-    longest_step : float
-        Without any field a state is made after so long (s).
-    risk : Risk, optional
-        What the protection levels promise; without it there are none, and an update costs less.
-    """
-
-    estimator: Literal["smoother", "ekf"] = "smoother"
-    lag: float = 4.0
-    delay: float = 0.0
-    start_duration: float = 6.0
-    longest_step: float = LONGEST_STEP
-    risk: Risk | None = None
 
 
 class Navigator:
