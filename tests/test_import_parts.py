@@ -58,6 +58,7 @@ def test_gyro_and_accelerometer_of_two_tables_are_one_inertial_sensor(tmp_path: 
     table(folder / "Gyroscope.csv", "time (s),x (rad/s),y (rad/s),z (rad/s)", fast, gyro(fast))
     table(folder / "Accelerometer.csv", "time (s),x (m/s^2),y (m/s^2),z (m/s^2)", slow, accel(slow))
     magnetometer(folder / "Magnetometer.csv")
+    (folder / "Metadata.csv").write_text("version,device name\n3,telephone\n")
     log, figures = imported(tmp_path / "log", folder)
     inside = fast[(fast >= slow[0]) & (fast <= slow[-1])]
     np.testing.assert_allclose(log.imu.time, inside, rtol=0, atol=2e-9)
@@ -66,7 +67,8 @@ def test_gyro_and_accelerometer_of_two_tables_are_one_inertial_sensor(tmp_path: 
     assert figures["imu_rows_written"] == len(inside)
     left_out = "imu_dropped_outside_of_the_other_half's_table"
     assert figures[left_out] == len(fast) - len(inside)
-    assert "accel was interpolated" in figures["notes"][0]
+    assert "Metadata.csv: holds no table of numbers" in figures["notes"][0]
+    assert "accel was interpolated linearly to the times of the gyro" in figures["notes"][1]
     assert {p.name for p in (tmp_path / "log").glob("*.parquet")} == {
         "imu.parquet",
         "magnetometer.parquet",

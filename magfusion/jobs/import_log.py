@@ -134,10 +134,10 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
                 counts[stream] = write_stream(plan, directory / f"{stream}.parquet", shared)
             except InputError as error:
                 told.problems.append(str(error))
-        resampled = ""
+        note = ""
         if set(HALVES) <= set(counts) and not told.problems:
             joined = join_halves(directory, counts)
-            counts["imu"], resampled = joined.counts, joined.resampled
+            counts["imu"], note = joined.counts, joined.note
         _refuse_apart(counts, told)
         _refuse(told)
         epoch_ns = counts["imu"].first if epoch == FIRST else int(epoch)
@@ -145,7 +145,7 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         report("checking", len(found.plans), len(found.plans) + 1)
         figures = _checked(directory, output, found, settings.site)
         figures = heading("import", output.resolve().name) | figures
-        figures |= _figures(found, counts, epoch_ns, epoch == FIRST, resampled)
+        figures |= _figures(found, counts, epoch_ns, epoch == FIRST, note)
         write_report(directory, figures)
     return figures
 
@@ -256,7 +256,7 @@ def _place(plan: Plan) -> str:
 
 
 def _figures(
-    found: Gathered, counts: dict[str, Counts], epoch_ns: int, is_first: bool, resampled: str
+    found: Gathered, counts: dict[str, Counts], epoch_ns: int, is_first: bool, note: str
 ) -> Figures:
     """Return what was read, what was left out, and what was understood."""
     figures = Figures(
@@ -285,12 +285,8 @@ def _figures(
         Figure("map", lines, section=Section.REPORT),
         Figure("understood", shown, section=Section.REMARKS),
     )
-    notes = []
-    if resampled:
-        notes.append(
-            f"The {resampled} was interpolated linearly to the times of the other half of the"
-            " inertial sensor, which is sampled faster."
-        )
+    notes = [f"Passed over: {reason}" for reason in found.passed_over]
+    notes += [note] if note else []
     if not is_first and abs(counts["imu"].first - epoch_ns) * 1e-9 > LATE:
         begin = (counts["imu"].first - epoch_ns) * 1e-9
         notes.append(

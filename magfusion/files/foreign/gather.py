@@ -40,6 +40,8 @@ class Gathered:
     Parameters
     ----------
     bags : list of Path
+    passed_over : list of str
+        Files beside the tables of a folder that are none, and why.
     stamped : bool
         Whether the formats have their own convention of an epoch: the first inertial sample.
     """
@@ -49,6 +51,7 @@ class Gathered:
     bags: list[Path] = field(default_factory=list)
     stamped: bool = False
     opened: dict[Path, Source] = field(default_factory=dict)
+    passed_over: list[str] = field(default_factory=list)
 
     def add(self, plan: Plan | None) -> None:
         """Add a stream, of which there may be one."""
@@ -78,6 +81,7 @@ def gather(paths: Sequence[Path], wanted: Asked, told: Findings) -> Gathered:
     for stream in ("imu", "magnetometer"):
         if stream not in attempted:
             told.problems.append(f"No table is given for the {stream}; give --{stream} FILE.")
+    told.problems += found.passed_over if told.problems else []  # what is lacking may be there
     for stream, plan in found.plans.items():
         found.plans[stream] = replace(plan, shift_ns=wanted.shifts_ns.get(stream, 0))
     for stream in wanted.entries:
@@ -142,7 +146,12 @@ def _add_bag(path: Path, wanted: Asked, found: Gathered) -> set[str]:
 
 
 def _add_table(file: Path, wanted: Asked, found: Gathered, among_others: bool) -> set[str]:
+    before = len(found.told.problems)
     source = _opened(file, wanted, found)
+    if source is None and among_others:
+        found.passed_over += found.told.problems[before:]
+        del found.told.problems[before:]
+        return set()
     if source is None:
         return set(STREAMS)
     streams = {"truth"} if file.suffix.lower() == ".tum" else streams_of(source.columns, file.stem)

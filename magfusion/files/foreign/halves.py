@@ -16,6 +16,7 @@ from magfusion.units import NANOSECOND, Array, IntArray
 
 HALVES = ("gyro", "accel")
 UNCOVERED = "outside of the other half's table"
+ALIKE = 0.9  # of a rate; where both are alike, the gyro's samples are kept
 MOST_STEPS = 3.5  # of the slower half, between which it is interpolated; farther is missing
 
 
@@ -25,12 +26,12 @@ class Joined:
 
     Parameters
     ----------
-    resampled : str
-        The half that was interpolated, empty where both have the same stamps.
+    note : str
+        Which half was interpolated; empty where both have the same stamps.
     """
 
     counts: Counts
-    resampled: str
+    note: str
 
 
 def join_halves(directory: Path, counts: dict[str, Counts]) -> Joined:
@@ -44,7 +45,8 @@ def join_halves(directory: Path, counts: dict[str, Counts]) -> Joined:
     InputError
         Where they have no moment in common.
     """
-    slow, fast = sorted(HALVES, key=lambda half: _rate(counts[half]))
+    gyro_leads = _rate(counts["gyro"]) > ALIKE * _rate(counts["accel"])
+    fast, slow = HALVES if gyro_leads else HALVES[::-1]
     paths = {half: directory / f"{half}.parquet" for half in HALVES}
     begin = max(counts[half].first for half in HALVES)
     end = min(counts[half].last for half in HALVES)
@@ -82,7 +84,11 @@ def join_halves(directory: Path, counts: dict[str, Counts]) -> Joined:
             writer.write_table(pa.table(columns), row_group_size=ROWS_PER_GROUP)
     for path in paths.values():
         path.unlink()
-    return Joined(made, "" if exact else slow)
+    note = (
+        f"The {slow} was interpolated linearly to the times of the {fast}: they are of two tables,"
+        " and sampled apart."
+    )
+    return Joined(made, "" if exact else note)
 
 
 def _rate(counts: Counts) -> float:
