@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import MISSING, Field
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, get_type_hints
+from typing import Annotated, Any, Literal, NoReturn, get_args, get_type_hints
 
 import typer
 from typer.core import TyperGroup
@@ -206,6 +206,7 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
         if output is None and "output" in wanted and not command.output_optional:
             # A log's name as the user sees it, even where it was given as ".".
             log = Path(os.path.realpath(own["log"])).name if "log" in own else ""
+            log += f"_and_{len(own['more'])}_more" if own.get("more") else ""
             output = Path(command.output or f"{log}_{path.split()[-1].replace('-', '_')}")
         earlier = _stamp(output)
         given = _given(context)
@@ -261,8 +262,8 @@ def _parameter(field: Field[Any], option: Option, hint: Any) -> inspect.Paramete
     if option.words is not None:
         hint = Literal[tuple(option.words)]
         default = next((w for w, value in option.words.items() if value == default), default)
-    elif hint == tuple[str, ...]:
-        hint, default = list[str], []
+    elif hint in (tuple[str, ...], tuple[Path, ...]):
+        hint, default = (list[str] if str in get_args(hint) else list[Path]), []
     if default is None:
         hint = hint | None
     if option.positional:
@@ -298,11 +299,12 @@ def _given(context: typer.Context) -> set[str]:
 def _run(context: typer.Context, settings: Settings, given: set[str]) -> Run:
     """Return what a page tells of how it came about."""
     values = {field.name: getattr(settings, field.name) for field, _ in options(type(settings))}
+    paths = [p for v in values.values() for p in (v if isinstance(v, tuple) else (v,))]
     return Run(
         shlex.join(["magfusion", *(context.obj or [])]),
         values,
         frozenset(given),
-        tuple(value for value in values.values() if isinstance(value, Path) and value.exists()),
+        tuple(path for path in paths if isinstance(path, Path) and path.exists()),
     )
 
 

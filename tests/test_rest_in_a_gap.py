@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magfusion.estimation.batch import LONGEST_STEP, Smoothed, smooth
+from magfusion.estimation.batch import Smoothed, smooth
+from magfusion.estimation.prepared import LONGEST_STEP
 from magfusion.estimation.between_epochs import at_imu_rate
 from magfusion.estimation.navigator import Navigator
 from magfusion.estimation.state import as_trajectory

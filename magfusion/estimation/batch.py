@@ -6,16 +6,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from gtsam.symbol_shorthand import V
 
-from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.bridged_log import bridged
+from magfusion.errors import InputError
 from magfusion.estimation.convergence import last_move, refuse_open, settled_at
-from magfusion.estimation.demodulation import demodulated
 from magfusion.estimation.graph import Estimate, Graph, initial_estimate, marginals, read_states
 from magfusion.estimation.initialization.chain import Start
-from magfusion.estimation.initialization.offline import begin, carried, with_rest_bias
-from magfusion.estimation.integrity.detection import detected, only
 from magfusion.estimation.integrity.mending import mended
-from magfusion.estimation.likeliest import likeliest
 from magfusion.estimation.log_graph import PreparedLog, graph_of
 from magfusion.estimation.measurements.earth import EarthField, check_earth, disturbed
 from magfusion.estimation.measurements.field_error import field_errors
@@ -25,55 +20,18 @@ from magfusion.estimation.measurements.pose_fix import survey_response
 from magfusion.estimation.measurements.zero_velocity import may_stand, quiet_before
 from magfusion.estimation.noise_tuning import Tuned, as_declared, noise_of, plausible, with_noise
 from magfusion.estimation.noise_tuning import settled as same_noise
-from magfusion.estimation.settings import EstimatorSettings
+from magfusion.estimation.prepared import prepared
+from magfusion.estimation.settings import SmootherSettings as SmootherSettings
 from magfusion.estimation.solve.bordered import Optimised, eliminate, marginal, optimise
-from magfusion.model.parameters import Block, Calibration, initial_calibration, placed
+from magfusion.model.parameters import Block, Calibration, placed
 from magfusion.model.progress import Report, quiet
-from magfusion.model.samples import FieldSamples, ImuSamples, Log
+from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import MotionModel, Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.receiver.cycles import whole_cycles
-from magfusion.receiver.slots import has_schedule
 from magfusion.units import Array, BoolArray, IntArray
 
-LONGEST_STEP = 5.0  # s; without any field a state is made after so long
-REST_STEP = 2.0  # s; and so long at rest, where each has a zero velocity
-SPARSE = 2.5  # intervals; a longer one than so many usual ones is a gap
 QUIET = 0.3  # sigmas; a last pass that moved the poses by less has converged all the same
 TUNINGS = 3  # passes after which the noise is found anew; then it stays as it is
-
-
-@dataclass(frozen=True)
-class SmootherSettings(EstimatorSettings):
-    """How a log is smoothed; the Earth field is measured with tight coupling only.
-
-    Parameters
-    ----------
-    coupling : {'tight', 'loose'}
-        Whether the phasors or the fixes made of them enter the graph.
-    loss : {None, 'huber', 'cauchy'}
-        Robust loss of the field measurements: a false beacon is nothing that sums of squares
-        expect, and where all are true it costs nothing.
-    passes : int
-        At most so many predictions of the waveform.
-    tune : bool
-        Whether noise and model error are found from the residuals, their declared values being a
-        prior; with tight coupling.
-    measurements : tuple of (ndarray, Measurement)
-        Anything else that was measured, with the times of its rows (s), at which states are made.
-    """
-
-    coupling: str = "tight"
-    loss: str | None = "cauchy"
-    passes: int = 10
-    tune: bool = True
-    measurements: tuple[tuple[Array, Measurement], ...] = ()
-
-    def __post_init__(self) -> None:
-        if self.earth and self.coupling == "loose":
-            raise ValueError("the Earth field is measured with tight coupling only")
-        if self.passes < 1:
-            raise ValueError(f"passes must be at least 1; got {self.passes}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +87,8 @@ class Smoothed:
         What one sigma of the survey does to every pose alike, with loose coupling.
     noise : tuple of Tuned
         What was found of noise and model error; the site of ``calibration`` has it.
+    standing : bool ndarray, shape (states,)
+        Where the platform stands.
     """
 
     states: Trajectory
@@ -158,6 +118,7 @@ class Smoothed:
     noise: tuple[Tuned, ...] = ()
     field_errors: tuple[Block, ...] = ()
     calibration_response: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    standing: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     @property
     def uncertain(self) -> tuple[Block, ...]:
@@ -194,68 +155,7 @@ def smooth(
     if settings.earth:
         check_earth(site)
     known = mended(log, site)
-    return _solved(bridged(_prepared(known, site, settings, report)), settings, report)
-
-
-def _prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) -> PreparedLog:
-    report("demodulating", 0, settings.passes + 3)
-    loose, demodulation = settings.coupling == "loose", demodulated(log, site, settings.lockin)
-    samples = demodulation.fields
-    if loose and has_schedule(site):
-        samples = whole_cycles(samples, log.imu, site)
-    if len(samples) < 2:
-        raise EstimationError(
-            f"log {log.name} has {len(samples)} field epoch; at least 2 are needed"
-        )
-    report("finding a start", 1, settings.passes + 3)
-    begin_imu = float(log.imu.time[0])
-    calibration = initial_calibration(site, float(np.mean(samples.time)), begin_imu)
-    offset, steady = calibration.time_offset, None
-    log = replace(log, imu=calibration.on_log_rate(log.imu))
-    if settings.earth:
-        steady, samples = demodulation.steady(calibration), only(samples, detected(samples))
-    between = _in_gaps(samples.time, log.imu, offset, site.platform.motion)
-    others = [time for time, _ in settings.measurements]
-    time = np.unique(np.concatenate([samples.time, between, *others]))
-    blocks, considered = ((), ()) if loose else settings.blocks(site)
-    starts = [
-        PreparedLog(
-            demodulation=demodulation,
-            samples=samples,
-            steady=steady,
-            epoch=np.searchsorted(time, samples.time),
-            fixes=beginning.fixes if loose else None,
-            start=beginning.start,
-            states=with_rest_bias(
-                carried(beginning.states, log.imu, offset, time), log.imu, calibration
-            ),
-            declared=beginning.declared,
-            blocks=blocks,
-            considered=considered,
-            loss=settings.loss,
-            others=settings.measurements,
-        )
-        for beginning in begin(samples, steady, log, calibration)
-    ]
-    return likeliest(starts)
-
-
-def _in_gaps(time: Array, imu: ImuSamples, time_offset: float, motion: MotionModel) -> Array:
-    """Return when states are made where no field comes (s), more of them where the IMU is quiet.
-
-    Parameters
-    ----------
-    time : ndarray, shape (n,)
-        Of the fields (s).
-    time_offset : float
-        (s)
-    """
-    step, out = np.diff(time), [np.zeros(0)]
-    for k in np.flatnonzero(step > max(LONGEST_STEP, SPARSE * float(np.median(step)))):
-        inner = np.linspace(time[k], time[k + 1], int(np.ceil(step[k] / REST_STEP)) + 1)[1:-1]
-        every = np.arange(1, len(inner) + 1) % int(LONGEST_STEP / REST_STEP) == 0
-        out.append(inner[every | quiet_before(imu, inner - time_offset, motion)])
-    return np.concatenate(out)
+    return _solved(prepared(known, site, settings, report), settings, report)
 
 
 def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smoothed:
@@ -300,7 +200,7 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
         iterations, done = iterations + found.iterations, done + 1
     report("posterior", settings.passes + 2, settings.passes + 3)
     fields = log.samples if wave is None else wave.fields
-    result = _posterior(log, graph, found, fields, gaps)
+    result = posterior(log, graph, found, fields, gaps)
     report("done", settings.passes + 3, settings.passes + 3)
     refuse_open(result.states)
     move = (
@@ -308,7 +208,7 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
         if settled and found.converged
         else last_move(before, result.states, None if found.converged else (graph, found.estimate))
     )
-    result = replace(result, noise=tuned)
+    result = replace(result, noise=tuned, standing=standing)
     return replace(
         result, passes=done, iterations=iterations, converged=move < QUIET, last_move=move
     )
@@ -357,9 +257,18 @@ def _at_rest(
     return out
 
 
-def _posterior(
+def posterior(
     log: PreparedLog, graph: Graph, found: Optimised[Estimate], samples: FieldSamples, gaps: int
 ) -> Smoothed:
+    """Return the posterior of a log whose graph was optimised.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        As they are measured in the graph.
+    gaps : int
+        Intervals that were bridged.
+    """
     estimate = found.estimate
     states, response = read_states(estimate.values, log.states.time), None
     errors: tuple[Block, ...] = ()

@@ -1,7 +1,7 @@
 """The graph of a log or of a window: inertial factors, measurements, a calibration beside them."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -18,6 +18,7 @@ from magfusion.estimation.factors import (
 )
 from magfusion.estimation.inertial import ROWS, Link
 from magfusion.estimation.measurements.measurement import Measurement
+from magfusion.estimation.prior_factor import PriorShift, prior_factor
 from magfusion.estimation.solve.bordered import eliminate, eliminate_partial, last_marginal
 from magfusion.estimation.solve.ordering import nested_dissection
 from magfusion.estimation.state import states_in
@@ -81,6 +82,8 @@ class Graph:
         their columns are those of ``blocks``, then of what is considered.
     segments : Segments
         Of a long log in which the calibration drifts.
+    shift : PriorShift, optional
+        What else is uncertain does this to the mean of the prior, where other logs made it.
     """
 
     native: gtsam.NonlinearFactorGraph
@@ -90,6 +93,7 @@ class Graph:
     epochs: int
     links: tuple[Link, ...] = ()
     segments: Segments = ONE_SEGMENT
+    shift: PriorShift | None = None
     factors: tuple[Factors, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -155,7 +159,7 @@ class Graph:
         for factors in self.factors:
             graph.push_back(factors.linearize(states, estimate.at(factors.segment)))
         if self.blocks and self.declared is not None:
-            graph.push_back(_prior_factor(self.declared, estimate.calibration, self.blocks))
+            graph.push_back(prior_factor(self.declared, estimate.calibration, self.blocks))
         for drift in self.segments.factors(self._calibrations(estimate), self.blocks):
             graph.push_back(drift)
         return graph
@@ -270,7 +274,7 @@ class Graph:
         for drift in self.segments.factors(self._calibrations(estimate), self.blocks):
             graph.push_back(drift)
         if self.blocks and self.declared is not None:
-            graph.push_back(_prior_factor(self.declared, estimate.calibration, self.blocks))
+            graph.push_back(prior_factor(self.declared, estimate.calibration, self.blocks))
         if not explaining:
             for i in range(graph.size()):
                 factor = graph.at(i)
@@ -299,10 +303,16 @@ class Graph:
         They are left over when all else is eliminated, so that one elimination serves them all.
         """
         assert self.declared is not None
-        spread = prior_sqrt_covariance(self.declared.site, considered)
-        graph = self.beside(estimate, considered, spread, self.by_considered(spread))
+        spread, shift = prior_sqrt_covariance(self.declared.site, considered), None
+        if self.shift is not None:
+            spread, shift = self.shift.beside(spread)
+        graph = replace(self, declared=None).beside(
+            estimate, considered, spread, self.by_considered(spread)
+        )
+        if self.blocks:
+            graph.push_back(prior_factor(self.declared, self.declared, self.blocks, shift))
         conditional, _ = eliminate_partial(graph, self.ordering)
-        return steps_of_others(conditional, dimension(considered))
+        return steps_of_others(conditional, spread.shape[1])
 
 
 def steps_of_others(conditional: gtsam.GaussianBayesNet, count: int) -> list[gtsam.VectorValues]:
@@ -313,15 +323,6 @@ def steps_of_others(conditional: gtsam.GaussianBayesNet, count: int) -> list[gts
         given.insert(CONSIDERED_KEY, one)
         steps.append(conditional.optimize(given))
     return steps
-
-
-def _prior_factor(
-    declared: Calibration, calibration: Calibration, blocks: tuple[Block, ...]
-) -> gtsam.JacobianFactor:
-    sqrt_information = prior_sqrt_information(declared.site, blocks)
-    error = -sqrt_information @ difference(declared, calibration, blocks)
-    unit = gtsam.noiseModel.Unit.Create(len(sqrt_information))
-    return gtsam.JacobianFactor(CALIBRATION_KEY, sqrt_information, error, unit)
 
 
 def initial_estimate(

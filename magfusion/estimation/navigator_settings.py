@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from magfusion.estimation.batch import LONGEST_STEP
+from magfusion.estimation.prepared import LONGEST_STEP
 from magfusion.estimation.settings import EstimatorSettings
 from magfusion.model.trust import Risk
 

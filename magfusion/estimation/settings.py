@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.model.parameters import (
     PARAMETERS,
     Block,
@@ -12,6 +13,7 @@ from magfusion.model.parameters import (
 )
 from magfusion.model.site import Site
 from magfusion.receiver.windows import LockinSettings
+from magfusion.units import Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,3 +43,36 @@ class EstimatorSettings:
         kinds = self.parameters if self.earth else of_phasors(self.parameters)
         estimated = choose_blocks(site, self.estimate, parameters=kinds)
         return estimated, considered_blocks(site, estimated, parameters=kinds)
+
+
+@dataclass(frozen=True)
+class SmootherSettings(EstimatorSettings):
+    """How a log is smoothed; the Earth field is measured with tight coupling only.
+
+    Parameters
+    ----------
+    coupling : {'tight', 'loose'}
+        Whether the phasors or the fixes made of them enter the graph.
+    loss : {None, 'huber', 'cauchy'}
+        Robust loss of the field measurements: a false beacon is nothing that sums of squares
+        expect, and where all are true it costs nothing.
+    passes : int
+        At most so many predictions of the waveform.
+    tune : bool
+        Whether noise and model error are found from the residuals, their declared values being a
+        prior; with tight coupling.
+    measurements : tuple of (ndarray, Measurement)
+        Anything else that was measured, with the times of its rows (s), at which states are made.
+    """
+
+    coupling: str = "tight"
+    loss: str | None = "cauchy"
+    passes: int = 10
+    tune: bool = True
+    measurements: tuple[tuple[Array, Measurement], ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.earth and self.coupling == "loose":
+            raise ValueError("the Earth field is measured with tight coupling only")
+        if self.passes < 1:
+            raise ValueError(f"passes must be at least 1; got {self.passes}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.jobs.settings import Command, EstimateSettings, LogSettings, WindowSettings, option
+from magfusion.jobs.settings import Command, EstimateSettings, LogsSettings, WindowSettings, option
 from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Site
 
@@ -69,7 +69,7 @@ class Transfer(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LogCalibrationSettings(LogSettings, WindowSettings, EstimateSettings):
+class LogCalibrationSettings(LogsSettings, WindowSettings, EstimateSettings):
     """What is calibrated by a log of ordinary motion."""
 
     cross_validate: int | None = option(
@@ -80,7 +80,7 @@ class LogCalibrationSettings(LogSettings, WindowSettings, EstimateSettings):
 def run_calibrate_log(
     settings: LogCalibrationSettings, output: Path, report: Report = quiet
 ) -> Figures:
-    """Calibrate a site by a log of ordinary motion.
+    """Calibrate a site by a log of ordinary motion, or by several together.
 
     Raises
     ------
@@ -110,6 +110,12 @@ def run_calibrate_log(
 
     job = settings.job(output)
     smoother = SmootherSettings(estimate=settings.groups, lockin=settings.lockin(job))
+    if settings.more:
+        from magfusion.jobs.joint_result import run_joint
+
+        if settings.cross_validate is not None:
+            raise InputError("--cross-validate divides one log; several were given")
+        return run_joint(JOB, settings, smoother, output, report)
     claimed = claim(output, JOB)
     log, site = read_job(job, unknown=True)
     cuts = _cuts(job, log, site, settings.cross_validate)

@@ -8,6 +8,7 @@ from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
 
+OPEN = "the measurements leave a direction of the motion open"
 # They tell of it themselves, and what they were killed in can be gone on with.
 _OWN = ("navigate", "drift")
 _SHOWN = {"job": Section.TITLE, "log": Section.TITLE} | dict.fromkeys(
@@ -59,3 +60,18 @@ def _read(path: Path) -> Figures:
             for name, value in told.items()
         )
     )
+
+
+def reason_of(error: RuntimeError) -> str:
+    """Return why an estimate failed.
+
+    Raises
+    ------
+    RuntimeError
+        The same, where it is not known.
+    """
+    if isinstance(error, EstimationError):
+        return str(error)
+    if "Indeterminate" in str(error):
+        return OPEN
+    raise error

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, fields, replace
@@ -65,11 +66,17 @@ _TABLES = {"imu.parquet", "magnetometer.parquet", "fields.parquet", "truth.parqu
 _TRUE_SITE = {f"true_{name}" for name in _SITE}
 _LOG = {"log.yaml", *_SITE, *_TRUE_SITE, "report.json", *_TABLES}
 UNFINISHED_DRIFT = "unfinished"
+KEPT, LOGS, LOGS_TABLE = "kept", "logs", "logs.csv"  # of several logs
 CHECKPOINT, ROWS = "checkpoint.bin", "checkpoint.rows"
 # What is in the directory while these jobs run.
-_UNFINISHED = {"navigate": {CHECKPOINT, ROWS}, "drift": {UNFINISHED_DRIFT}}
+_UNFINISHED = {
+    "navigate": {CHECKPOINT, ROWS},
+    "drift": {UNFINISHED_DRIFT},
+    "smooth": {KEPT},
+    "calibrate log": {KEPT},
+}
 _WRITTEN = {
-    "smooth": _RESULT | {"fixes.parquet"},
+    "smooth": _RESULT | {"fixes.parquet", KEPT, LOGS, LOGS_TABLE},
     "fix": _RESULT | {"fixes.parquet"},
     "navigate": _RESULT | {"lagged.parquet"} | _UNFINISHED["navigate"],
     "drift": {"drift.png", "stability.png", "run.rrd", "report.json"} | _UNFINISHED["drift"],
@@ -77,7 +84,7 @@ _WRITTEN = {
     "simulate": _LOG,
     "demodulate": _LOG,
     "survey": {"survey.parquet", "survey.png", "report.json"},
-    "calibrate log": _SITE | {"calibration.png", "report.json"},
+    "calibrate log": _SITE | {"calibration.png", "report.json", KEPT, LOGS_TABLE},
     "calibrate beacon": _SITE | {"beacon.png", "report.json"},
     "calibrate antenna": _SITE | {"antenna.png", "report.json"},
     "calibrate fieldmap": _SITE | {"field_map.png", "report.json"},
@@ -122,6 +129,22 @@ def claim(output: Path, *kinds: str) -> AbstractContextManager[Path]:
 
     refuse_in_the_way(real(output), replaces)
     return whole_directory(output, replaces)
+
+
+def keep_results(whole: Path, logs: list[tuple[str, Path, Path]]) -> None:
+    """Copy what is kept of several logs into the directory that becomes the output.
+
+    Parameters
+    ----------
+    logs : list of (str, Path, Path)
+        Name of each, the file that is kept of it, and the directory of its results.
+    """
+    (whole / KEPT).mkdir()
+    for name, kept, results in logs:
+        if kept.is_file():
+            shutil.copy2(kept, whole / KEPT / kept.name)
+        if results.is_dir():
+            shutil.copytree(results, whole / LOGS / name)
 
 
 def found_in(directory: Path, trust: Trust) -> Path:

@@ -97,9 +97,10 @@ def option(default: Any, help: str, **facts: Any) -> Any:
     return dataclasses.field(default=default, metadata={"option": Option(help, **facts)})
 
 
-def argument(help: str, **facts: Any) -> Any:
-    """Return a field that must be given, by its place."""
-    return dataclasses.field(metadata={"option": Option(help, positional=True, **facts)})
+def argument(help: str, default: Any = dataclasses.MISSING, **facts: Any) -> Any:
+    """Return a field that is given by its place; it must be where it has no default."""
+    asked = {"option": Option(help, positional=True, **facts)}
+    return dataclasses.field(default=default, metadata=asked)
 
 
 def required(help: str, **facts: Any) -> Any:
@@ -211,6 +212,36 @@ class LogSettings(PartSettings):
         if self.start is not None and self.end is not None and not self.start < self.end:
             raise InputError(f"--start must come before --end; got {self.start:g} and {self.end:g}")
         return Job(self.log, self.site, output, self.start, self.end, topics_option(self.topics))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogsSettings(LogSettings):
+    """A log, or several of one site that are refined together."""
+
+    more: tuple[Path, ...] = argument(
+        "More logs of the same site, to refine it by all of them together", ()
+    )
+    cluster: str | None = option(
+        None, "Dask scheduler, tcp://host:8786, whose workers see logs and results; several logs"
+    )
+    workers: int | None = option(
+        None, "Processes on this machine; several logs", note="default: one a core"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.more and (self.cluster is not None or self.workers is not None):
+            raise InputError("--cluster and --workers share out several logs; one log was given")
+
+    def jobs(self, output: Path) -> list[Job]:
+        """Return a job for every log.
+
+        Raises
+        ------
+        InputError
+        """
+        first = self.job(output)
+        return [first, *(dataclasses.replace(first, log_path=path) for path in self.more)]
 
 
 LOWEST_MAINS = 10.0  # Hz; below, its harmonics would be fitted to the motion

@@ -12,29 +12,27 @@ from magfusion.jobs.settings import (
     Command,
     EarthSettings,
     EstimateSettings,
-    LogSettings,
+    LogsSettings,
     RiskSettings,
     WindowSettings,
     option,
 )
 from magfusion.model.progress import Report, quiet
-from magfusion.results.figures import Column, Figure, Figures, Section, heading
+from magfusion.results.figures import Figure, Figures, Section, heading
 
 if TYPE_CHECKING:
-    from magfusion.estimation.batch import Smoothed, SmootherSettings
+    from magfusion.estimation.batch import SmootherSettings
     from magfusion.jobs.inputs import Job
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
     from magfusion.model.trust import Risk
-    from magfusion.units import Array
 
 
-OPEN = "the measurements leave a direction of the motion open"
 CONTRADICTION = "fields and inertial data contradict each other so much that nothing can be solved"
 
 
 @dataclass(frozen=True, kw_only=True)
-class SmoothSettings(LogSettings, WindowSettings, EarthSettings, EstimateSettings, RiskSettings):
+class SmoothSettings(LogsSettings, WindowSettings, EarthSettings, EstimateSettings, RiskSettings):
     """How a log is smoothed."""
 
     coupling: Literal["tight", "loose"] = option("tight", "Phasors or fixes in the graph")
@@ -73,9 +71,14 @@ class SmoothSettings(LogSettings, WindowSettings, EarthSettings, EstimateSetting
 
 
 def run(settings: SmoothSettings, output: Path, report: Report = quiet) -> Figures:
-    """Smooth a log as the settings ask; see `run_smooth`."""
+    """Smooth a log as the settings ask, or several together; see `run_smooth`, `run_joint`."""
     job = settings.job(output)
     smoother = settings.smoother(job)
+    if settings.more:
+        from magfusion.jobs.joint_result import run_joint
+
+        parts = settings, smoother, output, report
+        return run_joint("smooth", *parts, imu_rate=settings.imu_rate, risk=settings.risks)
     return run_smooth(job, smoother, imu_rate=settings.imu_rate, risk=settings.risks, report=report)
 
 
@@ -101,31 +104,11 @@ def run_smooth(
     InputError, EstimationError
         In the latter case the single-epoch fixes have been saved in the output directory.
     """
-    from magfusion.estimation.between_epochs import at_imu_rate
-    from magfusion.estimation.integrity.diagnosis import with_cause
-    from magfusion.estimation.integrity.judge import judged
-    from magfusion.estimation.integrity.smoothed_exclusion import (
-        separated_smooth,
-        states_between,
-        states_judged,
-    )
     from magfusion.estimation.self_survey import smooth_and_place
-    from magfusion.files.site import save_site
-    from magfusion.files.trajectory_table import write_trajectory
-    from magfusion.files.tum import write_tum
-    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
-    from magfusion.results.page_motion import Motion
-    from magfusion.results.recording import write_recording
-    from magfusion.results.refinement import result_site
-    from magfusion.results.report import (
-        FAILED,
-        compared_with_truth,
-        placement_figures,
-        smoothed_figures,
-        where_found,
-        write_report,
-    )
-    from magfusion.results.verdict import level_figures, trust_figures
+    from magfusion.jobs.failure import reason_of
+    from magfusion.jobs.inputs import claim, named, read_job, refuse_failed
+    from magfusion.jobs.smooth_result import finished, with_errors, write_finished
+    from magfusion.results.report import FAILED
 
     claimed = claim(job.output, "smooth", "fix")
     log, site = read_job(job, unknown=True)
@@ -134,7 +117,7 @@ def run_smooth(
         with named(job.log_path):
             result, placed = smooth_and_place(log, site, settings, report)
     except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
-        reason = _reason(error)
+        reason = reason_of(error)
         if any(beacon.unknown is not None for beacon in site.beacons):
             raise EstimationError(f"{job.log_path}: {reason}") from error
         with claimed as whole:
@@ -142,83 +125,14 @@ def run_smooth(
         raise EstimationError(
             f"{job.log_path}: {said}; the single-epoch fixes were saved in {job.output / FAILED}"
         ) from error
-    separated = separated_smooth(result, risk)
-    result, trust = judged(separated.result, log)
-    trust = with_cause(trust | separated.trust, log, site, settings.lockin)
-    by_state = states_judged(separated, result, trust.verdict)
-    figures = (
-        heading("smooth", log.name)
-        | trust_figures(trust)
-        | Figures(where_found("coupling", settings.coupling != "tight", settings.coupling))
-    )
-    figures |= smoothed_figures(result) | level_figures(by_state)
-    figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
-    errors, compared = compared_with_truth(result.states, log)
-    figures |= compared | placement_figures(placed, result.calibration.site)
-    if errors is not None and not placed:
-        figures |= _fixed_survey_figures(log, site, settings, result)
-    refined, innovations = result_site(result, log.name), _innovations(result)
-    written = at_imu_rate(result, log) if imu_rate else result.states
+    done = finished(log, site, settings, result, risk)
+    elapsed = Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
+    done = replace(done, figures=done.figures | elapsed)
+    done = with_errors(done, log, placed, (site, settings))
     with claimed as whole:
-        directory = found_in(whole, trust)
-        write_tum(written, directory / "trajectory.tum", log.epoch_ns)
-        rows = states_between(by_state, result.states, written)
-        write_trajectory(written, directory / "trajectory.parquet", log.epoch_ns, rows)
-        save_site(refined, directory / "site.yaml")
-        write_recording(
-            directory / "run.rrd",
-            refined,
-            result.states,
-            truth=log.truth,
-            errors=errors,
-            innovations=innovations,
-            trust=trust,
-            states=by_state,
-        )
-        motion = Motion(refined, result.states, log.truth, errors, innovations, by_state)
-        write_report(whole, figures, motion)
-    refuse_failed(job.log_path, output=job.output, trust=trust)
-    return figures
-
-
-def _innovations(result: Smoothed) -> dict[str, tuple[Array, Array]]:
-    import numpy as np
-
-    channels = result.fields.channels
-    found = {}
-    for name in dict.fromkeys(beacon for beacon, _ in channels):
-        own = result.residual[:, [beacon == name for beacon, _ in channels]]
-        seen = np.isfinite(own).all(axis=(1, 2))
-        if np.any(seen):
-            found[name] = (result.fields.time[seen], np.sqrt(np.mean(own[seen] ** 2, axis=(1, 2))))
-    return found
-
-
-def _fixed_survey_figures(
-    log: Log, site: Site, settings: SmootherSettings, result: Smoothed
-) -> Figures:
-    """Return the errors with the calibration as surveyed: what estimating it was worth."""
-    from magfusion.estimation.batch import smooth
-    from magfusion.results.errors import trajectory_errors
-    from magfusion.results.report import error_figures
-
-    kept = ("phase", "time-offset")
-    if all(block.group in kept for block in result.blocks):
-        return Figures()
-    try:
-        fixed = smooth(log, site, replace(settings, estimate=kept))
-    except RuntimeError as error:
-        return Figures(Figure("held_failed", _reason(error), section=Section.REPORT))
-    assert log.truth is not None
-    return error_figures(trajectory_errors(fixed.states, log.truth), Column.FIXED, "held_")
-
-
-def _reason(error: RuntimeError) -> str:
-    if isinstance(error, EstimationError):
-        return str(error)
-    if "Indeterminate" in str(error):
-        return OPEN
-    raise error
+        write_finished(whole, log, done, imu_rate=imu_rate)
+    refuse_failed(job.log_path, output=job.output, trust=done.trust)
+    return done.figures
 
 
 def _save_fixes_instead(
@@ -230,6 +144,7 @@ def _save_fixes_instead(
     from magfusion.estimation.demodulation import first_fixes, phasors
     from magfusion.estimation.integrity.diagnosis import OF_CATCH_ALL, with_cause
     from magfusion.estimation.integrity.recording import BRIDGED, recorded
+    from magfusion.jobs.failure import OPEN
     from magfusion.jobs.fix import write_fix_result
     from magfusion.jobs.inputs import found_in
     from magfusion.model.parameters import initial_calibration

@@ -62,6 +62,8 @@ CODES = {
     "jitter": "stamps are uneven",
     "length_units": "the positions of beacons are in another unit",
     "lever_arm": "the lever arm of the magnetometer is not as declared",
+    "log_left_out": "one of several logs has no part in what they refine, as it failed alone",
+    "logs_disagree": "a log contradicts the others about the site that they share",
     "lost": "nothing explains the fields where the platform is thought to be",
     "low_signal": "beacons are not told from noise",
     "magnetometer_axes": "the magnetometer's axes are left-handed",

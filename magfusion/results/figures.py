@@ -22,6 +22,7 @@ class Section(StrEnum):
 
     TITLE = "title"
     VERDICT = "verdict"
+    LOGS = "logs"  # the value has a row for each of several logs
     ERRORS = "errors"
     SUMMARY = "summary"
     CALIBRATION = "calibration"

@@ -24,6 +24,7 @@ from magfusion.results.shown import (
     column_rows,
     findings,
     labelled,
+    log_rows,
     notes,
     number_text,
     sentences,
@@ -68,6 +69,7 @@ def write_page(directory: Path, figures: Figures, motion: Motion | None = None) 
         f"<h1>magfusion {escape(name)}</h1>",
         _verdict(figures),
         _section("Held, and not checked by these data", _unverified(figures)),
+        _section("Logs", "".join(_table(log_rows(f)) for f in figures.of(Section.LOGS))),
         _section("Main figures", _main(figures)),
     ]
     if motion is not None:

@@ -11,6 +11,7 @@ from magfusion.results.shown import (
     column_rows,
     findings,
     labelled,
+    log_rows,
     notes,
     number_text,
     sentences,
@@ -35,6 +36,7 @@ def show(figures: Figures, output: Path | None, console: Console | None = None) 
     console.print(name, style="bold", soft_wrap=True, markup=False)
     _show_verdict(figures, console)
     tables = (
+        *(_of_logs(figure) for figure in figures.of(Section.LOGS)),
         _table(figures.of(Section.ERRORS), ""),
         _summary(figures.of(Section.SUMMARY)),
         _calibration([f for f in figures.all if isinstance(f, Estimate)]),
@@ -75,6 +77,15 @@ def _table(figures: list[Figure], corner: str) -> Table:
     """Return a table of figures by their labels and columns."""
     (_, *columns), *rows = column_rows(figures, corner)
     table = Table(corner, *columns, box=None)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _of_logs(figure: Figure) -> Table:
+    """Return a table of several logs."""
+    head, *rows = log_rows(figure)
+    table = Table(*head, box=None)
     for row in rows:
         table.add_row(*row)
     return table

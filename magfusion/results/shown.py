@@ -50,6 +50,29 @@ def column_rows(figures: list[Figure], corner: str) -> list[list[str]]:
     return [[corner, *columns], *cells]
 
 
+# Columns of the table of logs that a reader sees, and what they are called.
+_OF_LOGS = {
+    "log": "log",
+    "verdict": "verdict",
+    "code": "first reason",
+    "epochs": "epochs",
+    "position_sigma_m": "sigma (m)",
+    "attitude_sigma_deg": "(deg)",
+    "aligned_ate_m": "aligned (m)",
+    "alone_aligned_ate_m": "alone",
+    "nees_mean": "NEES",
+}
+
+
+def log_rows(figure: Figure) -> list[list[str]]:
+    """Return the table of several logs, its head first."""
+    value = figure.value if isinstance(figure.value, list) else []
+    rows = [row for row in value if isinstance(row, dict)]
+    known = [key for key in _OF_LOGS if any(row.get(key) not in (None, "") for row in rows)]
+    cells = [[number_text(row.get(key)) for key in known] for row in rows]
+    return [[_OF_LOGS[key] for key in known], *cells]
+
+
 def summary_rows(figures: list[Figure]) -> list[tuple[str, str]]:
     """Return one line for each figure, and one for what several beacons have each."""
     rows: list[tuple[str, str]] = []

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -60,15 +61,63 @@ def run_many(
     EstimationError
         Where a process of this machine was ended from outside.
     """
+    with crew(len(inputs), cluster=cluster, workers=workers) as hands:
+        return hands.run(task, inputs, seed=seed, report=report)
+
+
+@dataclass(frozen=True)
+class Crew:
+    """Processes that stay for several calls, so that starting them is paid for once.
+
+    Parameters
+    ----------
+    executor : Executor, optional
+        None runs the tasks right here.
+    """
+
+    executor: Executor | None
+
+    def run(
+        self,
+        task: Callable[[Input, np.random.Generator], Output],
+        inputs: Sequence[Input],
+        *,
+        seed: int = 0,
+        report: Report | None = None,
+    ) -> list[Output]:
+        """Run a task on every input; see `run_many`."""
+        tell = report or (lambda _stage, _done, _total: None)
+        seeds = np.random.SeedSequence(seed).spawn(len(inputs))
+        given = list(zip(inputs, seeds, strict=True))
+        if self.executor is None:
+            return list(_here(task, given, tell))
+        return _gather(self.executor, task, given, tell)
+
+
+@contextmanager
+def crew(most: int, *, cluster: str | None = None, workers: int | None = None) -> Iterator[Crew]:
+    """Yield who runs tasks: this process, others of this machine, or a Dask cluster.
+
+    Parameters
+    ----------
+    most : int
+        Tasks at once.
+    cluster, workers : str, int, optional
+        As of `run_many`.
+
+    Raises
+    ------
+    InputError
+        Where the cluster cannot be used, or ``workers`` is below one.
+    """
     if workers is not None and workers < 1:
         raise InputError(f"--workers must be at least 1; got {workers}")
-    tell = report or (lambda _stage, _done, _total: None)
-    seeds = np.random.SeedSequence(seed).spawn(len(inputs))
-    count = min(workers or len(os.sched_getaffinity(0)), len(inputs))
+    count = min(workers or len(os.sched_getaffinity(0)), most)
     if cluster is None and count <= 1:
-        return list(_here(task, list(zip(inputs, seeds, strict=True)), tell))
+        yield Crew(None)
+        return
     with _processes(count) if cluster is None else _dask(cluster) as executor:
-        return _gather(executor, task, list(zip(inputs, seeds, strict=True)), tell)
+        yield Crew(executor)
 
 
 def _run(

@@ -31,11 +31,11 @@ def calibration_change(case: Case) -> Testimony:
     cov = cov + 2.0 * moved @ moved.T
     scale = np.sqrt(np.diagonal(spread @ spread.T))
     change, cov = change / scale, cov / scale[:, None] / scale
-    tests = [_distance(change, cov, [block]) for block in result.blocks]
+    tests = [distance(change, cov, [block]) for block in result.blocks]
     kinds = list(dict.fromkeys(block.parameter for block in result.blocks))
     of_kind = {kind: [b for b in result.blocks if b.parameter == kind] for kind in kinds}
-    joint = {kind: _distance(change, cov, blocks) for kind, blocks in of_kind.items()}
-    whole = _distance(change, cov, list(result.blocks))
+    joint = {kind: distance(change, cov, blocks) for kind, blocks in of_kind.items()}
+    whole = distance(change, cov, list(result.blocks))
     every = [*tests, *joint.values(), whole]
     speaks = holm([log_p for _, _, log_p in every], WITNESS_BUDGET)
     said = [(t, yes and t[0] > TOLERATED * t[1]) for t, yes in zip(every, speaks, strict=True)]
@@ -62,8 +62,16 @@ def calibration_change(case: Case) -> Testimony:
     return Testimony(tuple(findings), factor=np.full(len(case.pose_cov), excess))
 
 
-def _distance(change: Array, cov: Array, blocks: list[Block]) -> tuple[float, int, float]:
-    """Return chi square, degrees of freedom, and logarithm of its probability."""
+def distance(change: Array, cov: Array, blocks: list[Block]) -> tuple[float, int, float]:
+    """Return chi square of some blocks' change, its degrees of freedom and log probability.
+
+    Parameters
+    ----------
+    change : ndarray, shape (dimension,)
+        In sigmas of the prior.
+    cov : ndarray, shape (dimension, dimension)
+        Of it; directions of less than `SAID` say nothing.
+    """
     rows = np.concatenate([np.arange(len(change))[block.columns] for block in blocks])
     own = cov[np.ix_(rows, rows)]
     value, vector = np.linalg.eigh(0.5 * (own + own.T))

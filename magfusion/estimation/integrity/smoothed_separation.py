@@ -175,6 +175,9 @@ def _linear(
         step = difference(graph.declared, estimate.calibration, graph.blocks)
         normal.corner += whitening.T @ whitening
         normal.right_border[:, 0] -= whitening.T @ (whitening @ step)
+        if graph.shift is not None:
+            by = graph.shift.by_considered
+            normal.right_border[:, 1 : 1 + by.shape[1]] += whitening.T @ (whitening @ by)
     for rows in _native_rows(graph, estimate, spread, size):
         normal.add(*rows)
     states, fields = states_in(estimate.values), None

@@ -101,7 +101,7 @@ class _LogMoment(BeaconParameter, SiteParameter):
 class _OfDrive(BeaconParameter):
     """A parameter of the log's own: some entries of an array that the calibration holds."""
 
-    of_log = factor_of_phasor = True
+    of_log = each_log = factor_of_phasor = True
     attribute: ClassVar[str]
 
     def mine(self, site: Site, owner: str) -> BoolArray:

@@ -130,6 +130,7 @@ class Parameter:
     negligible: ClassVar[float] = 0.0
     declared: ClassVar[bool] = False  # whether the site's file has its value and its sigma
     of_log: ClassVar[bool] = False  # whether it is the log's own, only recorded with the site
+    each_log: ClassVar[bool] = False  # whether every log has a value of its own, declared or not
     steady_only: ClassVar[bool] = False  # whether only the steady field determines it
     factor_of_phasor: ClassVar[bool] = False  # its Jacobian is the phasor but for a factor
     inertial: ClassVar[bool] = False  # whether it corrects the inertial stream

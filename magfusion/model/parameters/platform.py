@@ -106,7 +106,7 @@ class _TimeOffset(Parameter):
     unit, spoken = SECOND, MILLISECOND
     words = by_turning = "the IMU's time offset"
     negligible = 1e-4
-    declared = True
+    declared = each_log = True
 
     def sigma(self, site: Site, owner: str) -> Array:
         return np.array([site.platform.imu.time_offset_sigma])
@@ -141,7 +141,7 @@ class _ClockRate(Parameter):
     unit = spoken = PPM
     words = by_turning = "the rate of the IMU's clock"
     negligible = 1e-7
-    declared = True
+    declared = each_log = True
 
     def sigma(self, site: Site, owner: str) -> Array:
         imu = site.platform.imu

@@ -1,0 +1,122 @@
+"""Whether the logs of one site agree: each against what the survey and all the others say."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.estimation.integrity.priors_of_log import TOLERATED, distance
+from magfusion.estimation.integrity.statistics import WITNESS_BUDGET, holm, sigmas
+from magfusion.estimation.joint import Known, Said, Shared, known_by
+from magfusion.model.parameters import BeaconParameter
+from magfusion.model.trust import Finding
+from magfusion.units import Array
+
+NAMED = 3  # parameters in a sentence
+
+
+class Agreement(NamedTuple):
+    """What logs say of each other.
+
+    Parameters
+    ----------
+    of_log : tuple of tuple of Finding
+        Of each log: none, or that it contradicts the others.
+    excess : float
+        By what variances are too small, one where they agree.
+    sigmas : ndarray, shape (logs,)
+        How far each log is from the others, all in all, in sigmas of chance.
+    """
+
+    of_log: tuple[tuple[Finding, ...], ...]
+    excess: float
+    sigmas: Array
+
+
+class _Distance(NamedTuple):
+    """Chi square, freedom and log probability of each block, then of all together."""
+
+    tests: list[tuple[float, int, float]]
+    by_block: list[float]  # largest change, in its own sigmas
+
+
+def agreement(
+    shared: Shared, logs: Sequence[Said], names: Sequence[str], joint: Known
+) -> Agreement:
+    """Test every log against the others; name those that contradict, the farthest first.
+
+    A log that contradicts the others makes each of them contradict the rest: once it is named, the
+    others are tried without it.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of the logs, as findings have them.
+    joint : Known
+        By all logs.
+    """
+    pool, excess = list(range(len(logs))), 1.0
+    findings: list[tuple[Finding, ...]] = [() for _ in logs]
+    first = [_distance(shared, logs, pool, i, joint) for i in pool]
+    found = dict(zip(pool, first, strict=True))
+    while len(pool) > 1:
+        tests = [test for i in pool for test in found[i].tests]
+        speaks = holm([log_p for _, _, log_p in tests], WITNESS_BUDGET)
+        loud = [s and t[0] > TOLERATED * t[1] for t, s in zip(tests, speaks, strict=True)]
+        each = len(found[pool[0]].tests)
+        said = {i: loud[k * each : (k + 1) * each] for k, i in enumerate(pool)}
+        if not any(loud):
+            break
+        worst = min((i for i in pool if any(said[i])), key=lambda i: _least(found[i]))
+        ratios = [
+            t[0] / t[1] for t, yes in zip(found[worst].tests, said[worst], strict=True) if yes
+        ]
+        excess = max(excess, *ratios)
+        other = [names[i] for i in pool if i != worst]
+        findings[worst] = (_finding(shared, names[worst], other, found[worst]),)
+        pool.remove(worst)
+        found = {i: _distance(shared, logs, pool, i, joint) for i in pool}
+    far = np.array([float(sigmas(one.tests[-1][2])) for one in first])
+    return Agreement(tuple(findings), excess, far)
+
+
+def _least(one: _Distance) -> float:
+    return min(log_p for _, _, log_p in one.tests)
+
+
+def _distance(
+    shared: Shared, logs: Sequence[Said], pool: list[int], which: int, joint: Known
+) -> _Distance:
+    """Return how far a log takes the calibration from what the others of a pool make of it."""
+    every = known_by(shared, [logs[i] for i in pool], joint.step)
+    others = known_by(shared, [logs[i] for i in pool if i != which], joint.step)
+    none = np.zeros((len(joint.step), joint.by_common.shape[1]))
+    before = others.by_common if others.by_common.shape[1] else none
+    moved = every.by_common - before
+    cov = others.cov - every.cov + moved @ moved.T + every.apart + others.apart
+    scale = np.sqrt(np.diagonal(others.cov))
+    change, cov = (every.step - others.step) / scale, cov / scale[:, None] / scale
+    tests = [distance(change, cov, [block]) for block in shared.blocks]
+    tests.append(distance(change, cov, list(shared.blocks)))
+    sure = np.abs(change) / np.sqrt(np.maximum(np.diagonal(cov), 1e-4))
+    return _Distance(tests, [float(np.max(sure[b.columns])) for b in shared.blocks])
+
+
+def _finding(shared: Shared, name: str, others: list[str], one: _Distance) -> Finding:
+    blocks = shared.blocks
+    order = sorted(range(len(blocks)), key=lambda k: one.tests[k][2])[:NAMED]
+    amounts = ", ".join(f"{blocks[k].name} by {one.by_block[k]:.1f} sigma" for k in order)
+    square, freedom, _ = one.tests[-1]
+    first = blocks[order[0]]
+    cause = (
+        f"beacon {first.owner} was moved or its drive changed"
+        if isinstance(first.parameter, BeaconParameter)
+        else "the magnetometer, its mounting or what is about it changed"
+    )
+    whom = f"log {others[0]}" if len(others) == 1 else "the other logs"
+    text = (
+        f"Log {name} contradicts {whom}: it takes {amounts} from where {whom} and the survey have"
+        f" them (all together a chi square of {square:.3g} on {freedom}). Probably {cause} between"
+        " the logs: refine the site by the logs before and after apart."
+    )
+    return Finding("logs_disagree", text, weight=float(sigmas(_least(one))))

@@ -1,0 +1,80 @@
+"""What a job keeps of a part that is done, for another run that asks for the same."""
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from magfusion.files.atomic import whole_file
+
+PIECE = 1 << 24  # bytes read at once
+ENDS = 1 << 22  # bytes at either end of a large file, which tell it from others
+LARGE = 1 << 30  # bytes, from which only those are read
+
+
+AnyArray = np.ndarray[Any, Any]
+
+
+class Kept(NamedTuple):
+    """Arrays and plain facts of what was done."""
+
+    arrays: Mapping[str, AnyArray]
+    facts: dict[str, Any]
+
+
+def save_kept(path: Path, key: str, kept: Kept) -> None:
+    """Write what was done.
+
+    Parameters
+    ----------
+    key : str
+        Of all that made it.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    facts = np.array(json.dumps({"key": key, "facts": kept.facts}))
+    with whole_file(path) as unfinished, unfinished.open("wb") as file:
+        np.savez(file, allow_pickle=False, facts=facts, **kept.arrays)
+
+
+def load_kept(path: Path, key: str) -> Kept | None:
+    """Return what was done with the same key; None where there is nothing, or it cannot be read."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            told = json.loads(str(file["facts"]))
+            if told["key"] != key:
+                return None
+            return Kept({k: file[k] for k in file.files if k != "facts"}, told["facts"])
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile):
+        return None
+
+
+def digest_of_files(paths: Iterable[Path], *, without: frozenset[str] = frozenset()) -> str:
+    """Return a digest of the content of files, and of all files in directories.
+
+    Parameters
+    ----------
+    without : set of str
+        Names of files that do not count.
+    """
+    every: list[tuple[str, Path]] = []
+    for path in paths:
+        if path.is_dir():
+            own = sorted(p for p in path.rglob("*") if p.is_file() and p.name not in without)
+            every += [(str(p.relative_to(path)), p) for p in own]
+        elif path.is_file():
+            every.append(("", path))
+    digest = hashlib.sha256()
+    for name, path in every:
+        size = path.stat().st_size
+        digest.update(f"{name}\0{size}\0".encode())
+        with path.open("rb") as file:
+            if size > LARGE:
+                digest.update(file.read(ENDS))
+                file.seek(size - ENDS)
+            while piece := file.read(PIECE):
+                digest.update(piece)
+    return digest.hexdigest()

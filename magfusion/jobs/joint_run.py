@@ -1,0 +1,276 @@
+"""Several logs of one site: each alone, then rounds until all have one calibration, then the last.
+
+What is done of a log alone is kept in the output, by what made it; the rounds go on from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.batch import SmootherSettings
+from magfusion.estimation.integrity.logs_agree import Agreement, agreement
+from magfusion.estimation.joint import Known, Shared, apart_in_sigmas, known_by, uncoupled
+from magfusion.estimation.joint_log import OfLog
+from magfusion.files.atomic import real
+from magfusion.files.kept import digest_of_files
+from magfusion.jobs.inputs import KEPT, Job, read_site
+from magfusion.jobs.joint_kept import Alone
+from magfusion.jobs.joint_tasks import (
+    LastTask,
+    LogTask,
+    RoundTask,
+    alone,
+    last,
+    one_round,
+    shared_of,
+)
+from magfusion.model.progress import Report
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Risk, Trust, Verdict
+from magfusion.results.provenance import versions
+from magfusion.simulation.monte_carlo import Crew, crew
+
+SETTLED = 1e-6  # sigmas; a step of the shared calibration that ends the rounds
+MOST_ROUNDS = 20
+UNSETTLED = 0.1  # sigmas that the last round may have moved it by
+_SITE_FILES = ("site.yaml", "site_field_map.parquet", "site_correlation.parquet")
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """What several logs made of one site.
+
+    Parameters
+    ----------
+    known : Known
+        Of the shared calibration.
+    excess : float
+        By what its variances are too small, as the logs contradict each other.
+    logs : tuple of OfLog
+        Those that took part.
+    table : list of dict
+        A row for each log that was given.
+    """
+
+    shared: Shared
+    known: Known
+    excess: float
+    logs: tuple[OfLog, ...]
+    table: list[dict[str, Any]]
+    trust: Trust
+    rounds: int
+
+
+def tasks_of(jobs: Sequence[Job], smoother: SmootherSettings, output: Path) -> list[LogTask]:
+    """Return the tasks of some logs, once it is clear that they are different logs of one site.
+
+    Raises
+    ------
+    InputError
+    """
+    site = _one_site(jobs, smoother)
+    names, seen = _names([job.log_path for job in jobs]), dict[str, Path]()
+    tasks = []
+    for job, name in zip(jobs, names, strict=True):
+        content = digest_of_files([job.log_path], without=frozenset(_SITE_FILES))
+        if content in seen:
+            raise InputError(
+                f"{job.log_path}: is the same log as {seen[content]}, and would count twice; give"
+                " each log once"
+            )
+        seen[content] = job.log_path
+        made_by = repr((content, site, job.start, job.end, job.topics, smoother, versions()))
+        key = _digest(made_by)
+        place = real(output) / KEPT
+        own = replace(job, output=place / name)
+        tasks.append(LogTask(name, own, smoother, place / f"{name}.npz", key))
+    return tasks
+
+
+def _digest(text: str) -> str:
+    import hashlib
+
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _one_site(jobs: Sequence[Job], smoother: SmootherSettings) -> str:
+    """Return the digest of the one site of several logs."""
+    found = {}
+    for job in jobs:
+        path = job.declared_path
+        read_site(job)
+        beside = [path.with_name(name) for name in _SITE_FILES[1:]]
+        found[digest_of_files([path, *beside])] = path
+    if len(found) > 1:
+        first, other = list(found.values())[:2]
+        raise InputError(
+            f"{other}: differs from {first}; logs that refine one site share its file: give it with"
+            " --site SITE.yaml"
+        )
+    shared = shared_of(read_site(jobs[0]), smoother)
+    if smoother.coupling == "loose" or not shared.blocks:
+        raise InputError(
+            f"{jobs[0].declared_path}: the logs have nothing to refine together, as nothing of the"
+            " calibration is estimated that they share; declare how well the survey is known, leave"
+            " --coupling tight and --estimate as they are, or smooth each log on its own"
+        )
+    return next(iter(found))
+
+
+def _names(paths: list[Path]) -> list[str]:
+    """Return a name for each log: its own, with those of directories above where others have it."""
+    parts = [real(path).with_suffix("").parts[1:] for path in paths]
+    most = max(len(p) for p in parts)
+    for count in range(1, most + 1):
+        names = ["_".join(p[-count:]) for p in parts]
+        if len(set(names)) == len(names):
+            return names
+    return [f"{name}_{i + 1}" for i, name in enumerate(names)]
+
+
+def refine(
+    tasks: list[LogTask],
+    *,
+    cluster: str | None,
+    workers: int | None,
+    writes: bool,
+    imu_rate: bool = False,
+    risk: Risk | None = None,
+    report: Report,
+) -> Joint:
+    """Refine one site by all logs together.
+
+    Parameters
+    ----------
+    writes : bool
+        Whether the trajectory of each log is written, to its job's output.
+
+    Raises
+    ------
+    InputError
+        Where a log cannot be used, or the cluster not be reached.
+    EstimationError
+        Where no log is left.
+    """
+    site = _declared(tasks)
+    shared = shared_of(site, tasks[0].smoother)
+    with crew(len(tasks), cluster=cluster, workers=workers) as hands:
+        first = hands.run(alone, tasks, report=_staged(report, "smoothing each log alone"))
+        some = [
+            (task, one.log)
+            for task, one in zip(tasks, first, strict=True)
+            if one.log is not None and one.facts["verdict"] != Verdict.FAILED
+        ]
+        if not some:
+            raise EstimationError(
+                f"none of the {len(tasks)} logs can be used: {tasks[0].name}:"
+                f" {first[0].facts['reason']}"
+            )
+        used = [task for task, _ in some]
+        logs, known, moved, rounds = _rounds(hands, used, [log for _, log in some], shared, report)
+        agreed = agreement(shared, [log.said for log in logs], [t.name for t in used], known)
+        given = [
+            LastTask(one, agreed.excess, said, writes, imu_rate, risk)
+            for one, said in zip(
+                _round_tasks(used, logs, shared, known), agreed.of_log, strict=True
+            )
+        ]
+        rows = hands.run(last, given, report=_staged(report, "each log in the joint solution"))
+    of_used = {t.name: row for t, row in zip(used, rows, strict=True)}
+    far = {t.name: float(s) for t, s in zip(used, agreed.sigmas, strict=True)}
+    table = [
+        _row(task, one.facts, of_used.get(task.name), far.get(task.name))
+        for task, one in zip(tasks, first, strict=True)
+    ]
+    trust = _trust(table, agreed, _unheard(site, first), moved)
+    return Joint(shared, known, agreed.excess, tuple(logs), table, trust, rounds)
+
+
+def _declared(tasks: list[LogTask]) -> Site:
+    """Return the site, with nothing that joins what is shared to what is each log's own."""
+    site = read_site(tasks[0].job)
+    return uncoupled(site, shared_of(site, tasks[0].smoother).blocks)
+
+
+def _staged(report: Report, stage: str) -> Report:
+    return lambda _stage, done, total: report(stage, done, total)
+
+
+def _round_tasks(
+    tasks: list[LogTask], logs: list[OfLog], shared: Shared, known: Known
+) -> list[RoundTask]:
+    said = [log.said for log in logs]
+    return [
+        RoundTask(task, log, shared, known_by(shared, said[:i] + said[i + 1 :], known.step))
+        for i, (task, log) in enumerate(zip(tasks, logs, strict=True))
+    ]
+
+
+def _rounds(
+    hands: Crew, tasks: list[LogTask], logs: list[OfLog], shared: Shared, report: Report
+) -> tuple[list[OfLog], Known, float, int]:
+    """Repeat until no log takes the shared calibration elsewhere."""
+    at = np.mean([log.said.step for log in logs], axis=0)
+    known = known_by(shared, [log.said for log in logs], at)
+    moved = np.inf
+    for done in range(MOST_ROUNDS):
+        report("refining together", done, MOST_ROUNDS)
+        logs = hands.run(one_round, _round_tasks(tasks, logs, shared, known))
+        after = known_by(shared, [log.said for log in logs], known.step)
+        moved, known = apart_in_sigmas(after.step, known.step, after.cov), after
+        if moved < SETTLED:
+            return logs, known, moved, done + 1
+    return logs, known, moved, MOST_ROUNDS
+
+
+def _unheard(site: Site, first: Sequence[Alone]) -> list[str]:
+    heard = {name for one in first for name in one.facts.get("heard", ())}
+    return [beacon.name for beacon in site.beacons if beacon.name not in heard]
+
+
+def _row(
+    task: LogTask, before: dict[str, Any], after: dict[str, Any] | None, far: float | None
+) -> dict[str, Any]:
+    """Return the row of a log: in the joint solution, and beside it what it was alone."""
+    row: dict[str, Any] = {"log": task.name, "path": str(task.job.log_path), "used": "yes"}
+    if after is None:
+        return row | {"used": "no", **{k: before[k] for k in ("verdict", "code", "reason")}}
+    row |= after
+    row["from_others_sigma"] = far
+    kept = ("verdict", "position_sigma_m", "attitude_sigma_deg", "aligned_ate_m", "ate_m")
+    return row | {f"alone_{key}": before[key] for key in kept if key in before}
+
+
+def _trust(
+    table: list[dict[str, Any]], agreed: Agreement, unheard: list[str], moved: float
+) -> Trust:
+    """Return the verdict on all: what the logs say of each other, then what is said of each."""
+    found = [finding for said in agreed.of_log for finding in said]
+    contradicted = {finding.text for finding in found}
+    for row in table:
+        if row["used"] == "no":
+            text = f"Log {row['log']} has no part in this, as it failed alone: {row['reason']}"
+            found.append(Finding("log_left_out", text, weight=100.0))
+        elif row["code"] and row["reason"] not in contradicted:
+            text = f"Log {row['log']}: {row['reason']}"
+            verdict = Verdict.DOUBTFUL  # of all; each log has its own
+            found.append(Finding(row["code"], text, verdict))
+    for name in unheard:
+        text = (
+            f"None of the logs hears beacon {name}: the site says of it what it said before. Were"
+            " these logs made there?"
+        )
+        found.append(Finding("silent_beacon", text, weight=50.0))
+    if not moved < UNSETTLED:
+        text = (
+            f"The logs did not settle on one calibration: the last of {MOST_ROUNDS} rounds still"
+            f" moved it by {moved:.2g} sigma. Leave out the log that is farthest from the others."
+        )
+        found.append(Finding("not_converged", text))
+    return Trust(tuple(found))

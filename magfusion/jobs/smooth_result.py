@@ -1,0 +1,168 @@
+"""The result of a smoothed log: judged, with its figures, and written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.between_epochs import at_imu_rate
+from magfusion.estimation.integrity.diagnosis import with_cause
+from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.smoothed_exclusion import (
+    separated_smooth,
+    states_between,
+    states_judged,
+)
+from magfusion.estimation.self_survey import Placement
+from magfusion.files.site import save_site
+from magfusion.files.trajectory_table import write_trajectory
+from magfusion.files.tum import write_tum
+from magfusion.jobs.failure import reason_of
+from magfusion.jobs.inputs import found_in
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Risk, StateTrust, Trust
+from magfusion.results.errors import TrajectoryErrors, trajectory_errors
+from magfusion.results.figures import Column, Figure, Figures, Section, heading
+from magfusion.results.page_motion import Motion
+from magfusion.results.recording import write_recording
+from magfusion.results.refinement import result_site
+from magfusion.results.report import (
+    compared_with_truth,
+    error_figures,
+    placement_figures,
+    smoothed_figures,
+    where_found,
+    write_report,
+)
+from magfusion.results.verdict import level_figures, trust_figures
+from magfusion.units import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Finished:
+    """A smoothed log with its verdict.
+
+    Parameters
+    ----------
+    states : StateTrust
+        Of each of its states.
+    figures : Figures
+        Without those of the truth.
+    errors : TrajectoryErrors, optional
+    """
+
+    result: Smoothed
+    trust: Trust
+    states: StateTrust
+    figures: Figures
+    errors: TrajectoryErrors | None
+
+
+def finished(
+    log: Log,
+    site: Site,
+    settings: SmootherSettings,
+    result: Smoothed,
+    risk: Risk | None,
+    *,
+    excess: float = 1.0,
+    said: tuple[Finding, ...] = (),
+) -> Finished:
+    """Judge a smoothed log.
+
+    Parameters
+    ----------
+    excess : float
+        By what the variances of its poses are too small, as other logs have it.
+    said : tuple of Finding
+        By other logs.
+    """
+    separated = separated_smooth(result, risk)
+    result, trust = judged(separated.result, log)
+    if excess > 1.0 and result.states.pose_cov is not None:
+        wider = excess * result.states.pose_cov
+        result = replace(result, states=replace(result.states, pose_cov=wider))
+    trust = with_cause(trust | separated.trust | Trust(said), log, site, settings.lockin)
+    by_state = states_judged(separated, result, trust.verdict)
+    figures = (
+        heading("smooth", log.name)
+        | trust_figures(trust)
+        | Figures(where_found("coupling", settings.coupling != "tight", settings.coupling))
+    )
+    figures |= smoothed_figures(result) | level_figures(by_state)
+    return Finished(result, trust, by_state, figures, None)
+
+
+def with_errors(
+    done: Finished,
+    log: Log,
+    placed: tuple[Placement, ...] = (),
+    fixed: tuple[Site, SmootherSettings] | None = None,
+) -> Finished:
+    """Return a result with its errors against the truth, where there is one.
+
+    Parameters
+    ----------
+    fixed : Site and SmootherSettings, optional
+        With which the log is smoothed once more, its survey fixed: what estimating it was worth.
+    """
+    result = done.result
+    errors, compared = compared_with_truth(result.states, log)
+    figures = done.figures | compared | placement_figures(placed, result.calibration.site)
+    if errors is not None and not placed and fixed is not None:
+        figures |= _fixed_survey_figures(log, *fixed, result)
+    return replace(done, figures=figures, errors=errors)
+
+
+def write_finished(whole: Path, log: Log, done: Finished, *, imu_rate: bool) -> None:
+    """Write all files of a smoothed log: below `FAILED` where its verdict is that."""
+    result, by_state = done.result, done.states
+    refined, innovations = result_site(result, log.name), _innovations(result)
+    written = at_imu_rate(result, log) if imu_rate else result.states
+    directory = found_in(whole, done.trust)
+    write_tum(written, directory / "trajectory.tum", log.epoch_ns)
+    rows = states_between(by_state, result.states, written)
+    write_trajectory(written, directory / "trajectory.parquet", log.epoch_ns, rows)
+    save_site(refined, directory / "site.yaml")
+    write_recording(
+        directory / "run.rrd",
+        refined,
+        result.states,
+        truth=log.truth,
+        errors=done.errors,
+        innovations=innovations,
+        trust=done.trust,
+        states=by_state,
+    )
+    motion = Motion(refined, result.states, log.truth, done.errors, innovations, by_state)
+    write_report(whole, done.figures, motion)
+
+
+def _innovations(result: Smoothed) -> dict[str, tuple[Array, Array]]:
+    channels = result.fields.channels
+    found = {}
+    for name in dict.fromkeys(beacon for beacon, _ in channels):
+        own = result.residual[:, [beacon == name for beacon, _ in channels]]
+        seen = np.isfinite(own).all(axis=(1, 2))
+        if np.any(seen):
+            found[name] = (result.fields.time[seen], np.sqrt(np.mean(own[seen] ** 2, axis=(1, 2))))
+    return found
+
+
+def _fixed_survey_figures(
+    log: Log, site: Site, settings: SmootherSettings, result: Smoothed
+) -> Figures:
+    """Return the errors with the calibration as surveyed: what estimating it was worth."""
+    kept = ("phase", "time-offset")
+    if all(block.group in kept for block in result.blocks):
+        return Figures()
+    try:
+        fixed = smooth(log, site, replace(settings, estimate=kept))
+    except RuntimeError as error:
+        return Figures(Figure("held_failed", reason_of(error), section=Section.REPORT))
+    assert log.truth is not None
+    return error_figures(trajectory_errors(fixed.states, log.truth), Column.FIXED, "held_")
