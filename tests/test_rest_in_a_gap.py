@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from magfusion.estimation.batch import Smoothed, smooth
-from magfusion.estimation.prepared import LONGEST_STEP
 from magfusion.estimation.between_epochs import at_imu_rate
 from magfusion.estimation.navigator import Navigator
+from magfusion.estimation.prepared import LONGEST_STEP
 from magfusion.estimation.state import as_trajectory
 from magfusion.model.samples import Log, Waveform
 from magfusion.model.trajectory import Trajectory

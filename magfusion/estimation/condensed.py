@@ -81,8 +81,11 @@ def condensed(
     site, size = graph.declared.site, dimension(graph.blocks)
     uncertain = placed((*considered, *errors))
     spread = prior_sqrt_covariance(site, uncertain)
-    system = replace(graph, declared=None).beside(
-        estimate, uncertain, spread, graph.by_considered(spread), explaining=True
+    alone = replace(graph, declared=None)
+    system = (
+        alone.beside(estimate, uncertain, spread, graph.by_considered(spread), explaining=True)
+        if uncertain
+        else alone.linearized(estimate)
     )
     _, rest = eliminate_partial(system, _all_but_the_calibration(graph))
     order = gtsam.Ordering()

@@ -113,6 +113,16 @@ def known_by(shared: Shared, logs: Sequence[Said], at: Array) -> Known:
     return Known(step, cov, cov @ by_common, cov @ apart @ cov)
 
 
+def between(shared: Shared, old: Said, new: Said, share: float) -> Said:
+    """Return what a log says, changed by a share of its change only, taken where it is new."""
+    if share == 1.0:
+        return new
+    here, there = shared.moved(new.step), shared.moved(old.step)
+    before = vars(taken_at(old.part, there, here, shared.blocks))
+    part = {k: share * v + (1.0 - share) * before[k] for k, v in vars(new.part).items()}
+    return Said(new.step, Condensed(**part))
+
+
 def apart_in_sigmas(one: Array, other: Array, cov: Array) -> float:
     """Return the root mean square of a difference, over all directions, in sigmas of each."""
     scale = np.sqrt(np.diagonal(cov))

@@ -15,11 +15,11 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.batch import SmootherSettings
 from magfusion.estimation.integrity.logs_agree import Agreement, agreement
-from magfusion.estimation.joint import Known, Shared, apart_in_sigmas, known_by, uncoupled
+from magfusion.estimation.joint import Known, Shared, apart_in_sigmas, between, known_by, uncoupled
 from magfusion.estimation.joint_log import OfLog
 from magfusion.files.atomic import real
 from magfusion.files.kept import digest_of_files
-from magfusion.jobs.inputs import KEPT, Job, read_site
+from magfusion.jobs.inputs import KEPT, Job, read_job, read_site
 from magfusion.jobs.joint_kept import Alone
 from magfusion.jobs.joint_tasks import (
     LastTask,
@@ -38,6 +38,8 @@ from magfusion.simulation.monte_carlo import Crew, crew
 
 SETTLED = 1e-6  # sigmas; a step of the shared calibration that ends the rounds
 MOST_ROUNDS = 20
+LARGE = 0.5  # sigmas; rounds that move it by more, and by more each time, are held back
+SMALLEST_SHARE = 0.25
 UNSETTLED = 0.1  # sigmas that the last round may have moved it by
 _SITE_FILES = ("site.yaml", "site_field_map.parquet", "site_correlation.parquet")
 
@@ -74,6 +76,9 @@ def tasks_of(jobs: Sequence[Job], smoother: SmootherSettings, output: Path) -> l
     ------
     InputError
     """
+    for job in jobs:
+        if not job.log_path.exists():
+            read_job(job)  # which says so
     site = _one_site(jobs, smoother)
     names, seen = _names([job.log_path for job in jobs]), dict[str, Path]()
     tasks = []
@@ -215,17 +220,28 @@ def _round_tasks(
 def _rounds(
     hands: Crew, tasks: list[LogTask], logs: list[OfLog], shared: Shared, report: Report
 ) -> tuple[list[OfLog], Known, float, int]:
-    """Repeat until no log takes the shared calibration elsewhere."""
+    """Repeat until no log takes the shared calibration elsewhere.
+
+    Where a round moves it farther than the one before, as among logs that contradict each other,
+    what they say is changed by a share only from then on.
+    """
     at = np.mean([log.said.step for log in logs], axis=0)
     known = known_by(shared, [log.said for log in logs], at)
-    moved = np.inf
+    moved, share = np.inf, 1.0
     for done in range(MOST_ROUNDS):
         report("refining together", done, MOST_ROUNDS)
-        logs = hands.run(one_round, _round_tasks(tasks, logs, shared, known))
+        solved = hands.run(one_round, _round_tasks(tasks, logs, shared, known))
+        logs = [
+            replace(new, said=between(shared, old.said, new.said, share))
+            for old, new in zip(logs, solved, strict=True)
+        ]
         after = known_by(shared, [log.said for log in logs], known.step)
-        moved, known = apart_in_sigmas(after.step, known.step, after.cov), after
+        before, moved = moved, apart_in_sigmas(after.step, known.step, after.cov) / share
+        known = after
         if moved < SETTLED:
             return logs, known, moved, done + 1
+        if moved > before and moved > LARGE and done:
+            share = max(0.5 * share, SMALLEST_SHARE)
     return logs, known, moved, MOST_ROUNDS
 
 

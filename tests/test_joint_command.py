@@ -1,0 +1,138 @@
+"""magfusion smooth LOGS, calibrate log LOGS: one site by several logs, its table, its refusals."""
+
+import csv
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import Refuse, run_command
+from test_joint import log_of, surveyed
+
+from magfusion.files.kept import digest_of_files
+from magfusion.files.log import write_log
+from magfusion.files.site import load_site, save_site
+from magfusion.simulation.log import perturb_site
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a directory of two logs of one site, and its file."""
+    root = tmp_path_factory.mktemp("recorded")
+    true = perturb_site(surveyed(), np.random.default_rng(5))
+    save_site(surveyed(), root / "site.yaml")
+    for which in range(2):
+        write_log(log_of(true, which), root / f"log{which}")
+    return root
+
+
+def given(recorded: Path, *names: str) -> list[Path | str]:
+    return [*(recorded / name for name in names), "--site", recorded / "site.yaml"]
+
+
+@pytest.fixture(scope="module")
+def calibrated(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    output = tmp_path_factory.mktemp("calibrated") / "out"
+    run_command(
+        *("calibrate", "log", *given(recorded, "log0", "log1")), "-o", output, "--workers", 1
+    )
+    return output
+
+
+@pytest.mark.slow
+def test_two_logs_make_one_site_and_one_table(calibrated: Path) -> None:
+    names = {path.name for path in calibrated.iterdir()}
+    assert names == {
+        *("site.yaml", "site_correlation.parquet", "calibration.png"),
+        *("report.json", "report.html", "logs.csv", "kept"),
+    }
+    report: dict[str, Any] = json.loads((calibrated / "report.json").read_text())
+    assert report["job"] == "calibrate log"
+    assert report["log"] == "log0, log1"
+    assert report["verdict"] in ("trustworthy", "doubtful")
+    assert report["logs_used"] == 2
+    with (calibrated / "logs.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    for row, told in zip(rows, report["logs"], strict=True):
+        assert {key: "" if value is None else str(value) for key, value in told.items()} == row
+        assert told["position_sigma_m"] > 0.0
+        assert told["verdict"] in ("trustworthy", "doubtful")
+        assert (told["reason"] == "") == (told["verdict"] == "trustworthy")
+    assert "log1" in (calibrated / "report.html").read_text()
+    before, after = surveyed(), load_site(calibrated / "site.yaml")
+    assert after.calibration is not None
+    assert after.beacons[1].sigma.log_moment[0] < before.beacons[1].sigma.log_moment[0]
+    # Of the IMU's clock each log has its own, and the site keeps what it declared.
+    assert after.platform.imu.time_offset == before.platform.imu.time_offset
+    assert after.platform.imu.time_offset_sigma == before.platform.imu.time_offset_sigma
+
+
+@pytest.mark.slow
+def test_a_rerun_takes_up_what_is_done_and_what_made_it(
+    recorded: Path, calibrated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = shutil.copytree(calibrated, tmp_path / "out")
+    before = json.loads((output / "report.json").read_text())
+
+    def never(*_arguments: object, **_others: object) -> None:
+        raise AssertionError("smoothed again")
+
+    monkeypatch.setattr("magfusion.jobs.joint_tasks.smooth", never)
+    again = ("calibrate", "log", *given(recorded, "log0", "log1"), "-o", output, "--workers", 1)
+    run_command(*again)
+    after = json.loads((output / "report.json").read_text())
+    assert after.pop("elapsed_s") != before.pop("elapsed_s")
+    assert after == before
+    with pytest.raises(AssertionError, match="smoothed again"):
+        run_command(*again, "--end", 2.9)
+
+
+def test_logs_that_cannot_be_refined_together_are_refused(
+    recorded: Path, tmp_path: Path, refuse: Refuse
+) -> None:
+    out = ("-o", tmp_path / "out")
+    command = ("calibrate", "log", *given(recorded, "log0", "log1"), *out)
+    twice = refuse("smooth", *given(recorded, "log0", "log0"), *out)
+    assert "is the same log as" in twice
+    copied = shutil.copytree(recorded / "log0", tmp_path / "another")
+    assert "is the same log as" in refuse(
+        "smooth", recorded / "log0", copied, "--site", recorded / "site.yaml", *out
+    )
+    for which in range(2):
+        shutil.copytree(recorded / f"log{which}", tmp_path / f"log{which}")
+        site = surveyed()
+        save_site(
+            replace(site, gravity=site.gravity + 0.001 * which), tmp_path / f"log{which}/site.yaml"
+        )
+    other = refuse("calibrate", "log", tmp_path / "log0", tmp_path / "log1", *out)
+    assert "share its file: give it with --site" in other
+    assert "divides one log" in refuse(*command, "--cross-validate", 2)
+    assert "nothing to refine together" in refuse(*command, "--estimate", "none")
+    assert "nothing to refine together" in refuse(*command, "--estimate", "phase,time-offset")
+    loose = ("smooth", *given(recorded, "log0", "log1"), "--coupling", "loose", *out)
+    assert "nothing to refine together" in refuse(*loose)
+    one = ("smooth", *given(recorded, "log0"), *out)
+    assert "one log was given" in refuse(*one, "--workers", 2)
+    assert "none" in refuse("smooth", *given(recorded, "log0", "none"), *out)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").write_text("mine")
+    assert "holds other files" in refuse(*command[:-1], tmp_path / "full")
+
+
+def test_a_digest_sees_content_and_names_but_not_places(tmp_path: Path) -> None:
+    for place, names in (("a", "xy"), ("b", "xy"), ("c", "xz")):
+        (tmp_path / place).mkdir()
+        for name in names:
+            (tmp_path / place / name).write_text(name.replace("z", "y"))
+    a, b, c = (digest_of_files([tmp_path / place]) for place in "abc")
+    assert a == b != c
+    x = frozenset("x")
+    assert digest_of_files([tmp_path / "a"], without=x) != a
+    (tmp_path / "b" / "x").write_text("other")
+    assert digest_of_files([tmp_path / "b"]) != a
+    assert digest_of_files([tmp_path / "b"], without=x) == digest_of_files(
+        [tmp_path / "a"], without=x
+    )
