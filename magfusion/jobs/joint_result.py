@@ -14,6 +14,7 @@ from magfusion.files.row_table import write_rows
 from magfusion.files.site import save_site
 from magfusion.jobs.inputs import LOGS, LOGS_TABLE, Job, claim, keep_results
 from magfusion.jobs.joint_run import Joint, refine, tasks_of
+from magfusion.jobs.joint_tasks import together_settings
 from magfusion.model.parameters import Calibration
 from magfusion.model.progress import Report
 from magfusion.results.figures import (
@@ -64,7 +65,8 @@ def run_joint(
     writes = command == "smooth"
     claimed = claim(output, *(("smooth", "fix") if writes else (command,)))
     jobs: list[Job] = settings.jobs(output)
-    tasks, began = tasks_of(jobs, smoother, output), time.perf_counter()
+    tasks = tasks_of(jobs, together_settings(smoother), output)
+    began = time.perf_counter()
     joint = refine(
         tasks,
         cluster=settings.cluster,

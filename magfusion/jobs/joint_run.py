@@ -177,9 +177,11 @@ def refine(
                 f"none of the {len(tasks)} logs can be used: {tasks[0].name}:"
                 f" {first[0].facts['reason']}"
             )
-        used = [task for task, _ in some]
-        logs, known, moved, rounds = _rounds(hands, used, [log for _, log in some], shared, report)
-        agreed = agreement(shared, [log.said for log in logs], [t.name for t in used], known)
+        used, logs = [task for task, _ in some], [log for _, log in some]
+        before = _agreement(used, logs, shared)
+        logs, known, moved, rounds = _rounds(hands, used, logs, shared, report)
+        # Held to what the others say, a robust loss soon refuses what says otherwise.
+        agreed = before if any(before.of_log) else _agreement(used, logs, shared)
         given = [
             LastTask(one, agreed.excess, said, writes, imu_rate, risk)
             for one, said in zip(
@@ -215,6 +217,12 @@ def _round_tasks(
         RoundTask(task, log, shared, known_by(shared, said[:i] + said[i + 1 :], known.step))
         for i, (task, log) in enumerate(zip(tasks, logs, strict=True))
     ]
+
+
+def _agreement(tasks: list[LogTask], logs: list[OfLog], shared: Shared) -> Agreement:
+    said = [log.said for log in logs]
+    known = known_by(shared, said, np.mean([one.step for one in said], axis=0))
+    return agreement(shared, said, [task.name for task in tasks], known)
 
 
 def _rounds(

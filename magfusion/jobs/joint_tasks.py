@@ -23,7 +23,7 @@ from magfusion.estimation.joint_log import (
 from magfusion.jobs.failure import reason_of
 from magfusion.jobs.inputs import Job, claim, named, read_job
 from magfusion.jobs.joint_kept import Alone, load_alone, save_alone
-from magfusion.model.parameters import initial_calibration
+from magfusion.model.parameters import GROUPS, initial_calibration
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
@@ -101,6 +101,15 @@ def read_shared(task: LogTask) -> tuple[Log, Site, Shared]:
     log, site = read_job(task.job)
     site = uncoupled(site, shared_blocks(task.smoother.blocks(site)[0]))
     return replace(log, name=task.name), site, shared_of(site, task.smoother)
+
+
+def together_settings(smoother: SmootherSettings) -> SmootherSettings:
+    """Return the settings with which several logs are smoothed.
+
+    What a survey knows well enough for one log, several tell better, and what it is wrong by is the
+    same in all of them: everything that has a sigma is estimated, unless the user says otherwise.
+    """
+    return replace(smoother, estimate=GROUPS) if smoother.estimate is None else smoother
 
 
 def shared_of(site: Site, smoother: SmootherSettings) -> Shared:
