@@ -12,9 +12,13 @@ import pytest
 from conftest import Refuse, run_command
 from test_joint import log_of, surveyed
 
+from magfusion.cli import main
+from magfusion.estimation.integrity.logs_agree import Agreement
 from magfusion.files.kept import digest_of_files
 from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
+from magfusion.jobs.joint_run import trust_of_all
+from magfusion.model.trust import Finding
 from magfusion.simulation.log import perturb_site
 
 
@@ -72,7 +76,11 @@ def test_two_logs_make_one_site_and_one_table(calibrated: Path) -> None:
 
 @pytest.mark.slow
 def test_a_rerun_takes_up_what_is_done_and_what_made_it(
-    recorded: Path, calibrated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recorded: Path,
+    calibrated: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     output = shutil.copytree(calibrated, tmp_path / "out")
     before = json.loads((output / "report.json").read_text())
@@ -86,8 +94,11 @@ def test_a_rerun_takes_up_what_is_done_and_what_made_it(
     after = json.loads((output / "report.json").read_text())
     assert after.pop("elapsed_s") != before.pop("elapsed_s")
     assert after == before
-    with pytest.raises(AssertionError, match="smoothed again"):
-        run_command(*again, "--end", 2.9)
+    capfd.readouterr()
+    with pytest.raises(SystemExit) as ended:
+        main([str(part) for part in (*again, "--end", 2.9)])
+    assert ended.value.code == 1
+    assert "smoothed again" in capfd.readouterr().err
 
 
 def test_logs_that_cannot_be_refined_together_are_refused(
@@ -136,3 +147,26 @@ def test_a_digest_sees_content_and_names_but_not_places(tmp_path: Path) -> None:
     assert digest_of_files([tmp_path / "b"], without=x) == digest_of_files(
         [tmp_path / "a"], without=x
     )
+
+
+def row(name: str, **facts: str) -> dict[str, Any]:
+    return {"log": name, "used": "yes", "verdict": "trustworthy", "code": "", "reason": ""} | facts
+
+
+def test_nothing_is_left_out_in_silence() -> None:
+    agreed = Agreement(((), ()), 1.0, np.zeros(2))
+    good = [row("a"), row("b")]
+    assert trust_of_all(good, agreed, [], 0.0).findings == ()
+    failed = row("c", used="no", verdict="failed", code="no_solution", reason="No start.")
+    found = trust_of_all([*good, failed], agreed, [], 0.0)
+    assert [(f.code, f.verdict) for f in found.findings] == [("log_left_out", "doubtful")]
+    assert "Log c has no part in this, as it failed alone: No start." in found.findings[0].text
+    (unheard,) = trust_of_all(good, agreed, ["D"], 0.0).findings
+    assert unheard.code == "silent_beacon"
+    assert "None of the logs hears beacon D" in unheard.text
+    (unsettled,) = trust_of_all(good, agreed, [], 0.2).findings
+    assert unsettled.code == "not_converged"
+    said = Finding("logs_disagree", "Log a contradicts log b: it takes all elsewhere.")
+    doubtful = [row("a", verdict="doubtful", code=said.code, reason=said.text), row("b")]
+    once = trust_of_all(doubtful, Agreement(((said,), ()), 3.0, np.zeros(2)), [], 0.0)
+    assert once.findings == (said,)

@@ -83,7 +83,7 @@ def test_a_cluster_of_two_workers_gives_the_same_figures(tmp_path: Path) -> None
     true = perturb_site(surveyed(), np.random.default_rng([1, 9]))
     save_site(surveyed(), tmp_path / "site.yaml")
     for which in range(LOGS):
-        write_log(part_of_room(true, 1, which, 3.0), tmp_path / f"log{which}")
+        write_log(part_of_room(true, 1, which, 2.4), tmp_path / f"log{which}")
     logs = [tmp_path / f"log{which}" for which in range(LOGS)]
     command = ("smooth", *logs, "--site", tmp_path / "site.yaml", "--no-tune", "-o")
     run_command(*command, tmp_path / "here", "--workers", 1)

@@ -195,7 +195,7 @@ def refine(
         _row(task, one.facts, of_used.get(task.name), far.get(task.name))
         for task, one in zip(tasks, first, strict=True)
     ]
-    trust = _trust(table, agreed, _unheard(site, first), moved)
+    trust = trust_of_all(table, agreed, _unheard(site, first), moved)
     return Joint(shared, known, agreed.excess, tuple(logs), table, trust, rounds)
 
 
@@ -271,10 +271,20 @@ def _row(
     return row | {f"alone_{key}": before[key] for key in kept if key in before}
 
 
-def _trust(
+def trust_of_all(
     table: list[dict[str, Any]], agreed: Agreement, unheard: list[str], moved: float
 ) -> Trust:
-    """Return the verdict on all: what the logs say of each other, then what is said of each."""
+    """Return the verdict on all: what the logs say of each other, then what is said of each.
+
+    Parameters
+    ----------
+    table : list of dict
+        A row for each log.
+    unheard : list of str
+        Beacons that no log hears.
+    moved : float
+        By how many sigmas the last round moved the shared calibration.
+    """
     found = [finding for said in agreed.of_log for finding in said]
     contradicted = {finding.text for finding in found}
     for row in table:
