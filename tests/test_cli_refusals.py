@@ -206,7 +206,7 @@ BAD_OPTIONS = [
     ("simulate", "Missing option '--output'"),
     ("smooth", "Missing argument"),
     ("fix LOG OUT -o OUT", "unexpected extra argument"),
-    ("smooth LOG OUT -o OUT", "OUT: there is no such file or directory; give the path of a log"),
+    ("smooth LOG OUT -o OUT", "there is no such file or directory; give the path of a log"),
     ("demodulate LOG -o OUT --frobnicate", "No such option: --frobnicate"),
     ("frobnicate", "No such command 'frobnicate'"),
     ("simulate -o OUT --duration nan", "--duration.*got nan"),
