@@ -159,15 +159,13 @@ def agreed_fix(
     """
     owner = np.array([name for name, _ in samples.channels])
     detected = list(dict.fromkeys(owner[samples.valid[0]].tolist()))
-    whole = _fixed(samples, calibration, prior, np.zeros(len(owner), dtype=bool))
+    (whole,) = _fixed(samples, calibration, prior, [np.zeros(len(owner), dtype=bool)])
     least = 2 if prior is None else 1
     if whole is None or _agrees(whole, samples):
         return whole
     for count in range(1, min(MOST_REFUSED, len(detected) - least) + 1):
-        tried = [
-            _fixed(samples, calibration, prior, np.isin(owner, names))
-            for names in combinations(detected, count)
-        ]
+        refused = [np.isin(owner, names) for names in combinations(detected, count)]
+        tried = _fixed(samples, calibration, prior, refused)
         agreed = [fix for fix in tried if fix is not None and _agrees(fix, samples)]
         if agreed:
             return min(agreed, key=lambda fix: float(fix.fixes.cost[0, 0]))
@@ -175,14 +173,36 @@ def agreed_fix(
 
 
 def _fixed(
-    samples: FieldSamples, calibration: Calibration, prior: Trajectory | None, refused: BoolArray
-) -> AgreedFix | None:
-    silenced: ComplexArray = np.where(refused[None, :, None], np.nan, samples.phasor_sensor)
+    samples: FieldSamples,
+    calibration: Calibration,
+    prior: Trajectory | None,
+    refused: list[BoolArray],
+) -> list[AgreedFix | None]:
+    """Fix one epoch without each choice of channels, all of them at once."""
+    count = len(refused)
+    every = samples.rows(np.zeros(count, dtype=int))
+    silenced: ComplexArray = np.where(np.array(refused)[:, :, None], np.nan, every.phasor_sensor)
+    known = None if prior is None else _repeated(prior, count)
     try:
-        fixes = fix_epochs(replace(samples, phasor_sensor=silenced), calibration, prior=prior)
+        fixes = fix_epochs(replace(every, phasor_sensor=silenced), calibration, prior=known)
     except (EstimationError, np.linalg.LinAlgError):
-        return None
-    return AgreedFix(fixes, refused)
+        if count == 1:
+            return [None]
+        return [_fixed(samples, calibration, prior, [one])[0] for one in refused]
+    return [AgreedFix(fixes.rows(slice(k, k + 1)), one) for k, one in enumerate(refused)]
+
+
+def _repeated(prior: Trajectory, count: int) -> Trajectory:
+    """Return the one pose of a prediction so many times."""
+    assert prior.pose_cov is not None
+    # Times must increase; of a pose to hold to they say nothing.
+    apart = np.spacing(prior.time[0]) * np.arange(count)
+    return Trajectory(
+        time=prior.time[0] + apart,
+        world_from_body=np.repeat(prior.world_from_body, count, axis=0),
+        position_world=np.repeat(prior.position_world, count, axis=0),
+        pose_cov=np.repeat(prior.pose_cov, count, axis=0),
+    )
 
 
 def _agrees(fix: AgreedFix, samples: FieldSamples) -> bool:

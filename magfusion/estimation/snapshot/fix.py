@@ -77,6 +77,10 @@ class Fixes:
         relative = np.exp(-0.5 * (self.cost - self.cost[:, :1]))
         return relative / np.sum(relative, axis=1, keepdims=True)
 
+    def rows(self, chosen: IntArray | BoolArray | slice) -> "Fixes":
+        """Return the fixes of some epochs."""
+        return Fixes(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+
     def best(self) -> Trajectory:
         """Return the first hypothesis of every epoch."""
         return Trajectory(
