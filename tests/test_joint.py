@@ -40,7 +40,7 @@ from magfusion.units import DEGREE, Array
 RESTLESS = Rests(start=0.0, move=1e3, pause=0.0)
 NOISE = 3e-10  # T; of each part of a phasor
 SETTINGS = together_settings(SmootherSettings(tune=False))
-ROUNDS = 7
+ROUNDS = 6
 
 
 def surveyed() -> Site:
@@ -51,7 +51,7 @@ def surveyed() -> Site:
     return replace(plain, beacons=(replace(beacons[0], synchronised=False), *beacons[1:]))
 
 
-def log_of(true: Site, which: int, duration: float = 3.0) -> Log:
+def log_of(true: Site, which: int, duration: float = 2.4) -> Log:
     """Return a log of phasors."""
     rng = np.random.default_rng([7, which])
     config = SimulationConfig(
