@@ -4,10 +4,15 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pyarrow.parquet
 import pytest
 import yaml
 from conftest import Refuse, Worked, run_command
+from matplotlib.image import imread
+from rerun.chunk import RrdReader
+
+from magfusion.results.coverage_colours import COLOURS
 
 FILES = {"coverage.parquet", "coverage.png", "run.rrd", "report.html", "report.json"}
 
@@ -27,6 +32,32 @@ def test_the_command_writes_table_picture_recording_and_report(
     assert report["median_with_extra_m"] < report["median_without_extra_m"]
     for sigma, determined in zip(table["position_sigma"], table["determined"], strict=True):
         assert math.isfinite(sigma) is determined
+    pixels = np.round(255 * np.asarray(imread(place / "coverage.png"))[..., :3])
+    in_picture = {tuple(pixel) for pixel in pixels.reshape(-1, 3).astype(int).tolist()}
+    best, *_, worst = drawn = _mean_sigma_by_colour(place, table)
+    assert best[0] < worst[0]
+    assert [colour for _, colour in drawn] == list(COLOURS.values())  # by growing sigma
+    assert in_picture.issuperset(COLOURS.values())
+
+
+def _mean_sigma_by_colour(
+    place: Path, table: dict[str, list[float]]
+) -> list[tuple[float, tuple[int, ...]]]:
+    """Return mean sigma and colour of the recording's points, by growing sigma."""
+    where = np.stack([table[f"position_{axis}"] for axis in "xyz"], axis=1)
+    found = []
+    for chunk in RrdReader(place / "run.rrd").stream().to_chunks():
+        batch = chunk.to_record_batch()
+        drawn = chunk.entity_path.startswith("/world/position_sigma/")
+        if drawn and "Points3D:colors" in batch.schema.names:
+            [points] = batch.column("Points3D:positions").to_pylist()
+            [[packed]] = batch.column("Points3D:colors").to_pylist()
+            rows = [int(np.argmin(np.abs(where - point).sum(axis=1))) for point in points]
+            sigma = [table["position_sigma"][row] for row in rows]
+            if sigma and np.all(np.isfinite(sigma)):
+                colour = tuple(packed >> shift & 255 for shift in (24, 16, 8))
+                found.append((float(np.mean(sigma)), colour))
+    return sorted(found)
 
 
 def test_a_volume_that_is_nowhere_determined_is_reported_as_such(

@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.errors import TrajectoryErrors, trajectory_errors
 from magfusion.results.recording import COVERAGE, open_viewer, write_recording
+from magfusion.results.recording_layout import about_zero, readable_range
 from magfusion.results.recording_plots import MAX_ROWS
 from magfusion.results.shapes import beads, coverage_shell, ellipsoids
 from magfusion.simulation.demo_site import demo_site
@@ -216,3 +218,43 @@ def test_beads_are_spaced_along_the_path_not_in_time() -> None:
 def test_a_recording_that_is_not_there_is_not_opened(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="there is no such file"):
         open_viewer(tmp_path / "run.rrd")
+
+
+def _labels(low: float, high: float) -> int:
+    """Return how many multiples of a power of ten are in a range, at most eight apart."""
+    step = 10.0 ** np.ceil(np.log10((high - low) / 8.0))
+    return int(np.floor(high / step) - np.ceil(low / step)) + 1
+
+
+def test_an_axis_has_two_labels_and_holds_what_is_drawn() -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(300):
+        size, middle = 10.0 ** rng.uniform(-6.0, 4.0), rng.choice([0.0, 0.1, 30.0])
+        values = size * (middle + rng.standard_normal(20))
+        values[3] = np.nan
+        shown = readable_range(values)
+        assert shown is not None
+        low, high = shown
+        assert low < np.nanmin(values) < np.nanmax(values) < high
+        assert _labels(low, high) >= 2
+        symmetric = about_zero(values)
+        assert symmetric is not None
+        assert symmetric[0] == pytest.approx(-symmetric[1])
+        assert _labels(*symmetric) >= 3
+    assert readable_range(np.full(3, 2.0)) is None
+    assert readable_range(np.full(3, np.nan)) is None
+
+
+def test_the_verdict_stands_above_all_with_the_figures(tmp_path: Path) -> None:
+    doubt = Finding("gravity", "Gravity is not of the declared size.", Verdict.DOUBTFUL)
+    write_recording(
+        tmp_path / "run.rrd", SITE, _estimate(), errors=_errors(), trust=Trust((doubt,))
+    )
+    read = RrdReader(tmp_path / "run.rrd").stream().to_chunks()
+    [text] = _static(read, "verdict", "TextDocument:text")
+    heading, _, figures, reason = text.splitlines()
+    assert heading == "## ⚠ DOUBTFUL"
+    ate, sigma = 1e3 * _errors().ate, 3e3 * np.sqrt(9e-4)
+    assert f"{N} poses in 39.8 s; 3 sigma {sigma:.2g} mm" in figures
+    assert f"errors {ate:.2g} mm" in figures
+    assert doubt.text in reason

@@ -3,8 +3,8 @@
 import subprocess
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -18,10 +18,21 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import StateTrust, Trust
 from magfusion.results.errors import TrajectoryErrors
 from magfusion.results.recording_file import whole_recording
+from magfusion.results.recording_layout import (
+    about_zero,
+    eye_on,
+    layout,
+    plot,
+    readable_range,
+    span_of,
+)
 from magfusion.results.recording_plots import (
     AXES,
+    ERRORS,
     TIMELINE,
+    ErrorPlot,
     beacon_colour,
+    biases,
     gaps_of,
     log_biases,
     log_errors,
@@ -30,7 +41,6 @@ from magfusion.results.recording_plots import (
     rows_of,
 )
 from magfusion.results.recording_trust import (
-    BANNER,
     LEVELS,
     has_levels,
     log_doubtful,
@@ -100,15 +110,33 @@ def write_recording(
         log_biases(recording, trajectory)
         if innovations:
             log_innovations(recording, site, innovations, trajectory.time[[0, -1]])
+        banner = None
         if trust is not None:
-            log_verdict(recording, trust)
+            banner = log_verdict(recording, trust, _summary(trajectory, errors))
         if states is not None:
             log_doubtful(recording, trajectory, states, 0.008 * scale.size)
             log_levels(recording, trajectory, states, errors)
-        levels = has_levels(states)
-        _log_legend(recording, trajectory, truth is not None, bool(innovations), levels, scale)
-        shown = _Shown(errors is not None, bool(innovations), levels, trust is not None)
-        recording.send_blueprint(_blueprint(site, trajectory, shown, scale))
+        _log_legend(recording, trajectory, truth is not None, scale)
+        drawn = _Drawn(trajectory, errors, innovations or {}, states)
+        recording.send_blueprint(_blueprint(site, drawn, scale, banner))
+
+
+def _summary(trajectory: Trajectory, errors: TrajectoryErrors | None) -> str:
+    """Return how long the path is, how well it is known, and how well it is met."""
+    time = trajectory.time
+    said = [f"{len(time)} poses in {time[-1] - time[0]:.3g} s"]
+    if trajectory.pose_cov is not None:
+        widest = [
+            3.0 * float(np.sqrt(np.median(np.linalg.eigvalsh(trajectory.pose_cov[:, p, p])[:, -1])))
+            for p in (slice(3, 6), slice(0, 3))
+        ]
+        said.append(
+            f"3 sigma {1e3 * widest[0]:.2g} mm and {np.rad2deg(widest[1]):.2g} deg (median)"
+        )
+    if errors is not None:
+        met = f"{1e3 * errors.ate:.2g} mm and {errors.attitude_rmse_deg:.2g} deg"
+        said.append(f"errors {met} rms against the truth")
+    return "; ".join(said)
 
 
 def open_viewer(path: Path) -> None:
@@ -219,116 +247,91 @@ def _log_legend(
     recording: rr.RecordingStream,
     trajectory: Trajectory,
     has_truth: bool,
-    has_innovations: bool,
-    levels: bool,
     scale: Scale,
 ) -> None:
     lines = [
         "| drawn | meaning |",
         "|---|---|",
-        "| **blue line and box** | estimated path and body; body axes x red, y green, z blue |",
+        "| **blue line, box** | estimate; body axes x red, y green, z blue |",
     ]
     if has_truth:
         lines.append("| **green beads** | true path, with its gaps |")
     if trajectory.pose_cov is not None:
-        lines.append(f"| **blue ellipsoids** | 3-sigma position, drawn {scale.sigma} x as large |")
+        lines.append(f"| **blue ellipsoids** | 3-sigma position, {scale.sigma} x as large |")
     lines += [
-        "| **arrows and loops** | moments and coils of the beacons, in one colour each |",
-        f"| **thin shells** | where a beacon's RMS field is {COVERAGE * 1e9:g} nT |",
+        "| **arrows, loops** | moments and coils of a beacon |",
+        "| **grid** | 1 m, at height 0 |",
+        f"| **shells** (hidden) | where a beacon's RMS field is {COVERAGE * 1e9:g} nT |",
     ]
-    if has_innovations:
-        lines.append("| **innovations** | RMS of whitened residuals; 1 where all is as declared |")
-    if levels:
-        lines.append(
-            "| **yellow lines** | protection level: no larger error unnoticed, but for `--risk` |"
-        )
     document = rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
     recording.log("legend", document, static=True)
 
 
-def _plot(origin: str, name: str, span: rr.TimeRange, legend: bool = True) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(
-        origin=origin,
-        name=name,
-        axis_x=rrb.TimeAxis(view_range=span),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop, visible=legend),
-    )
-
-
-def _by_axis(origin: str, name: str, unit: str, span: rr.TimeRange) -> rrb.Vertical:
+def _by_axis(kind: ErrorPlot, errors: TrajectoryErrors, span: rr.TimeRange) -> rrb.Vertical:
+    """Return the three components one above the other, on one scale."""
+    error, sigma = kind.of(errors)
+    values = about_zero(error) if sigma is None else about_zero(error, 3.0 * sigma)
     views = [
-        _plot(f"{origin}/{axis}", f"{axis}: error, ±3 sigma ({unit})", span, legend=False)
+        plot(
+            f"{kind.place}/{axis}", kind.title(axis, sigma is not None), span, values, legend=False
+        )
         for axis in AXES
     ]
-    return rrb.Vertical(*views, name=name)
+    return rrb.Vertical(*views, name=kind.name)
 
 
-class _Shown(NamedTuple):
-    """What a recording holds beside the path."""
-
-    errors: bool
-    innovations: bool
-    levels: bool
-    verdict: bool
-
-
-def _blueprint(site: Site, trajectory: Trajectory, shown: _Shown, scale: Scale) -> rrb.Blueprint:
-    first, last = (rr.TimeInt(seconds=float(trajectory.time[i])) for i in (0, -1))
-    span = rr.TimeRange(
-        start=rr.TimeRangeBoundary.absolute(first), end=rr.TimeRangeBoundary.absolute(last)
-    )
-    upper: list[rrb.Container | rrb.View] = []
-    if shown.errors:
-        upper.append(_by_axis("plots/position_error_mm", "Position error", "mm, world", span))
-        upper.append(_by_axis("plots/attitude_error_deg", "Attitude error", "deg, body", span))
-    upper.append(_plot("plots/position_m", "Position (m)", span))
-    lower: list[rrb.Container | rrb.View] = []
-    if shown.levels:
-        upper += [_plot(place, name, span) for place, name in LEVELS.items()]
-    if shown.innovations:
-        lower.append(_plot("plots/innovations", "Innovations", span))
-    if trajectory.gyro_bias_body is not None:
-        lower.append(_plot("plots/gyro_bias_deg_s", "Gyro bias (deg/s)", span))
-    if trajectory.accel_bias_body is not None:
-        lower.append(_plot("plots/accel_bias_m_s2", "Accel bias (m/s²)", span))
-    lower.append(rrb.TextDocumentView(origin="legend", name="Legend"))
-    untouched = rrb.EntityBehavior(interactive=False)  # a shell would catch every click
-    scene = rrb.Spatial3DView(
+def scene_view(site: Site, scale: Scale, name: str = "Scene") -> rrb.Spatial3DView:
+    """Return the view of all that is in the world, the beacons' shells hidden."""
+    # Shells would hide the path and catch every click; the viewer's own panel shows them.
+    hidden = rrb.EntityBehavior(interactive=False, visible=False)
+    return rrb.Spatial3DView(
         origin="world",
-        name="Scene",
+        name=name,
+        line_grid=rrb.LineGrid3D(spacing=1.0),
         eye_controls=eye_on(scale),
-        overrides={f"{_beacon_place(b.name)}/coverage": untouched for b in site.beacons},
-    )
-    plots = rrb.Vertical(rrb.Tabs(*upper), rrb.Tabs(*lower), row_shares=[3, 2])
-    return layout(scene, plots, banner=BANNER if shown.verdict else None)
-
-
-def eye_on(scale: Scale) -> rrb.EyeControls3D:
-    """Return a view of the whole scene from above its corner."""
-    return rrb.EyeControls3D(
-        position=scale.centre_world + scale.size * np.array([-0.54, -0.86, 0.66]),
-        look_target=scale.centre_world,
-        eye_up=(0.0, 0.0, 1.0),
+        overrides={f"{_beacon_place(b.name)}/coverage": hidden for b in site.beacons},
     )
 
 
-def layout(
-    *parts: rrb.Container | rrb.View, shares: tuple[int, ...] = (3, 2), banner: str | None = None
+@dataclass(frozen=True, eq=False)
+class _Drawn:
+    """What is drawn beside the scene."""
+
+    trajectory: Trajectory
+    errors: TrajectoryErrors | None
+    innovations: Mapping[str, tuple[Array, Array]]
+    states: StateTrust | None
+
+
+def _blueprint(
+    site: Site, drawn: _Drawn, scale: Scale, banner: tuple[str, str] | None
 ) -> rrb.Blueprint:
-    """Return a layout of parts side by side, the viewer's own panels out of the way.
-
-    Parameters
-    ----------
-    banner : str, optional
-        Entity of a text that stands above them.
-    """
-    body: rrb.Container = rrb.Horizontal(*parts, column_shares=list(shares))
-    if banner is not None:
-        view = rrb.TextDocumentView(origin=banner, name="Verdict")
-        body = rrb.Vertical(view, body, row_shares=[1, 6])
-    return rrb.Blueprint(
-        body,
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="collapsed"),
-    )
+    trajectory = drawn.trajectory
+    span = span_of(trajectory.time)
+    upper: list[rrb.Container | rrb.View] = []
+    if drawn.errors is not None:
+        upper += [_by_axis(kind, drawn.errors, span) for kind in ERRORS]
+    if drawn.states is not None and has_levels(drawn.states):
+        upper += [
+            plot(level.place, level.name, span, readable_range(level.of(drawn.states), zero=True))
+            for level in LEVELS
+        ]
+    lower: list[rrb.Container | rrb.View] = []
+    if drawn.innovations:
+        name = "Residuals (1 expected)"
+        values = readable_range(np.ones(1), *(v for _, v in drawn.innovations.values()), zero=True)
+        lower.append(plot("plots/innovations", name, span, values))
+    for place, name, unit, bias in biases(trajectory):
+        if bias is not None:
+            lower.append(plot(place, name, span, readable_range(unit * bias)))
+    position = plot("plots/position_m", "Position (m)", span)
+    if drawn.errors is None:
+        upper.insert(0, position)
+    else:  # below the scene where nothing else would stand there
+        (upper if lower else lower).append(position)
+    legend = rrb.TextDocumentView(origin="legend", name="Legend")
+    below: rrb.Container | rrb.View = legend
+    if lower:
+        below = rrb.Horizontal(rrb.Tabs(*lower), legend, column_shares=[1, 1])
+    left = rrb.Vertical(scene_view(site, scale), below, row_shares=[8, 5])
+    return layout(left, rrb.Tabs(*upper), shares=(3, 2), banner=banner)

@@ -9,12 +9,12 @@ from magfusion.errors import InputError
 from magfusion.estimation.state import POSITION, State
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.results.recording import layout, log_beacons
-from magfusion.results.recording_plots import TIMELINE
+from magfusion.results.recording import log_beacons
+from magfusion.results.recording_layout import layout, plot
+from magfusion.results.recording_plots import AXES, TIMELINE, beacon_colour
 from magfusion.results.shapes import ellipsoids, scene_scale
 
 _PATH = (70, 170, 255)
-_AXES = ("x", "y", "z")
 _PIECE = 50  # states to a strip of the path
 
 
@@ -38,6 +38,13 @@ class LiveView:
         recording.log(
             "world/estimate/body", rr.TransformAxes3D(0.06 * self._scale.size), static=True
         )
+        for place in ("plots/position_m", "plots/position_sigma_mm"):
+            for axis, colour in AXES.items():
+                style = rr.SeriesLines(colors=colour, names=axis, widths=1.5)
+                recording.log(f"{place}/{axis}", style, static=True)
+        for index, beacon in enumerate(site.beacons):
+            style = rr.SeriesLines(colors=beacon_colour(index), names=f"beacon {beacon.name}")
+            recording.log(_innovation(beacon.name), style, static=True)
         recording.send_blueprint(_blueprint())
 
     def show(self, state: State, distortion: dict[str, float]) -> None:
@@ -59,16 +66,15 @@ class LiveView:
             colors=(*_PATH, 110),
         )
         recording.log("world/estimate/three_sigma", sigma)
-        for axis, value in zip(_AXES, place, strict=True):
+        for axis, value in zip(AXES, place, strict=True):
             recording.log(f"plots/position_m/{axis}", rr.Scalars(float(value)))
         spread = state.world_from_body @ state.cov[POSITION, POSITION] @ state.world_from_body.T
-        for axis, variance in zip(_AXES, np.diagonal(spread), strict=True):
+        for axis, variance in zip(AXES, np.diagonal(spread), strict=True):
             recording.log(
                 f"plots/position_sigma_mm/{axis}", rr.Scalars(1e3 * float(np.sqrt(variance)))
             )
         for name, level in distortion.items():
-            own = f"plots/innovations/{rr.escape_entity_path_part(name)}"
-            recording.log(own, rr.Scalars(float(np.sqrt(level))))
+            recording.log(_innovation(name), rr.Scalars(float(np.sqrt(level))))
 
     def _extend(self, place: list[float]) -> None:
         """Draw the path in strips, so that no message grows with the run."""
@@ -77,6 +83,10 @@ class LiveView:
         self.recording.log(f"world/estimate/path/{self._strips}", strip, static=True)
         if len(self._path) >= _PIECE:
             self._path, self._strips = [place], self._strips + 1
+
+
+def _innovation(beacon: str) -> str:
+    return f"plots/innovations/{rr.escape_entity_path_part(beacon)}"
 
 
 def open_live_view(site: Site) -> LiveView:
@@ -99,8 +109,9 @@ def open_live_view(site: Site) -> LiveView:
 
 def _blueprint() -> rrb.Blueprint:
     plots = rrb.Vertical(
-        rrb.TimeSeriesView(origin="plots/position_m", name="Position (m)"),
-        rrb.TimeSeriesView(origin="plots/position_sigma_mm", name="Sigma of the position (mm)"),
-        rrb.TimeSeriesView(origin="plots/innovations", name="Innovations"),
+        plot("plots/position_m", "Position (m)", None),
+        plot("plots/position_sigma_mm", "Sigma of the position (mm)", None),
+        plot("plots/innovations", "Residuals of the fields (1 expected)", None),
     )
-    return layout(rrb.Spatial3DView(origin="world", name="Scene"), plots)
+    scene = rrb.Spatial3DView(origin="world", name="Scene")
+    return layout(scene, plots, shares=(3, 2), play="following")

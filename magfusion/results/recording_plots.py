@@ -1,6 +1,7 @@
 """The series of a recording: position, errors with their sigmas, biases, innovations."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
@@ -69,41 +70,68 @@ def log_position(
             log_series(recording, place, truth.time, truth.position_world[:, i], pale)
 
 
+@dataclass(frozen=True)
+class ErrorPlot:
+    """Plots of the components of an error, with what they are called."""
+
+    place: str
+    name: str
+    axes: str  # of which frame
+    unit: str
+    scale: float  # from SI to the unit
+
+    def of(self, errors: TrajectoryErrors) -> tuple[Array, Array | None]:
+        """Return the error and its sigma in the unit, shape (n, 3)."""
+        position = "position" in self.place
+        error = errors.position_world if position else errors.attitude_body
+        sigma = errors.position_sigma_world if position else errors.attitude_sigma_body
+        return self.scale * error, None if sigma is None else self.scale * sigma
+
+    def title(self, axis: str, sigma: bool) -> str:
+        """Return what stands above the plot of a component."""
+        grey = "; grey: 3 sigma" if sigma else ""
+        return f"{self.name} {self.axes} {axis} ({self.unit}){grey}"
+
+
+ERRORS = (
+    ErrorPlot("plots/position_error_mm", "Position error", "along world", "mm", 1e3),
+    ErrorPlot(
+        "plots/attitude_error_deg", "Attitude error", "about body", "deg", float(np.rad2deg(1.0))
+    ),
+)
+
+
 def log_errors(recording: rr.RecordingStream, errors: TrajectoryErrors) -> None:
     """Draw the components of the errors between three sigmas."""
-    kinds = (
-        ("position_error_mm", 1e3, errors.position_world, errors.position_sigma_world),
-        (
-            "attitude_error_deg",
-            np.rad2deg(1.0),
-            errors.attitude_body,
-            errors.attitude_sigma_body,
-        ),
-    )
-    for name, unit, error, sigma in kinds:
+    for kind in ERRORS:
+        error, sigma = kind.of(errors)
         for i, (axis, colour) in enumerate(AXES.items()):
-            place = f"plots/{name}/{axis}"
+            place = f"{kind.place}/{axis}"
             style = rr.SeriesLines(colors=colour, names=f"{axis} error", widths=1.5)
-            log_series(recording, f"{place}/error", errors.time, unit * error[:, i], style)
+            log_series(recording, f"{place}/error", errors.time, error[:, i], style)
             if sigma is not None:
-                bound = 3.0 * unit * sigma[:, i, None] * np.array([1.0, -1.0])
+                bound = 3.0 * sigma[:, i, None] * np.array([1.0, -1.0])
                 names = ["+3 sigma", "-3 sigma"]
                 band = rr.SeriesLines(colors=[SIGMA, SIGMA], names=names, widths=[1.0, 1.0])
                 log_series(recording, f"{place}/three_sigma", errors.time, bound, band)
 
 
+def biases(trajectory: Trajectory) -> tuple[tuple[str, str, float, Array | None], ...]:
+    """Return of each bias: its plot, what it is called, from SI to its unit, and the bias."""
+    gyro, accel = trajectory.gyro_bias_body, trajectory.accel_bias_body
+    return (
+        ("plots/gyro_bias_deg_s", "Gyro bias (deg/s)", float(np.rad2deg(1.0)), gyro),
+        ("plots/accel_bias_m_s2", "Accel bias (m/s²)", 1.0, accel),
+    )
+
+
 def log_biases(recording: rr.RecordingStream, trajectory: Trajectory) -> None:
     """Draw the biases, where they were estimated."""
-    kinds = (
-        ("gyro_bias_deg_s", np.rad2deg(1.0), trajectory.gyro_bias_body),
-        ("accel_bias_m_s2", 1.0, trajectory.accel_bias_body),
-    )
-    for name, unit, bias in kinds:
+    for place, _, unit, bias in biases(trajectory):
         if bias is not None:
             for i, (axis, colour) in enumerate(AXES.items()):
                 style = rr.SeriesLines(colors=colour, names=axis, widths=1.5)
-                place = f"plots/{name}/{axis}"
-                log_series(recording, place, trajectory.time, unit * bias[:, i], style)
+                log_series(recording, f"{place}/{axis}", trajectory.time, unit * bias[:, i], style)
 
 
 def log_innovations(
@@ -118,7 +146,7 @@ def log_innovations(
         present = np.isfinite(rms)
         if not present.any():
             continue
-        style = rr.SeriesLines(colors=colours[name], names=name, widths=1.0)
+        style = rr.SeriesLines(colors=colours[name], names=f"beacon {name}", widths=1.0)
         place = f"plots/innovations/beacons/{rr.escape_entity_path_part(name)}"
         log_series(recording, place, time[present], rms[present], style)
     style = rr.SeriesLines(colors=(255, 255, 255), names="expected", widths=1.5)

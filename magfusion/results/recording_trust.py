@@ -1,5 +1,7 @@
 """What a recording shows of trust: the verdict above all, doubtful states, protection levels."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import rerun as rr
 
@@ -10,24 +12,57 @@ from magfusion.results.recording_plots import AXES, SIGMA, log_series, rows_of
 from magfusion.units import Array
 
 BANNER = "verdict"  # entity
-LEVELS = {
-    "plots/position_level_mm": "Position: level (mm)",
-    "plots/attitude_level_deg": "Attitude: level (deg)",
-}
+_MARK = {Verdict.TRUSTWORTHY: "✔", Verdict.DOUBTFUL: "⚠", Verdict.FAILED: "✖"}
 _DOUBTFUL, _FAILED = (250, 190, 40), (235, 60, 60)
 _LEVEL = (250, 190, 40)
 
 
-def log_verdict(recording: rr.RecordingStream, trust: Trust) -> None:
-    """Write the verdict, its reasons, and what nothing has checked."""
-    lines = [f"## {str(trust.verdict).upper()}", ""]
-    lines += [f"- {reason.text}" for reason in trust.reasons]
+@dataclass(frozen=True)
+class LevelPlot:
+    """A plot of the length of an error below its protection level."""
+
+    place: str
+    name: str
+    scale: float  # from SI to the unit
+    part: slice  # of the pose's covariance
+
+    def of(self, states: StateTrust) -> Array:
+        """Return the protection level in the plot's unit, shape (n,)."""
+        position = "position" in self.place
+        return 1e3 * states.protection_level_m if position else states.protection_level_deg
+
+    def error(self, errors: TrajectoryErrors) -> Array:
+        """Return the length of the error in the plot's unit, shape (n,)."""
+        own = errors.position_world if "position" in self.place else errors.attitude_body
+        return np.asarray(self.scale * np.linalg.norm(own, axis=1))
+
+
+LEVELS = (
+    LevelPlot("plots/position_level_mm", "Protection (mm)", 1e3, slice(3, 6)),
+    LevelPlot(
+        "plots/attitude_level_deg",
+        "Protection (deg)",
+        float(np.rad2deg(1.0)),
+        slice(0, 3),
+    ),
+)
+
+
+def banner_text(verdict: Verdict, lines: list[str]) -> str:
+    """Return the verdict as a heading, and lines below it."""
+    return "\n".join([f"## {_MARK[verdict]} {str(verdict).upper()}", "", *lines])
+
+
+def log_verdict(recording: rr.RecordingStream, trust: Trust, summary: str) -> tuple[str, str]:
+    """Write the verdict, its reasons, and what nothing has checked; return entity and text."""
+    lines = [f"- {summary}", *(f"- **{reason.text}**" for reason in trust.reasons)]
     lines += [f"- *noticed:* {remark.text}" for remark in trust.remarks]
     if trust.unverified:
         names = ", ".join(one.name for one in trust.unverified)
         lines.append(f"- *held, and not checked by these data:* {names}")
-    document = rr.TextDocument("\n".join(lines), media_type=rr.MediaType.MARKDOWN)
-    recording.log(BANNER, document, static=True)
+    text = banner_text(trust.verdict, lines)
+    recording.log(BANNER, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN), static=True)
+    return BANNER, text
 
 
 def log_doubtful(
@@ -54,34 +89,19 @@ def log_levels(
     states: StateTrust,
     errors: TrajectoryErrors | None,
 ) -> None:
-    """Draw the protection levels beside three sigmas, and as a band about the errors."""
+    """Draw the protection levels beside three sigmas and the errors' lengths."""
     if not has_levels(states):
         return
-    kinds = (
-        ("position", "mm", 1e3, 1e3 * states.protection_level_m, slice(3, 6)),
-        ("attitude", "deg", np.rad2deg(1.0), states.protection_level_deg, slice(0, 3)),
-    )
-    for name, unit, scale, shown, part in kinds:
-        place = f"plots/{name}_level_{unit}"
-        style = rr.SeriesLines(colors=_LEVEL, names="protection level", widths=1.5)
-        log_series(recording, f"{place}/level", trajectory.time, shown, style)
+    for kind in LEVELS:
+        style = rr.SeriesLines(
+            colors=_LEVEL, names="protection level: no larger error unnoticed", widths=1.5
+        )
+        log_series(recording, f"{kind.place}/level", trajectory.time, kind.of(states), style)
         if trajectory.pose_cov is not None:
-            widest = np.linalg.eigvalsh(trajectory.pose_cov[:, part, part])[:, -1]
-            style = rr.SeriesLines(colors=SIGMA, names="3 sigma, widest", widths=1.0)
-            sigma = 3.0 * scale * np.sqrt(widest)
-            log_series(recording, f"{place}/three_sigma", trajectory.time, sigma, style)
-        if errors is None:
-            continue
-        size = scale * np.linalg.norm(_error(errors, name), axis=1)
-        style = rr.SeriesLines(colors=AXES["x"], names="error", widths=1.5)
-        log_series(recording, f"{place}/error", errors.time, size, style)
-        names = ["+ protection level", "- protection level"]
-        band = rr.SeriesLines(colors=[_LEVEL, _LEVEL], names=names, widths=[1.0, 1.0])
-        both = shown[:, None] * np.array([1.0, -1.0])
-        for axis in AXES:
-            own = f"plots/{name}_error_{unit}/{axis}/protection_level"
-            log_series(recording, own, trajectory.time, both, band)
-
-
-def _error(errors: TrajectoryErrors, name: str) -> Array:
-    return errors.position_world if name == "position" else errors.attitude_body
+            widest = np.linalg.eigvalsh(trajectory.pose_cov[:, kind.part, kind.part])[:, -1]
+            style = rr.SeriesLines(colors=SIGMA, names="3 sigma of the widest axis", widths=1.0)
+            sigma = 3.0 * kind.scale * np.sqrt(widest)
+            log_series(recording, f"{kind.place}/three_sigma", trajectory.time, sigma, style)
+        if errors is not None:
+            style = rr.SeriesLines(colors=AXES["x"], names="error", widths=1.5)
+            log_series(recording, f"{kind.place}/error", errors.time, kind.error(errors), style)

@@ -5,15 +5,14 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import BoundaryNorm
+from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 
 from magfusion.model.site import Beacon, Site
 from magfusion.results.coverage import Coverage
-from magfusion.units import Array
+from magfusion.results.coverage_colours import COLOURS, bounds, length
 
 SLICES = 3  # heights that are drawn where there are more
-BANDS = 10  # of the scale
 
 
 def write_plot(path: Path, site: Site, found: Coverage, extra: Beacon | None) -> None:
@@ -30,8 +29,9 @@ def write_plot(path: Path, site: Site, found: Coverage, extra: Beacon | None) ->
     drawn = heights[np.unique(np.linspace(0, len(heights) - 1, SLICES).astype(int))]
     figure = Figure(figsize=(1.0 + 5.0 * len(drawn), 5.5), layout="constrained")
     FigureCanvasAgg(figure)
-    levels = _levels(found.position_sigma[found.determined])
-    norm = BoundaryNorm(levels, 256, extend="both")
+    levels = bounds(found)
+    colours = ListedColormap([tuple(c / 255 for c in colour) for colour in COLOURS.values()])
+    norm = BoundaryNorm(levels, len(COLOURS), extend="both")
     panels = figure.subplots(1, len(drawn), squeeze=False)[0]
     for axes, height in zip(panels, drawn, strict=True):
         here = found.position_world[:, 2] == height
@@ -39,13 +39,13 @@ def write_plot(path: Path, site: Site, found: Coverage, extra: Beacon | None) ->
         sigma = found.position_sigma[here].reshape(len(x), len(y)).T
         shown = np.ma.masked_invalid(sigma)
         axes.set_facecolor("0.8")
-        mesh = axes.pcolormesh(x, y, shown, norm=norm, cmap="viridis_r", shading="nearest")
+        mesh = axes.pcolormesh(x, y, shown, norm=norm, cmap=colours, shading="nearest")
         if np.all(np.isfinite(sigma)) and min(sigma.shape) > 1:
             axes.contour(x, y, sigma, levels=levels, colors="white", linewidths=0.6)
         _mark(axes, site, extra)
         axes.set(title=f"height {height:.3g} m", xlabel="x (m)", ylabel="y (m)", aspect="equal")
     bar = figure.colorbar(mesh, ax=list(panels), ticks=levels, shrink=0.85)
-    bar.ax.set_yticklabels([_length(level) for level in levels])
+    bar.ax.set_yticklabels([length(level) for level in levels])
     bar.set_label("position sigma, three axes together")
     figure.suptitle(
         "Best position that one window allows (Cramér-Rao bound); grey: not determined;\n"
@@ -74,16 +74,3 @@ def _place(axes: Axes, beacon: Beacon, marker: str, size: float) -> None:
         fontsize=8,
         bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "alpha": 0.7, "linewidth": 0},
     )
-
-
-def _levels(sigma: Array) -> Array:
-    """Return bounds of the scale in equal ratios, from the best to the worst hundredth."""
-    if len(sigma) == 0:
-        return np.geomspace(1e-3, 1.0, BANDS + 1)
-    low, high = np.quantile(sigma, [0.01, 0.99])
-    return np.geomspace(low, max(high, 1.1 * low), BANDS + 1)
-
-
-def _length(metres: float) -> str:
-    millimetres = metres < 0.1
-    return f"{1e3 * metres:.3g} mm" if millimetres else f"{metres:.3g} m"

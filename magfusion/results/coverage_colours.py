@@ -1,0 +1,33 @@
+"""The colours of a coverage, the same in its picture and in its recording."""
+
+import numpy as np
+
+from magfusion.results.coverage import Coverage
+from magfusion.units import Array, IntArray
+
+# From the most accurate to the least; light to dark for those who see no hues.
+COLOURS = {
+    "yellow": (250, 225, 50),
+    "light green": (150, 215, 70),
+    "green": (45, 175, 110),
+    "teal": (30, 135, 155),
+    "blue": (65, 85, 190),
+    "violet": (120, 35, 140),
+}
+
+
+def bounds(found: Coverage) -> Array:
+    """Return the bounds between the colours in equal ratios (m), shape (colours - 1,)."""
+    sigma = found.position_sigma[found.determined]
+    low, high = np.quantile(sigma, [0.05, 0.95]) if len(sigma) else (0.01, 1.0)
+    return np.geomspace(low, max(high, 1.1 * low), len(COLOURS) - 1)
+
+
+def colour_of(found: Coverage) -> IntArray:
+    """Return which colour each point has, shape (n,); meaningless where not determined."""
+    return np.digitize(found.position_sigma, bounds(found))
+
+
+def length(metres: float) -> str:
+    """Return a sigma as it is printed."""
+    return f"{1e3 * metres:.3g} mm" if metres < 0.1 else f"{metres:.3g} m"
