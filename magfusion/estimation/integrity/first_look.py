@@ -102,7 +102,12 @@ def first_look(log: Log, site: Site | None, lockin: LockinSettings | None = None
     if found is not None and not has_schedule(site):
         settings = beside_lines(log, site, lockin) or usual_lockin(site)
         harmless = judged_lines(found, site, settings)
-        findings += [line for line in harmless if line.verdict is Verdict.TRUSTWORTHY]
+        # What `recorded` says below is not said twice.
+        findings += [
+            line
+            for line in harmless
+            if line.verdict is Verdict.TRUSTWORTHY and line.code != "fitted_line"
+        ]
     fixes = _fixed(log, site, samples, look[1].time)
     poses = None
     if fixes is not None:
