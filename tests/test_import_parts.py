@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,8 +45,8 @@ def magnetometer(path: Path, begin: float = 0.0) -> Path:
     )
 
 
-def imported(output: Path, *sources: Path, **options: object) -> tuple[Log, Figures]:
-    settings = ImportSettings(sources=tuple(map(str, sources)), **options)  # type: ignore[arg-type]
+def imported(output: Path, *sources: Path, **options: Any) -> tuple[Log, Figures]:
+    settings = ImportSettings(sources=tuple(map(str, sources)), **options)
     figures = run_import(settings, output)
     return open_log(output), figures
 
@@ -138,6 +139,8 @@ def test_an_offset_brings_a_table_to_the_clock_of_the_others(tmp_path: Path) -> 
     assert log.waveform.time[0] == pytest.approx(-0.25, abs=1e-9)
     with pytest.raises(InputError, match="--offset 'mag=1': write TABLE=SECONDS"):
         imported(tmp_path / "other", imu, field, offset=("mag=1",))
+    with pytest.raises(InputError, match="--offset truth: no table of truth is read"):
+        imported(tmp_path / "other", imu, field, map_file=file, offset=("truth=1",))
 
 
 def test_rows_of_one_sensor_are_taken_from_a_table_of_several(tmp_path: Path) -> None:

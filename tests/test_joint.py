@@ -207,9 +207,8 @@ def test_the_joint_solution_is_that_of_one_graph_of_all_logs(together: Together)
         for i in range(done.graph.epochs):
             apart = ends.atPose3(X(i)).localCoordinates(estimate.values.atPose3(X(i)))
             assert np.max(np.abs(apart) / np.sqrt(np.diagonal(cov[i]))) < 1e-6
-            assert np.allclose(
-                ends.atVector(V(i)), estimate.values.atVector(V(i)), rtol=0, atol=1e-9
-            )
+            faster = ends.atVector(V(i)) - estimate.values.atVector(V(i))
+            assert np.max(np.abs(faster)) < 1e-9  # m/s
             bias = (
                 ends.atConstantBias(B(i)).vector() - estimate.values.atConstantBias(B(i)).vector()
             )

@@ -347,10 +347,16 @@ class Navigator:
         offset, usual = self._arrived.applied_offset, self._arrived.usual
         imu = self._arrived.motion_samples(state.time - offset, time - offset)
         blind = self._arrived.stand_in.covers(state.time - offset, time - offset)
-        noise, blocks, (gyro, accel) = self._process_noise, self.blocks, self._white
-        model = replace(self.site.platform.imu, gyro_noise=gyro, accel_noise=accel)
-        site = replace(self.site, platform=replace(self.site.platform, imu=model))
+        noise, blocks, site = self._process_noise, self.blocks, self._site_as_measured()
         return propagate(state, imu, time, site, offset, noise, usual, blocks, blind=blind)
+
+    def _site_as_measured(self) -> Site:
+        """Return the site with the inertial noise that the samples of the beginning have."""
+        platform, (gyro, accel) = self.site.platform, self._white
+        if (gyro, accel) == (platform.imu.gyro_noise, platform.imu.accel_noise):
+            return self.site
+        imu = replace(platform.imu, gyro_noise=gyro, accel_noise=accel)
+        return replace(self.site, platform=replace(platform, imu=imu))
 
 
 def restored(

@@ -117,11 +117,16 @@ def no_start(seconds: float, why: NoStart) -> Trust:
 
 def _not_said_again(online: Trust, heard: tuple[Finding, ...]) -> Trust:
     """Leave out what was said of the beginning and is said of the whole recording as well."""
-    every: dict[str, int] = {}
+    every: dict[tuple[str, str], int] = {}
     for finding in heard:
-        every[finding.code] = max(finding.verdict.rank, every.get(finding.code, 0))
-    kept = tuple(f for f in online.findings if f.verdict.rank > every.get(f.code, -1))
+        every[_subject(finding)] = max(finding.verdict.rank, every.get(_subject(finding), 0))
+    kept = tuple(f for f in online.findings if f.verdict.rank > every.get(_subject(f), -1))
     return replace(online, findings=kept)
+
+
+def _subject(finding: Finding) -> tuple[str, str]:
+    """Return what is wrong and the sensor that leads the sentence: numbers differ with the span."""
+    return finding.code, finding.text.partition(":")[0]
 
 
 def _chosen(rows: dict[str, Array], trust: Trust, *, lagged: bool) -> BoolArray:

@@ -81,6 +81,7 @@ def gather(paths: Sequence[Path], wanted: Asked, told: Findings) -> Gathered:
     for stream in ("imu", "magnetometer"):
         if stream not in attempted:
             told.problems.append(f"No table is given for the {stream}; give --{stream} FILE.")
+    _refuse_unused(found, wanted)
     told.problems += found.passed_over if told.problems else []  # what is lacking may be there
     for stream, plan in found.plans.items():
         found.plans[stream] = replace(plan, shift_ns=wanted.shifts_ns.get(stream, 0))
@@ -91,6 +92,22 @@ def gather(paths: Sequence[Path], wanted: Asked, told: Findings) -> Gathered:
                 f" --{stream} FILE."
             )
     return found
+
+
+def _refuse_unused(found: Gathered, wanted: Asked) -> None:
+    """Refuse options of tables that are not read: a clock that is not moved would pass silently."""
+    if found.told.problems:
+        return
+    for option, streams in (("offset", wanted.shifts_ns), ("rows", wanted.rows)):
+        for stream in streams:
+            of_format = option == "rows" and found.stamped and stream not in wanted.files
+            if stream in found.plans and not of_format:
+                continue
+            read = ", ".join(found.plans)
+            found.told.problems.append(
+                f"--{option} {stream}: no table of {stream} is read (there are {read}); name one"
+                f" of these, or give --{stream} FILE."
+            )
 
 
 def _halves(found: Gathered, attempted: set[str], named: set[str]) -> set[str]:
