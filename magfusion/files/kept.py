@@ -10,13 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from magfusion.files.atomic import whole_file
-
-PIECE = 1 << 24  # bytes read at once
-ENDS = 1 << 22  # bytes at either end of a large file, which tell it from others
-LARGE = 1 << 30  # bytes, from which only those are read
-
-
-AnyArray = np.ndarray[Any, Any]
+from magfusion.units import AnyArray
 
 
 class Kept(NamedTuple):
@@ -69,12 +63,7 @@ def digest_of_files(paths: Iterable[Path], *, without: frozenset[str] = frozense
             every.append(("", path))
     digest = hashlib.sha256()
     for name, path in every:
-        size = path.stat().st_size
-        digest.update(f"{name}\0{size}\0".encode())
         with path.open("rb") as file:
-            if size > LARGE:
-                digest.update(file.read(ENDS))
-                file.seek(size - ENDS)
-            while piece := file.read(PIECE):
-                digest.update(piece)
+            content = hashlib.file_digest(file, "sha256").hexdigest()
+        digest.update(f"{name}\0{content}\0".encode())
     return digest.hexdigest()

@@ -14,11 +14,11 @@ from magfusion.estimation.joint import Said
 from magfusion.estimation.joint_log import OfLog
 from magfusion.estimation.noise_tuning import Tuned
 from magfusion.estimation.prepared import Begun
-from magfusion.files.kept import AnyArray, Kept, load_kept, save_kept
+from magfusion.files.kept import Kept, load_kept, save_kept
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.units import Array
+from magfusion.units import AnyArray, Array
 
 _STATES = (
     "time",
@@ -97,15 +97,11 @@ def load_alone(path: Path, key: str, site: Site) -> Alone | None:
     )
     rival = _states_in(arrays, _RIVAL) if f"{_RIVAL}time" in arrays else None
     begun = Begun(states, declared, start, facts["rival_chi_square"], rival)
-    part = Condensed(**{name: arrays[f"said_{name}"] for name in _of_condensed()})
+    part = Condensed(**{name: arrays[f"said_{name}"] for name in Condensed.__dataclass_fields__})
     noise = tuple(Tuned(*one) for one in facts["noise"])
     standing = np.asarray(arrays["standing"], dtype=bool)
     said = Said(arrays["said_step"], part)
     return Alone(OfLog(begun, arrays["steps"], noise, standing, said), facts["table"])
-
-
-def _of_condensed() -> tuple[str, ...]:
-    return ("information", "gradient", "by_common", "by_place", "by_log")
 
 
 def _of_states(states: Trajectory, prefix: str) -> dict[str, Array]:
