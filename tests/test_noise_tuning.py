@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.integrity.tuned_noise import tuned_noise
-from magfusion.estimation.noise_tuning import NORMAL, STUDENT, Tuned, tuned_site
+from magfusion.estimation.noise_tuning import NORMAL, STUDENT, Tuned, _likeliest, tuned_site
 from magfusion.files.site import load_site, save_site
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
@@ -134,6 +134,34 @@ def test_the_gain_of_the_robust_fit_leaves_normal_residuals_as_they_are(componen
         return float(weight * chi2.pdf(square, components))
 
     assert quad(influence, 0.0, 100.0)[0] == pytest.approx(components, rel=1e-5)
+
+
+def test_of_a_strong_beacon_nothing_is_found_that_was_not_declared() -> None:
+    """A white error as large as its model error would be a thousand times its noise."""
+    rng = np.random.default_rng(0)
+    over_scales = np.tile([10.0, 1.0, 0.1, 0.01], 100)
+    parts = np.stack([np.ones(400), over_scales, np.full(400, 1e6)])
+    variance = np.array([1.0, 0.25, 0.0]) @ parts
+    square = variance * rng.chisquare(6, 400)
+    log = _likeliest(square, parts, np.zeros(400), np.full(400, 0.5), 6, slice(2, None))
+    noise, _, white = np.exp(2.0 * log)[:, None] * parts
+    assert np.mean(noise + white) == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.slow
+def test_a_survey_by_hand_is_not_taken_for_noise_of_the_imu() -> None:
+    """Its errors are not estimated, and bend the path: the IMU contradicts, and is right."""
+    site = demo_site()
+    beacons = tuple(
+        replace(b, sigma=replace(b.sigma, position_world=np.full(3, 0.05))) for b in site.beacons
+    )
+    site = replace(site, beacons=beacons)
+    config = SimulationConfig(DEMO_BOX_WORLD, duration=20.0, motion="walk")
+    made = simulate_log(site, config, np.random.default_rng(3)).log
+    result = smooth(made, site)
+    for kind, true in (("gyro_noise", 3e-4), ("accel_noise", 3e-3)):
+        assert found(result, kind)[0] < 2.0 * true, kind
+    assert np.all(found(result, "noise_factor") < 2.0)
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from magfusion.estimation.measurements.model_error import alike_in_batch
 from magfusion.estimation.motion_compensation import MotionCompensated
 from magfusion.estimation.residual_shares import ChannelErrors, Leavings
 from magfusion.estimation.solve.bounded import minimise_bounded
-from magfusion.model.parameters import Calibration
+from magfusion.model.parameters import Block, Calibration
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -38,6 +38,7 @@ SCALES = 8  # epochs in a row that are compared, so far apart that they share no
 FAULT = 3.0  # of a declared model error; more is no error of that kind, and is not covered by it
 WEIGHINGS = 5  # times that the epochs are weighed by what is found, at first as if noise were all
 OF_IMU = ("gyro_noise", "accel_noise")  # a beacon may be called "imu", too
+NONE = 1e-4  # of a part that was not declared: as good as none
 PLAUSIBLE = 6.0  # by a factor of more, either way, white noise is a fault under another name
 LEFT = 1e-3  # of an error; of which less is left says nothing
 
@@ -114,7 +115,8 @@ def noise_of(
     samples, here = log.samples if wave is None else wave.fields, log.at_fields(states)
     alike = alike_in_batch(here.position_world, declared.model_error_length)
     blind = log.demodulation.blind
-    return tune(graph, estimate, samples, here, declared, overlap(samples), alike, blind)
+    windows, held = overlap(samples), log.considered
+    return tune(graph, estimate, samples, here, declared, windows, alike, blind, held)
 
 
 def tune(
@@ -126,6 +128,7 @@ def tune(
     windows: float,
     alike: Array,
     blind: BoolArray | None = None,
+    considered: tuple[Block, ...] = (),
 ) -> tuple[Tuned, ...]:
     """Return the noise that the residuals of a solved graph are likeliest with.
 
@@ -143,8 +146,11 @@ def tune(
         How many epochs have the same model error.
     blind : bool ndarray, shape (n,), optional
         Epochs whose noise is another: of a motion that was found without an IMU.
+    considered : tuple of Block
+        Parameters that are not estimated: what their errors do to residuals is no noise.
     """
-    system, now = Leavings(graph, estimate, samples, poses, windows), estimate.calibration.site
+    system = Leavings(graph, estimate, samples, poses, windows, considered)
+    now = estimate.calibration.site
     lag = max(1, round(windows))
     found: list[Tuned] = []
     for i, beacon in enumerate(now.beacons):
@@ -160,7 +166,7 @@ def tune(
         if not tuned:
             known, fixed = known[:1], fixed + known[1]
         for _ in range(WEIGHINGS):
-            log = _likeliest(square, known, fixed, weight, 6)
+            log = _likeliest(square, known, fixed, weight, 6, slice(2, None))
             parts = np.exp(2.0 * log)[:, None] * known
             of_model = (parts[1] if tuned else fixed) / (np.sum(parts, axis=0) + fixed)
             weight = (1.0 - of_model + of_model * near) / lag
@@ -258,7 +264,14 @@ def _tuned_imu(system: Leavings, now: Site, declared: Site) -> list[Tuned]:
     return found
 
 
-def _likeliest(square: Array, parts: Array, fixed: Array, weight: Array, components: int) -> Array:
+def _likeliest(
+    square: Array,
+    parts: Array,
+    fixed: Array,
+    weight: Array,
+    components: int,
+    undeclared: slice = slice(0, 0),
+) -> Array:
     """Return the logarithm of what each part's standard deviation is too small by.
 
     Parameters
@@ -273,14 +286,20 @@ def _likeliest(square: Array, parts: Array, fixed: Array, weight: Array, compone
         Of each: how much of it is independent.
     components : int
         Of each residual.
+    undeclared : slice
+        Parts of which nothing was declared: there may be none of them.
     """
+    start, least = np.zeros(len(parts)), np.full(len(parts), LEAST)
+    start[undeclared], least[undeclared] = np.log(LEAST), NONE
+    declared = np.ones(len(parts))
+    declared[undeclared] = 0.0
     gain, width = NORMAL[components], STUDENT + components
 
     def cost(log: Array) -> float:
         variance = np.exp(2.0 * log) @ parts + fixed
         bounded = width * np.log1p(gain * square / (STUDENT * variance))
         likelihood = 0.5 * np.sum(weight * (components * np.log(variance) + bounded))
-        return float(likelihood + 0.5 * np.sum((log / PRIOR) ** 2))
+        return float(likelihood + 0.5 * np.sum(declared * (log / PRIOR) ** 2))
 
-    limits = np.tile(np.log([LEAST, MOST]), (len(parts), 1))
-    return minimise_bounded(cost, np.zeros(len(parts)), limits, steps=100, decrease=1e-9)
+    limits = np.log(np.stack([least, np.full(len(parts), MOST)], axis=1))
+    return minimise_bounded(cost, start, limits, steps=100, decrease=1e-9)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from magfusion.estimation.factors import CONSIDERED_KEY
 from magfusion.estimation.graph import Estimate, Graph
 from magfusion.estimation.inertial import ROWS
 from magfusion.estimation.measurements.phasors import FieldPhasors
@@ -12,6 +13,8 @@ from magfusion.estimation.solve.bordered import eliminate
 from magfusion.estimation.state import states_in
 from magfusion.model.field import model_error_cov
 from magfusion.model.noise import sensor_positions
+from magfusion.model.parameters import Block
+from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -59,6 +62,9 @@ class Leavings:
         At the samples.
     windows : float
         How many windows hold each sample.
+    considered : tuple of Block
+        Parameters that are uncertain without being estimated.  Here they are: what their errors do
+        is no noise.
     """
 
     ordinary: BoolArray  # inertial intervals without a gap
@@ -70,13 +76,14 @@ class Leavings:
         samples: FieldSamples,
         poses: Trajectory,
         windows: float,
+        considered: tuple[Block, ...] = (),
     ) -> None:
         self._graph, self._samples = graph, samples
         self._measured = next(m for m in graph.measurements if isinstance(m, FieldPhasors))
         site = estimate.calibration.site
-        self._linear = graph.linearized(estimate)
+        self._linear, self._ordering, fields = _system(graph, estimate, considered)
         self._factors = _jacobians(self._linear)
-        self._inertial_system()
+        self._inertial_system(fields)
         error = graph.residual(self._measured, estimate)
         weight = np.ones(error.shape[:2])
         if self._measured.loss is not None:
@@ -93,10 +100,10 @@ class Leavings:
         )
         assert rows.by_pose is not None
         self._by_pose = rows.by_pose.reshape(len(error), -1, 6)
-        self._inertial_error = self._rows_of([-f.getb() for f in self._inertial])
+        self._error, self._inertial_error = self._left_of_all()
         self._draw(site, sensor_positions(site, poses), windows)
 
-    def _inertial_system(self) -> None:
+    def _inertial_system(self, first_fields: int) -> None:
         graph, end = self._graph, self._graph.native.size()
         first = end - graph.epochs + 1
         self._inertial = self._factors[first:end]
@@ -104,7 +111,8 @@ class Leavings:
         self._unwhitening = np.linalg.inv(np.array(roots).reshape(-1, ROWS, ROWS))
         self.sigma = np.sqrt(np.sum(self._unwhitening**2, axis=2))
         self.ordinary = np.all(self.sigma < ORDINARY * np.median(self.sigma, axis=0), axis=1)
-        self._fields, begin = [], end
+        self._fields = []
+        begin = first_fields
         for factors in graph.factors:
             end = begin + len(factors.measurement.epoch)
             if isinstance(factors.measurement, FieldPhasors):
@@ -137,7 +145,11 @@ class Leavings:
             factor.getb()[: own.size] = own.ravel()
         for factor, own in zip(self._inertial, inertial, strict=True):
             factor.getb()[: own.size] = own
-        step = eliminate(self._linear, self._graph.ordering).optimize()
+        return self._left_of_all()
+
+    def _left_of_all(self) -> tuple[Array, Array]:
+        """Return what the linear system leaves of its right-hand sides."""
+        step = eliminate(self._linear, self._ordering).optimize()
         components = self._error[0].size
         rows = [factor.error_vector(step)[:components] for factor in self._fields]
         kept = np.array(rows).reshape(self._error.shape) / self._weight
@@ -187,6 +199,24 @@ class Leavings:
         Each of shape (intervals, 15): rotation, position, velocity, biases.
         """
         return [self._inertial_error, *(inertial for _, inertial in self._left)]
+
+
+def _system(
+    graph: Graph, estimate: Estimate, considered: tuple[Block, ...]
+) -> tuple[gtsam.GaussianFactorGraph, gtsam.Ordering, int]:
+    """Return a linear graph that estimates what is considered too, and where its fields begin."""
+    ordering = graph.ordering
+    if not considered or graph.declared is None:
+        return graph.linearized(estimate), ordering, graph.native.size()
+    spread = prior_sqrt_covariance(graph.declared.site, considered)
+    by_inertial = graph.by_considered(spread)
+    linear = graph.beside(estimate, considered, spread, by_inertial, explaining=True)
+    fields = linear.size() - sum(len(part.measurement.epoch) for part in graph.factors)
+    count = spread.shape[1]
+    unit = gtsam.noiseModel.Unit.Create(count)
+    linear.push_back(gtsam.JacobianFactor(CONSIDERED_KEY, np.eye(count), np.zeros(count), unit))
+    ordering.push_back(CONSIDERED_KEY)
+    return linear, ordering, fields
 
 
 def _jacobians(linear: gtsam.GaussianFactorGraph) -> list[gtsam.JacobianFactor]:
