@@ -165,6 +165,7 @@ def state_content(navigator: Navigator, state: JudgedState) -> dict[str, Any]:
         "time": state.time,
         "started": True,
         "lost": state.lost,
+        "reset_counter": state.reset_counter,
         "verdict": str(state.verdict),
         "reasons": _said(state.judgement.reasons),
         "excluded": list(state.judgement.excluded),
