@@ -51,7 +51,7 @@ def told_of(state: JudgedState) -> dict[str, Any]:
 
 def write_walk(path: Path) -> Path:
     """Write the log of a short walk with its site; return its directory."""
-    walk = online_log(3, 9.0)
+    walk = online_log(3, 8.0)
     write_log(Log("walk", EPOCH_NS, "test", walk.imu, None, walk.fields), path)
     save_site(walk.site, path / "site.yaml")
     return path

@@ -102,7 +102,7 @@ def test_pymavlink_reads_every_state_of_a_pipe(
     assert len(messages) == len(datagrams)  # one each, none of them bad
     odometry = [one.to_dict() for one in messages if one.get_type() == "ODOMETRY"]
     started = [state for state in states if state["started"]]
-    assert len(started) >= 4
+    assert len(started) >= 3
     for message, state in zip(odometry, started, strict=True):
         compared(message, state)
         assert math.isnan(message["rollspeed"])
@@ -111,7 +111,7 @@ def test_pymavlink_reads_every_state_of_a_pipe(
         mavlink.MAV_STATE_CALIBRATING,
         mavlink.MAV_STATE_ACTIVE,
     }
-    assert 7 <= len(beats) <= 9  # one a second, of nine seconds
+    assert 6 <= len(beats) <= 8  # one a second, of eight seconds
     assert [one.get_seq() for one in messages] == list(range(len(messages)))
 
 

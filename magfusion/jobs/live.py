@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
-from magfusion.jobs.settings import Settings, option
+from magfusion.jobs.settings import FrameSettings, option
 
 if TYPE_CHECKING:
     from magfusion.estimation.integrity.judgement import JudgedState
@@ -26,7 +26,7 @@ class StateSink(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LiveSettings(Settings):
+class LiveSettings(FrameSettings):
     """Who is told of states as they are made."""
 
     live: bool = option(False, "Show the states in the viewer")
@@ -35,6 +35,18 @@ class LiveSettings(Settings):
         "Send the states as MAVLink ODOMETRY, by UDP",
         metavar="udpout:HOST:PORT",
         note="magfusion[mavlink]",
+    )
+    foxglove: str | None = option(
+        None,
+        "Serve the states to Foxglove, by WebSocket",
+        metavar="[HOST:]PORT",
+        note="magfusion[foxglove]",
+    )
+    ros2: str | None = option(
+        None,
+        "Publish the states as nav_msgs/Odometry of ROS 2, by DDS",
+        metavar="TOPIC",
+        note="magfusion[ros2]",
     )
 
 
@@ -71,6 +83,14 @@ def _opened(settings: LiveSettings, site: Site, epoch_ns: int) -> Iterator[State
         from magfusion.results.odometry_mavlink import MavlinkSender
 
         yield MavlinkSender(settings.mavlink, epoch_ns)
+    if settings.foxglove is not None:
+        from magfusion.results.live_foxglove import FoxgloveServer
+
+        yield FoxgloveServer(settings.foxglove, epoch_ns, settings.frame, settings.child)
+    if settings.ros2 is not None:
+        from magfusion.results.odometry_dds import RosPublisher
+
+        yield RosPublisher(settings.ros2, epoch_ns, settings.frame, settings.child)
     if settings.live:
         from magfusion.results.recording_live import open_live_view
 
