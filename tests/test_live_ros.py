@@ -6,6 +6,7 @@ import os
 import select
 import subprocess
 import sys
+import uuid
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,10 +37,12 @@ from magfusion.results.odometry_dds import RosPublisher, odometry_message
 from magfusion.results.ros_messages import Odometry
 
 # Only this machine, without multicast, which not every network has.
-LOOPBACK = """<CycloneDDS><Domain Id="any"><General><Interfaces>
-<NetworkInterface name="lo" multicast="false"/></Interfaces><AllowMulticast>false</AllowMulticast>
-</General><Discovery><ParticipantIndex>auto</ParticipantIndex><Peers><Peer address="127.0.0.1"/>
-</Peers></Discovery></Domain></CycloneDDS>"""
+LOOPBACK = """<CycloneDDS><Domain Id="any">
+<General><Interfaces><NetworkInterface address="127.0.0.1" multicast="false"/></Interfaces>
+<AllowMulticast>false</AllowMulticast></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex>
+<Peers><Peer address="127.0.0.1"/></Peers></Discovery>
+</Domain></CycloneDDS>"""
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 # As rclcpp and rclpy ask by default.
 ROS_DEFAULT = Qos(
@@ -56,6 +59,12 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> int:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
     return number
+
+
+@pytest.fixture
+def topic() -> str:
+    """Return a topic that no other test has, whichever processes they share the domain with."""
+    return f"/robot_{uuid.uuid4().hex}/odometry"
 
 
 @pytest.fixture(scope="module")
@@ -87,18 +96,18 @@ def test_the_bytes_are_those_that_ros_reads(tmp_path: Path) -> None:
         ((connection, _, message),) = (m for m in bag.messages() if "Odometry" in m[0].msgtype)
         kept: Any = bag.deserialize(message, connection.msgtype)
     for mine, other in zip(written_in(read), written_in(kept), strict=True):
-        close = mine == other if isinstance(mine, str) else np.isclose(mine, other, rtol=1e-12, atol=1e-15)
-        assert close, (mine, other)
+        exact = isinstance(mine, str)
+        assert mine == other if exact else mine == pytest.approx(other, rel=1e-12, abs=1e-15)
 
 
-def test_a_subscriber_that_knows_only_the_topic_receives_it(domain: int) -> None:
+def test_a_subscriber_that_knows_only_the_topic_receives_it(domain: int, topic: str) -> None:
     """Another process, which asks the publisher for the type of its messages."""
     publisher, state = (
-        RosPublisher("/robot/odometry", EPOCH_NS, "map", "base_link"),
+        RosPublisher(topic, EPOCH_NS, "map", "base_link"),
         example_state(3),
     )
     command = [sys.executable, str(Path(__file__).with_name("dds_subscriber.py")), str(domain)]
-    with subprocess.Popen([*command, "rt/robot/odometry"], stdout=subprocess.PIPE) as running:
+    with subprocess.Popen([*command, f"rt{topic}"], stdout=subprocess.PIPE) as running:
         assert running.stdout is not None
         while not select.select([running.stdout], [], [], 0.02)[0]:
             publisher.take(state, told_of(state))
@@ -115,10 +124,12 @@ def test_a_subscriber_that_knows_only_the_topic_receives_it(domain: int) -> None
     assert message["pose"]["covariance"] == odometry.pose_cov.ravel().tolist()
 
 
-def test_every_state_of_a_pipe_that_is_not_lost_is_published(log: Path, domain: int) -> None:
+def test_every_state_of_a_pipe_that_is_not_lost_is_published(
+    log: Path, domain: int, topic: str
+) -> None:
     participant = DomainParticipant(domain)
-    reader = DataReader(participant, Topic(participant, "rt/odometry", Odometry), qos=ROS_DEFAULT)
-    states, said = piped(log, LiveSettings(ros2="/odometry"))
+    reader = DataReader(participant, Topic(participant, f"rt{topic}", Odometry), qos=ROS_DEFAULT)
+    states, said = piped(log, LiveSettings(ros2=topic))
     assert said == ""
     received = reader.take(100)
     started = [state for state in states if state["started"]]
@@ -133,10 +144,10 @@ def test_every_state_of_a_pipe_that_is_not_lost_is_published(log: Path, domain: 
         assert np.allclose(sigma, state["sigma"]["position"], rtol=1e-9, atol=0.0)
 
 
-def test_a_lost_state_is_not_published(domain: int) -> None:
+def test_a_lost_state_is_not_published(domain: int, topic: str) -> None:
     participant = DomainParticipant(domain)
-    reader = DataReader(participant, Topic(participant, "rt/odometry", Odometry), qos=ROS_DEFAULT)
-    publisher, good = RosPublisher("/odometry", 0, "world", "body"), example_state(5)
+    reader = DataReader(participant, Topic(participant, f"rt{topic}", Odometry), qos=ROS_DEFAULT)
+    publisher, good = RosPublisher(topic, 0, "world", "body"), example_state(5)
     lost = replace(good, judgement=LOST)
     for state in (None, lost, good, lost):
         publisher.take(state, told_of(good))
@@ -144,10 +155,10 @@ def test_a_lost_state_is_not_published(domain: int) -> None:
     assert len(reader.take(10)) == 1
 
 
-@pytest.mark.parametrize("topic", ["odometry", "/", "/robot/", "/my topic", "/1st"])
-def test_a_name_that_is_no_topic_is_refused(log: Path, refuse: Refuse, topic: str) -> None:
-    said = refuse("navigate", "-", "--site", log / "site.yaml", "--ros2", topic)
-    assert f"--ros2 {topic!r}: is no topic; write one as /robot/odometry" in said
+@pytest.mark.parametrize("name", ["odometry", "/", "/robot/", "/my topic", "/1st"])
+def test_a_name_that_is_no_topic_is_refused(log: Path, refuse: Refuse, name: str) -> None:
+    said = refuse("navigate", "-", "--site", log / "site.yaml", "--ros2", name)
+    assert f"--ros2 {name!r}: is no topic; write one as /robot/odometry" in said
 
 
 @pytest.mark.parametrize("number", ["233", "-1", "home"])

@@ -114,7 +114,7 @@ def _navigate(
         for state in navigator.take():
             _tell(sink, others, state, state_content(navigator, state))
         navigator.take_lagged()
-        if not navigator.started and newest >= reached + WAITING:
+        if not navigator.started and -np.inf < newest >= reached + WAITING:
             _tell(sink, others, None, _waiting(navigator, newest))
             reached = newest
         sink.flush()

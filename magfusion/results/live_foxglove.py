@@ -5,6 +5,7 @@ from typing import Any
 
 from magfusion.errors import InputError
 from magfusion.estimation.integrity.judgement import JudgedState
+from magfusion.files.stream import json_line
 from magfusion.results.odometry import odometry_of
 
 HOST = "127.0.0.1"
@@ -81,7 +82,7 @@ class FoxgloveServer:
     def take(self, state: JudgedState | None, told: Mapping[str, Any]) -> None:
         """Publish what is told of a state, and its pose if it has one."""
         stamp = max(0, self._epoch_ns + round(float(told["time"]) * _NS))
-        self._state.log(dict(told), log_time=stamp)
+        self._state.log(json_line(dict(told)), log_time=stamp)
         if state is None or state.lost:
             return
         found, make = odometry_of(state, self._epoch_ns), self._messages

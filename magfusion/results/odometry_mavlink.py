@@ -10,12 +10,14 @@ from magfusion.errors import InputError
 from magfusion.estimation.integrity.judgement import JudgedState
 from magfusion.model.trust import Verdict
 from magfusion.results.odometry import Odometry, odometry_of
-from magfusion.units import Array
 
 # Of the vehicle that it is on board of, which is 1 unless somebody changed it.
 SYSTEM = 1
 HEARTBEAT = 1.0  # s
-_FRD = np.diag([1.0, -1.0, -1.0])  # forward, right, down of forward, left, up
+# Forward, right, down of forward, left, up.
+_FRD = np.array([1.0, -1.0, -1.0])
+_FRD_COV = np.outer(_FRD, _FRD)
+_UPPER = np.triu_indices(6)
 _ADDRESS = "udpout:HOST:PORT"
 
 
@@ -45,29 +47,24 @@ def odometry_message(odometry: Odometry, quality: int, resets: int) -> Any:
     """
     from pymavlink.dialects.v20 import common
 
-    flip = np.kron(np.eye(2), _FRD)
     velocity_cov = np.full((6, 6), np.nan)
-    velocity_cov[:3, :3] = _FRD @ odometry.velocity_cov_body @ _FRD
+    velocity_cov[:3, :3] = _FRD_COV * odometry.velocity_cov_body
     w, x, y, z = odometry.quaternion.tolist()
     return common.MAVLink_odometry_message(
         odometry.stamp_ns // 1000,
         common.MAV_FRAME_LOCAL_FRD,
         common.MAV_FRAME_BODY_FRD,
-        *(_FRD @ odometry.position_world).tolist(),
+        *(_FRD * odometry.position_world).tolist(),
         [w, x, -y, -z],
-        *(_FRD @ odometry.velocity_body).tolist(),
+        *(_FRD * odometry.velocity_body).tolist(),
         *(3 * [float("nan")]),
-        _upper(flip @ odometry.pose_cov @ flip),
-        _upper(velocity_cov),
+        (np.tile(_FRD_COV, (2, 2)) * odometry.pose_cov)[_UPPER].tolist(),
+        velocity_cov[_UPPER].tolist(),
         reset_counter=resets % 256,
         # There is no word for magnetic beacons, and PX4 refuses what it does not take for vision.
         estimator_type=common.MAV_ESTIMATOR_TYPE_VIO,
         quality=quality,
     )
-
-
-def _upper(cov: Array) -> list[float]:
-    return [float(c) for c in cov[np.triu_indices(6)]]
 
 
 class MavlinkSender:
