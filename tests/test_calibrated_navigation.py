@@ -7,11 +7,28 @@ from pathlib import Path
 import calibrated_navigation
 import numpy as np
 import pytest
-from calibrated_navigation import PAPER, Config, means
+from calibrated_navigation import PAPER, Config, means, report, taken_off
+
+Table = dict[str, dict[str, list[float]]]
 
 
-def test_calibration_leaves_nearly_what_exact_beacons_leave() -> None:
-    told = means(calibrated_navigation.run(Config(worlds=4, targets=60), workers=1))
+@pytest.fixture(scope="module")
+def told() -> Table:
+    return means(calibrated_navigation.run(Config(worlds=4, targets=60), workers=1))
+
+
+def test_what_calibration_takes_off_stands_beside_the_papers_share(told: Table) -> None:
+    printed = taken_off(PAPER["geometric"], PAPER["calibrated"])
+    assert printed == pytest.approx((28.6, 62.8), abs=0.1)  # per cent
+    ours = taken_off(told["geometric"]["trilateration"], told["calibrated"]["trilateration"])
+    assert min(ours) > max(printed)  # of exact amplitudes
+    last = report(told).splitlines()[-1].split()
+    assert last[:2] == ["taken", "off"]
+    assert [float(cell) for cell in last[2::2][-2:]] == pytest.approx([-28.6, -62.9])
+    assert [float(cell) for cell in last[2:6:2]] == pytest.approx([-s for s in ours], abs=0.05)
+
+
+def test_calibration_leaves_nearly_what_exact_beacons_leave(told: Table) -> None:
     for method in ("trilateration", "likelihood"):
         geometric, calibrated, true = (told[s][method] for s in calibrated_navigation.SITES)
         assert calibrated[0] < 0.4 * geometric[0]  # m
@@ -36,6 +53,11 @@ def test_an_amplitude_error_that_gives_the_papers_calibrated_gives_its_uncalibra
     paper_m, paper_deg = PAPER["geometric"]
     # Selected to match.
     assert told["calibrated"]["trilateration"][0] == pytest.approx(0.110, abs=0.008)
+    position_share, attitude_share = taken_off(
+        told["geometric"]["trilateration"], told["calibrated"]["trilateration"]
+    )
+    assert position_share == pytest.approx(28.6, abs=6.0)  # per cent
+    assert attitude_share == pytest.approx(45.0, abs=6.0)  # 62.8 printed
     # Predicted.
     assert abs(position - paper_m) < 3.0 * spread / np.sqrt(worlds)
     assert abs(angle - paper_deg) < 3.0 * spread_deg / np.sqrt(worlds)

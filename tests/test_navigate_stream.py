@@ -104,6 +104,15 @@ def test_nan_and_null_are_missing_samples_as_in_tables(
     assert told == f"magfusion: imu: {count} samples are NaN. They are left out.\n"
 
 
+def test_a_stream_that_begins_with_missing_samples_waits(site: Path) -> None:
+    """What holds no sample has no time at which anything could be said."""
+    missing = json_line({"imu": {"time": 1.0, "gyro": [None, 0.0, 0.0], "accel": [0.0, 0.0, 9.8]}})
+    present = json_line({"imu": {"time": 1.1, "gyro": [0.0, 0.0, 0.0], "accel": [0.0, 0.0, 9.8]}})
+    found, told = answered(site, missing + present)
+    assert [line["time"] for line in found] == [1.1]
+    assert told == "magfusion: imu: 1 samples are NaN. They are left out.\n"
+
+
 def test_a_state_tells_all_that_is_known(walk: OnlineLog, site: Path) -> None:
     last = answered(site, records(walk))[0][-1]
     truth = walk.motion.trajectory(np.array([last["time"]]))

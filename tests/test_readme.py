@@ -1,10 +1,13 @@
-"""What the README says is what happens: its blocks run in their order, in an empty directory."""
+"""What the README says is what happens: its blocks run in their order, in an empty directory.
+
+The figures of its prose are those of `told_figures.yaml`: see `test_told_figures`.
+"""
 
 import re
 from pathlib import Path
 
 import pytest
-from page_blocks import blocks, run_blocks
+from page_blocks import agree, blocks, differences, run_blocks
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -16,6 +19,39 @@ def test_every_block_of_the_readme_runs_and_shows_what_it_says(tmp_path: Path) -
     run_blocks(README, tmp_path)
     for name in ("magfusion_demo", "run", "navigated"):
         assert (tmp_path / name / "trajectory.tum").is_file()
+
+
+@pytest.mark.parametrize(
+    ("told", "shown", "same"),
+    [
+        ("0.0293", "0.0294", True),
+        ("0.0293", "0.0331", False),
+        ("-17", "-17.9", True),
+        ("-17", "17", False),
+        ("-0.001", "+0.0003", True),
+        ("-0.001", "+0.007", False),
+        ("4.23", "2.23", False),
+        ("2e-05", "2.1e-05", True),
+        ("2e-05", "5e-05", False),
+    ],
+)
+def test_a_number_is_what_is_told_within_a_tenth_or_its_last_digit(
+    told: str, shown: str, same: bool
+) -> None:
+    assert agree(told, shown) is same
+
+
+def test_other_words_numbers_and_lines_are_told_and_the_machines_speed_is_not() -> None:
+    page = next(block for language, block in BLOCKS if language == "text")
+    assert not differences(page, page)
+    assert not differences(page, page.replace("8.36 s", "83.6 s"))
+    other = differences(page, page.replace("4.23", "8.46"))
+    assert [line.split()[:3] for line in other] == [
+        ["told", "mean", "NEES"],
+        ["shown", "mean", "NEES"],
+    ]
+    assert differences(page, page.replace("TRUSTWORTHY", "DOUBTFUL"))
+    assert differences(page, page.splitlines()[0])
 
 
 def test_the_readme_shows_blocks_of_every_kind() -> None:

@@ -1,8 +1,8 @@
 """What the pages of the documentation have from the code: tables of options and of codes.
 
-A page says where: ``<!-- options: smooth -->`` and ``<!-- codes -->``; a heading that is the code
-of a finding is followed by what the code means.  Formulas become MathML, which needs no script.
-`mkdocs` calls the hook.
+A page says where: ``<!-- options: smooth -->``, ``<!-- codes -->``, ``<!-- papers -->`` and
+``<!-- paper: 004 -->``; a heading that is the code of a finding is followed by what it means.
+Formulas become MathML, which needs no script.  `mkdocs` calls the hook.
 """
 
 import dataclasses
@@ -17,11 +17,15 @@ from latex2mathml.converter import convert
 from magfusion.jobs import JOBS
 from magfusion.jobs.settings import Command, Option, options
 from magfusion.model.trust import CODES
+from magfusion.papers.register import FINDINGS, KINDS, Numbered, paper, papers
 
 OPTIONS = re.compile(r"<!-- options: ([a-z -]+) -->")
 ENTRY = re.compile(r"^### `(\w+)`$", re.M)
 FORMULA = re.compile(r"^\$\$\s(.+?)\$\$$", re.M | re.S)
 CODES_HERE = "<!-- codes -->"
+PAPERS_HERE = "<!-- papers -->"
+_OF_PAPERS = "magfusion.papers."
+PAPER = re.compile(r"<!-- paper: (\d+) -->")
 
 
 def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
@@ -78,6 +82,44 @@ def code_table() -> str:
     return _table(("code", "what it says"), rows)
 
 
+def papers_table() -> str:
+    """Return the four papers, and how many findings there are of each kind."""
+    rows = [
+        (
+            f"[{one.number}](papers/{one.number}.md)",
+            one.about,
+            *(str([e.entry.finding for e in one.entries].count(f)) for f in FINDINGS),
+        )
+        for one in papers()
+    ]
+    meanings = "\n".join(f"- *{finding}*: {text}" for finding, text in FINDINGS.items())
+    return f"{_table(('paper', 'about', *FINDINGS), rows)}\n\n{meanings}"
+
+
+def paper_page(number: str) -> str:
+    """Return all that is known of one paper, kind by kind."""
+    one = paper(number)
+    parts = [one.citation.text, *filter(None, [one.note])]
+    for kind, short in KINDS.items():
+        rows = [_paper_row(entry) for entry in one.of(kind)]
+        if rows:
+            told = _table((short, "says", "finding", "function", "shown by"), rows)
+            parts.append(f"## {kind.capitalize()}s\n\n{told}")
+    return "\n\n".join(parts)
+
+
+def _paper_row(one: Numbered) -> tuple[str, ...]:
+    entry = one.entry
+    place = f" (section {entry.where})" if entry.where else ""
+    finding = f"*{entry.finding}*{f': {entry.why}' if entry.why else ''}"
+    finding += f" **Figures:** {entry.figures}." if entry.figures else ""
+    called = "<br>".join(f"`{function.removeprefix(_OF_PAPERS)}`" for function in one.functions)
+    shown = [*entry.tests, *filter(None, [entry.scenario])]
+    shown = [f"`{text.rpartition('/')[2].replace('::', '` `')}`" for text in shown]
+    row = (str(one.number), entry.says + place, finding, called, "<br>".join(shown))
+    return tuple(text.replace("|", "\\|") for text in row)
+
+
 def _meaning(heading: str) -> str:
     meaning = CODES.get(heading)
     return f"\n\n*{meaning[0].upper()}{meaning[1:]}.*\n" if meaning else ""
@@ -90,6 +132,8 @@ def _mathml(formula: str) -> str:
 def on_page_markdown(markdown: str, **_: object) -> str:
     """Fill the tables in; called by mkdocs for every page."""
     filled = OPTIONS.sub(lambda found: option_table(found[1]), markdown)
+    filled = PAPER.sub(lambda found: paper_page(found[1]), filled)
+    filled = filled.replace(PAPERS_HERE, papers_table()) if PAPERS_HERE in filled else filled
     filled = FORMULA.sub(lambda found: _mathml(found[1]), filled)
     filled = ENTRY.sub(lambda found: found[0] + _meaning(found[1]), filled)
     return filled.replace(CODES_HERE, code_table())

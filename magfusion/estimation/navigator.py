@@ -19,6 +19,7 @@ from magfusion.estimation.input_queue import Arrivals
 from magfusion.estimation.integrity.bank import SubsetBank
 from magfusion.estimation.integrity.inertial_noise import measured_noise
 from magfusion.estimation.integrity.judgement import JudgedState, Judgement, Told, judged_state
+from magfusion.estimation.integrity.resets import Resets
 from magfusion.estimation.integrity.summary import Summary
 from magfusion.estimation.measurements.earth import check_earth
 from magfusion.estimation.measurements.measurement import Measurement
@@ -52,6 +53,7 @@ class Navigator:
     _made: list[JudgedState]
     _told: deque[Told]
     _white: list[float]
+    _resets: Resets
     summary: Summary
     why_no_start: NoStart
     rival_chi_square: float | None
@@ -77,7 +79,7 @@ class Navigator:
         imu = site.platform.imu
         self._white = [imu.gyro_noise, imu.accel_noise]  # what states are carried with
         self._judgement, self._made, self._told = Judgement(), [], deque()
-        self.summary = Summary()
+        self._resets, self.summary = Resets(), Summary()
         self.why_no_start = NoStart()
         self.rival_chi_square = None
 
@@ -172,7 +174,7 @@ class Navigator:
         last = self._estimator.state
         wanted = self._arrived.inertial if time is None else time
         state = last if wanted <= last.time else self._propagated(wanted).state
-        return judged_state(state, self._judgement)
+        return judged_state(state, self._judgement, self._resets.counter)
 
     @property
     def distortion(self) -> dict[str, float]:
@@ -192,13 +194,14 @@ class Navigator:
         if not isinstance(self._estimator, SlidingWindow):
             return []
         left, self._estimator.left = self._estimator.left, []
-        return [judged_state(state, self._judgement_at(state.time)) for state in left]
+        told = [(state, self._told_at(state.time)) for state in left]
+        return [judged_state(state, t.judgement, t.reset_counter) for state, t in told]
 
-    def _judgement_at(self, time: float) -> Judgement:
+    def _told_at(self, time: float) -> Told:
         """Return what was said of a time, and forget what was said before."""
         while len(self._told) > 1 and self._told[1].time <= time:
             self._told.popleft()
-        return self._told[0].judgement if self._told else Judgement()
+        return self._told[0] if self._told else Told(time, Judgement())
 
     @property
     def counts(self) -> Counter[str]:
@@ -326,7 +329,9 @@ class Navigator:
             self._arrived.fill_silence(self._estimator.state, time)
         predicted = self._propagated(time)
         judgement = self._update.take_in(self._estimator, self._arrived, predicted, samples)
-        state = self._estimator.state
+        state, counts = self._estimator.state, self.counts
+        restarts = counts["found by a fix"] + counts["lost and found again"]
+        self._resets.hear(predicted.state, state, self._judgement, judgement, restarts)
         self._tell(state, judgement)
         lag = self._arrived.apply_offset_anew(state, self.blocks)
         if lag:
@@ -336,10 +341,11 @@ class Navigator:
 
     def _tell(self, state: State, judgement: Judgement) -> None:
         self._judgement = judgement
-        self._made.append(judged_state(state, judgement))
+        counter = self._resets.counter
+        self._made.append(judged_state(state, judgement, counter))
         self.summary.note(state.time, judgement)
         if self.settings.estimator == "smoother":
-            self._told.append(Told(state.time, judgement))
+            self._told.append(Told(state.time, judgement, counter))
 
     def _propagated(self, time: float) -> Propagated:
         assert self._estimator is not None

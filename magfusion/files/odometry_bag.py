@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.result_states import ResultStates
+from magfusion.model.fixed_axes import fixed_axes_covariance
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
@@ -31,23 +32,11 @@ class Frames(NamedTuple):
     namespace: str = "/magfusion"
 
 
-def fixed_axes_covariance(trajectory: Trajectory) -> Array:
-    """Return covariances of poses as ROS means them, shape (n, 6, 6).
-
-    Ours is of a small motion on the right: rotation, then translation, both in body axes.  That of
-    ``geometry_msgs/PoseWithCovariance`` is of x, y, z and of rotations about the X, Y and Z axes of
-    the header's frame, which do not move the position.  To first order both parts are turned into
-    the world: ``d_position_world = R d_position_body`` and ``R exp(d) = exp(R d) R``.
-
-    Without a covariance, `UNKNOWN_VARIANCE` is on the diagonal.
-    """
-    n = len(trajectory)
+def _pose_covariance(trajectory: Trajectory) -> Array:
+    """Return covariances of poses, shape (n, 6, 6); `UNKNOWN_VARIANCE` where there are none."""
     if trajectory.pose_cov is None:
-        return np.tile(UNKNOWN_VARIANCE * np.eye(6), (n, 1, 1))
-    jacobian = np.zeros((n, 6, 6))
-    jacobian[:, :3, 3:] = jacobian[:, 3:, :3] = trajectory.world_from_body
-    cov = jacobian @ trajectory.pose_cov @ jacobian.swapaxes(1, 2)
-    return np.asarray(0.5 * (cov + cov.swapaxes(1, 2)))
+        return np.tile(UNKNOWN_VARIANCE * np.eye(6), (len(trajectory), 1, 1))
+    return fixed_axes_covariance(trajectory.world_from_body, trajectory.pose_cov)
 
 
 def write_bag(
@@ -101,7 +90,7 @@ def _messages(states: ResultStates, frames: Frames, types: Any) -> Iterator[tupl
     """Yield odometry and pose of each state."""
     found = states.trajectory
     quaternion = Rotation.from_matrix(found.world_from_body).as_quat().tolist()
-    cov = fixed_axes_covariance(found).reshape(-1, 36)
+    cov = _pose_covariance(found).reshape(-1, 36)
     velocity = np.zeros((len(found), 3))
     if found.velocity_world is not None:
         velocity = np.einsum("nji,nj->ni", found.world_from_body, found.velocity_world)

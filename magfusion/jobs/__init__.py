@@ -56,6 +56,10 @@ JOBS = {
         "Find roll, or roll and pitch, from the Earth's field, by a database or in closed form.",
     ),
     "replay": ("replay", "Print a log as the records that magfusion navigate - reads."),
+    "papers": (
+        "papers",
+        "Say of any equation, table, figure or claim of four papers where it is and if it holds.",
+    ),
     "simulate": ("simulate", "Simulate a log, with truth, in the files a user has."),
     "coverage": (
         "coverage",

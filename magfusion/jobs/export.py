@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from magfusion.errors import InputError
-from magfusion.jobs.settings import Command, Settings, argument, option
+from magfusion.jobs.settings import Command, FrameSettings, argument, option
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figure, Figures, Section
 
@@ -23,24 +23,17 @@ _NAMESPACE = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExportSettings(Settings):
+class ExportSettings(FrameSettings):
     """What is handed on, and how."""
 
     result: Path = argument("Result directory, or a table of states in it")
     format: Format | None = option(
         None, "Form of the file", note="default: what its name ends with"
     )
-    frame: str = option("world", "Frame of the poses, in a bag")
-    child: str = option("body", "Frame that they are the poses of, in a bag")
     namespace: str = option("/magfusion", "Of the topics odometry and pose, in a bag")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("frame", "child"):
-            if not getattr(self, name).strip():
-                raise InputError(f"--{name} must name a frame; got nothing")
-        if self.frame == self.child:
-            raise InputError(f"--frame and --child must differ; got {self.frame!r} for both")
         if not _NAMESPACE.fullmatch(self.namespace):
             raise InputError(f"--namespace must be of the form /robot/nav; got {self.namespace!r}")
 

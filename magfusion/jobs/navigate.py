@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.jobs.live import LiveSettings, state_sinks
 from magfusion.jobs.settings import (
     Command,
     EarthSettings,
@@ -26,20 +27,27 @@ from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Site
 
 if TYPE_CHECKING:
+    from magfusion.estimation.integrity.judgement import JudgedState
     from magfusion.estimation.navigator import Navigator, NavigatorSettings
     from magfusion.files.row_file import RowFile
     from magfusion.jobs.inputs import Job
+    from magfusion.jobs.live import StateSink
     from magfusion.jobs.navigate_results import NavigateResults
     from magfusion.jobs.replay import Replay
     from magfusion.model.samples import Log
     from magfusion.model.trust import Trust
     from magfusion.results.figures import Figures
-    from magfusion.results.recording_live import LiveView
 
 
 @dataclass(frozen=True, kw_only=True)
 class NavigateSettings(
-    LogSettings, WindowSettings, ReplayedSettings, EarthSettings, EstimateSettings, RiskSettings
+    LogSettings,
+    WindowSettings,
+    ReplayedSettings,
+    EarthSettings,
+    EstimateSettings,
+    RiskSettings,
+    LiveSettings,
 ):
     """How to navigate as data come, along a log or by records on standard input."""
 
@@ -56,7 +64,6 @@ class NavigateSettings(
         most=10.0,
         note="so much later are states",
     )
-    live: bool = option(False, "Show the states in the viewer")
     checkpoint: Path | None = option(
         None, "Checkpoint file", note="default: in the output while the job runs"
     )
@@ -110,7 +117,7 @@ def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
         settings.navigator(Job(settings.log, settings.site, Path())),
         settings.form,
         settings.keep_going,
-        settings.live,
+        settings,
         settings.checkpoint,
         settings.every,
         settings.resume,
@@ -150,22 +157,23 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
             f"{job.log_path}: holds only phasors, which know nothing of the Earth field; give the"
             " log with magnetometer.parquet, or leave --earth out"
         )
-    made = _make_parent(place)
-    run = _open_run(settings, navigator, log, site, place)
-    try:
-        with named(job.log_path):
-            _advance(run, settings, report)
-        figures, trust, results = _results(run)
-        with claimed as whole:
-            directory = found_in(whole, trust)
-            if results is not None:
-                write_navigated(directory, log, results)
-            write_report(whole, figures, None if results is None else motion_of(log, results))
-    except (InputError, EstimationError):
-        _clear(run, place, made)
-        raise
-    finally:
-        run.rows.close()
+    with state_sinks(settings, site, log.epoch_ns, sys.stderr) as sinks:
+        made = _make_parent(place)
+        run = _open_run(settings, navigator, log, site, place, sinks)
+        try:
+            with named(job.log_path):
+                _advance(run, settings, report)
+            figures, trust, results = _results(run)
+            with claimed as whole:
+                directory = found_in(whole, trust)
+                if results is not None:
+                    write_navigated(directory, log, results)
+                write_report(whole, figures, None if results is None else motion_of(log, results))
+        except (InputError, EstimationError):
+            _clear(run, place, made)
+            raise
+        finally:
+            run.rows.close()
     if settings.checkpoint is not None:
         _clear(run, place, made)
     refuse_failed(job.log_path, job.output, trust)
@@ -204,7 +212,7 @@ class NavigateRun:
     key: str
     position: int
     elapsed: float
-    view: LiveView | None
+    sinks: tuple[StateSink, ...]
 
 
 def _make_parent(place: Path) -> list[Path]:
@@ -235,14 +243,18 @@ def _rows_path(place: Path) -> Path:
 
 
 def _open_run(
-    settings: NavigateSettings, navigator: NavigatorSettings, log: Log, site: Site, place: Path
+    settings: NavigateSettings,
+    navigator: NavigatorSettings,
+    log: Log,
+    site: Site,
+    place: Path,
+    sinks: tuple[StateSink, ...],
 ) -> NavigateRun:
     from magfusion.files.checkpoint import run_key
     from magfusion.files.row_file import RowFile
     from magfusion.jobs.checkpoint import Kept, begin
     from magfusion.jobs.navigate_results import row_columns
     from magfusion.jobs.replay import PIECE, Replay
-    from magfusion.results.recording_live import open_live_view
 
     streams = [s for s in (log.imu, log.waveform, log.fields) if s is not None]
     key = run_key("navigate", site, navigator, PIECE, log.epoch_ns, streams)
@@ -256,7 +268,7 @@ def _open_run(
         key=key,
         position=begun.position,
         elapsed=begun.beside.elapsed,
-        view=open_live_view(site) if settings.live else None,
+        sinks=sinks,
     )
 
 
@@ -279,13 +291,22 @@ def _advance(run: NavigateRun, settings: NavigateSettings, report: Report) -> No
             # The first state is the result of a whole smoother.
             latency = spent if running else np.nan
             run.rows.append(state_row(run.navigator, state, latency, lagged=False))
-            if run.view is not None and not state.lost:
-                run.view.show(state, run.navigator.distortion)
+            _tell(run, state)
         for state in run.navigator.take_lagged():
             run.rows.append(state_row(run.navigator, state, np.nan, lagged=True))
         if k % every == 0:
             report("navigating", k, len(run.replay))
     run.elapsed = time.perf_counter() - began
+
+
+def _tell(run: NavigateRun, state: JudgedState) -> None:
+    """Tell who listens of a state."""
+    if run.sinks:
+        from magfusion.jobs.stream import state_content
+
+        told = state_content(run.navigator, state)
+        for sink in run.sinks:
+            sink.take(state, told)
 
 
 def _save(run: NavigateRun, position: int, elapsed: float) -> None:

@@ -370,6 +370,22 @@ class ReplayedSettings(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class FrameSettings(Settings):
+    """What ROS and Foxglove call the frames."""
+
+    frame: str = option("world", "Frame of the poses, for ROS and Foxglove")
+    child: str = option("body", "Frame that they are the poses of, for ROS and Foxglove")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("frame", "child"):
+            if not getattr(self, name).strip():
+                raise InputError(f"--{name} must name a frame; got nothing")
+        if self.frame == self.child:
+            raise InputError(f"--frame and --child must differ; got {self.frame!r} for both")
+
+
+@dataclass(frozen=True, kw_only=True)
 class RandomSettings(Settings):
     """What is drawn."""
 

@@ -24,9 +24,9 @@ from magfusion.files.stream import (
     whole_rows,
 )
 from magfusion.jobs.checkpoint import begin, save
+from magfusion.jobs.live import LiveSettings, StateSink, state_sinks
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding
-from magfusion.results.recording_live import open_live_view
 from magfusion.units import Array
 
 _PLACE = {"json": "line", "msgpack": "record"}
@@ -43,8 +43,8 @@ class StreamSettings:
         Of the records.
     keep_going : bool
         Count and pass over what is no record.
-    live : bool
-        Show the states in the viewer.
+    live : LiveSettings
+        Who else is told of the states.
     checkpoint : Path, optional
         Where to leave what is needed to go on.
     every : float
@@ -56,7 +56,7 @@ class StreamSettings:
     navigator: NavigatorSettings = field(default_factory=NavigatorSettings)
     form: Format = "json"
     keep_going: bool = False
-    live: bool = False
+    live: LiveSettings = field(default_factory=LiveSettings)
     checkpoint: Path | None = None
     every: float = 30.0
     resume: bool = False
@@ -85,9 +85,20 @@ def run_stream(
         Where the site cannot be read, or a record is none and ``keep_going`` is not set.
     """
     site = load_site(site_path)
+    with state_sinks(settings.live, site, 0, messages) as sinks:
+        return _navigate(site, settings, source, sink, messages, sinks)
+
+
+def _navigate(
+    site: Site,
+    settings: StreamSettings,
+    source: BinaryIO,
+    sink: BinaryIO,
+    messages: TextIO,
+    others: tuple[StateSink, ...],
+) -> int:
     key, place = run_key("stream", site, settings.navigator), settings.checkpoint
     navigator = begin(place, key, site, settings.navigator, None, resume=settings.resume).navigator
-    view = open_live_view(site) if settings.live else None
     refused, saved, reached = 0, -np.inf, -np.inf
     missing: Counter[str] = Counter()
     for numbered in read_records(source, settings.form):
@@ -101,12 +112,10 @@ def run_stream(
             messages.write(f"magfusion: {sentence} (passed over)\n")
             continue
         for state in navigator.take():
-            sink.write(json_line(state_content(navigator, state)))
-            if view is not None and not state.lost:
-                view.show(state, navigator.distortion)
+            _tell(sink, others, state, state_content(navigator, state))
         navigator.take_lagged()
-        if not navigator.started and newest >= reached + WAITING:
-            sink.write(json_line(_waiting(navigator, newest)))
+        if not navigator.started and -np.inf < newest >= reached + WAITING:
+            _tell(sink, others, None, _waiting(navigator, newest))
             reached = newest
         sink.flush()
         if place is not None and newest >= saved + settings.every:
@@ -117,6 +126,14 @@ def run_stream(
     if refused:
         messages.write(f"magfusion: {refused} records were passed over\n")
     return refused
+
+
+def _tell(
+    sink: BinaryIO, others: tuple[StateSink, ...], state: JudgedState | None, told: dict[str, Any]
+) -> None:
+    sink.write(json_line(told))
+    for other in others:
+        other.take(state, told)
 
 
 def _take_in(navigator: Navigator, site: Site, numbered: Numbered, missing: Counter[str]) -> float:
@@ -165,6 +182,7 @@ def state_content(navigator: Navigator, state: JudgedState) -> dict[str, Any]:
         "time": state.time,
         "started": True,
         "lost": state.lost,
+        "reset_counter": state.reset_counter,
         "verdict": str(state.verdict),
         "reasons": _said(state.judgement.reasons),
         "excluded": list(state.judgement.excluded),

@@ -1,7 +1,7 @@
 """The fields of a beacon's coils as they are declared: dipoles, loops, current sheets.
 
 A coil without a size is a dipole.  One with a radius is a thin loop, one with a length as well a
-uniform current sheet, one with a length alone a line of dipoles (paper 002, Eq 2-3): those with a
+uniform current sheet, one with a length alone a line of dipoles: those with a
 length are as many loops, or dipoles, as Gauss and Legendre's rule has nodes.  The relative error
 is below 1e-9 from half a length off the axis, and below 1e-6 from three tenths of it.
 """

@@ -68,6 +68,7 @@ class Told:
 
     time: float
     judgement: Judgement
+    reset_counter: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,9 +78,13 @@ class JudgedState(State):
     Parameters
     ----------
     judgement : Judgement
+    reset_counter : int
+        How often the pose has jumped up to here, as `magfusion.estimation.integrity.resets` has it:
+        who follows a pose by its changes begins anew where it rises.
     """
 
     judgement: Judgement = Judgement()
+    reset_counter: int = 0
 
     @property
     def verdict(self) -> Verdict:
@@ -92,7 +97,8 @@ class JudgedState(State):
         return self.verdict is Verdict.FAILED
 
 
-def judged_state(state: State, judgement: Judgement) -> JudgedState:
+def judged_state(state: State, judgement: Judgement, reset_counter: int = 0) -> JudgedState:
     """Return a state of an estimator as it is told."""
     own = {field.name: getattr(state, field.name) for field in fields(State)}
-    return JudgedState(**own | {"cov": judgement.honest(state.cov)}, judgement=judgement)
+    told = {"cov": judgement.honest(state.cov), "judgement": judgement}
+    return JudgedState(**own | told | {"reset_counter": reset_counter})

@@ -21,7 +21,7 @@ NOT_FUNCTIONS = {
     6: "names the nine entries of the drive X",
     7: "names the nine entries of the coupling Y",
     8: "names nine entries of the ambient field; False: one silent slot measures three of them",
-    19: "is Eq 18 at scale one",
+    19: "is Eq 18 at scale one; Misprint as that: both sides have one name",
 }
 
 
@@ -42,8 +42,8 @@ def eq_05_coupling(
 ) -> Array:
     """Return ``Y = -(K / R^3) H M X + A``, as measured.
 
-    Right with one vector in all columns of A, which the silent slot measures and which is to be
-    subtracted as `magfusion.receiver.ambient` does.
+    Misprint: it is called the coupling after A was removed.  Right as measured, with one vector in
+    all columns of A, which the silent slot has and `magfusion.receiver.ambient` takes off.
     """
     return eq_01_coupling(gain, attitude, position_beacon, drive) + ambient
 

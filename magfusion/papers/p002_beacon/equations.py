@@ -26,7 +26,7 @@ NOT_FUNCTIONS = {
     23: "step to Eq 26: the error of the matrix of Eq 19, of that of the directions",
     24: "step to Eq 26: its mean",
     25: "step to Eq 26; False: T is made of the estimated centre, hence not free of the errors",
-    26: "concludes that Eq 19 has no bias; Right to first order: 7 mm of the centre at 5 % noise",
+    26: "concludes that Eq 19 has no bias; False beyond first order: 7 mm of the centre at 5 %",
     27: "step to Eq 30: the sine of a small error is the error; Right",
     28: "step to Eq 30: element (3, 1) of the matrix as a function of psi and its error",
     29: "step to Eq 30: names the variance of element (3, 1)",
@@ -36,7 +36,7 @@ eq_01_field = dipole_field
 """Right."""
 
 eq_02_field = solenoid_field
-"""Unclear: a sum over dipoles along the axis and over radii; here the coil that they stand for."""
+"""Unclear: a coil that stands for rows and columns of turns; here that of Biot and Savart."""
 
 
 def eq_03_moment(current: float, turns: float, radius: Array) -> Array:
@@ -48,7 +48,7 @@ def eq_03_moment(current: float, turns: float, radius: Array) -> Array:
 
 
 eq_04_direction = p004.eq_07_direction
-"""Corrected as Eq 6-7 of paper 004; right of normals in the beacon's axes, z > 0, alone."""
+"""Unclear; taken for Eq 6-7 of paper 004, Corrected, of normals in the beacon's axes, z > 0."""
 
 eq_07_attitude = p004.eq_20_attitude
 """Right: ``Rz(gamma) Ry(psi) Rx(lambda)``."""

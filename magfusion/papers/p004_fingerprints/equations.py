@@ -145,7 +145,7 @@ eq_12_field = dipole_field
 
 
 def eq_13_log_field(offset: Array, moment: Array) -> Array:
-    """Return ln |B| (B in T) of a moment (..., 3) (A m^2).  Right, but that ``ln B`` is ln |B|."""
+    """Return ln |B| (B in T) of a moment (..., 3) (A m^2).  Misprint: ``ln B``; Right else."""
     distance = np.linalg.norm(offset, axis=-1)
     angular = eq_14_angular_term(offset / distance[..., None], moment)
     return eq_15_log_amplitude(distance, -3.0, eq_16_intercept(angular))

@@ -1,0 +1,109 @@
+"""Where states go as they are made, beside the files: the viewer, and what robots listen to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, TextIO
+
+from magfusion.jobs.settings import FrameSettings, option
+
+if TYPE_CHECKING:
+    from magfusion.estimation.integrity.judgement import JudgedState
+    from magfusion.model.site import Site
+    from magfusion.results.recording_live import LiveView
+
+
+class StateSink(Protocol):
+    """Takes states one by one, and never makes the estimator wait."""
+
+    def take(self, state: JudgedState | None, told: Mapping[str, Any]) -> None:
+        """Take a state, None before the first, with what the pipe tells of it."""
+
+    def close(self) -> str | None:
+        """End; return what went wrong on the way, as a sentence without its full stop."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveSettings(FrameSettings):
+    """Who is told of states as they are made."""
+
+    live: bool = option(False, "Show the states in the viewer")
+    mavlink: str | None = option(
+        None,
+        "Send the states as MAVLink ODOMETRY, by UDP",
+        metavar="udpout:HOST:PORT",
+        note="magfusion[mavlink]",
+    )
+    foxglove: str | None = option(
+        None,
+        "Serve the states to Foxglove, by WebSocket",
+        metavar="[HOST:]PORT",
+        note="magfusion[foxglove]",
+    )
+    ros2: str | None = option(
+        None,
+        "Publish the states as nav_msgs/Odometry of ROS 2, by DDS",
+        metavar="TOPIC",
+        note="magfusion[ros2]",
+    )
+
+
+@contextmanager
+def state_sinks(
+    settings: LiveSettings, site: Site, epoch_ns: int, messages: TextIO
+) -> Iterator[tuple[StateSink, ...]]:
+    """Yield what takes the states, and tell at the end what went wrong with it.
+
+    Parameters
+    ----------
+    epoch_ns : int
+        When the time of states is zero (ns since 1970).
+
+    Raises
+    ------
+    InputError
+        Where one cannot be opened.
+    """
+    sinks: list[StateSink] = []
+    try:
+        for sink in _opened(settings, site, epoch_ns):
+            sinks.append(sink)  # one by one: those before one that fails are to be closed
+        yield tuple(sinks)
+    finally:
+        for sink in sinks:
+            wrong = sink.close()
+            if wrong is not None:
+                messages.write(f"magfusion: {wrong}\n")
+
+
+def _opened(settings: LiveSettings, site: Site, epoch_ns: int) -> Iterator[StateSink]:
+    if settings.mavlink is not None:
+        from magfusion.results.odometry_mavlink import MavlinkSender
+
+        yield MavlinkSender(settings.mavlink, epoch_ns)
+    if settings.foxglove is not None:
+        from magfusion.results.live_foxglove import FoxgloveServer
+
+        yield FoxgloveServer(settings.foxglove, epoch_ns, settings.frame, settings.child)
+    if settings.ros2 is not None:
+        from magfusion.results.odometry_dds import RosPublisher
+
+        yield RosPublisher(settings.ros2, epoch_ns, settings.frame, settings.child)
+    if settings.live:
+        from magfusion.results.recording_live import open_live_view
+
+        yield _Viewer(open_live_view(site))
+
+
+@dataclass(frozen=True)
+class _Viewer:
+    view: LiveView
+
+    def take(self, state: JudgedState | None, told: Mapping[str, Any]) -> None:
+        if state is not None and not state.lost:
+            self.view.show(state, told["distortion"])
+
+    def close(self) -> None:
+        """Leave the viewer open."""

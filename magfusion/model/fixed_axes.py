@@ -1,0 +1,28 @@
+"""Covariances of poses about axes that do not move with the body, as robots exchange them."""
+
+import numpy as np
+
+from magfusion.units import Array
+
+
+def fixed_axes_covariance(world_from_body: Array, pose_cov: Array) -> Array:
+    """Return covariances as ROS and MAVLink mean them: position, then rotation, in world axes.
+
+    Ours is of a small motion on the right: rotation, then translation, both in body axes.  That of
+    ``geometry_msgs/PoseWithCovariance`` is of x, y, z and of rotations about the X, Y and Z axes of
+    the header's frame, which do not move the position.  To first order both parts are turned into
+    the world: ``d_position_world = R d_position_body`` and ``R exp(d) = exp(R d) R``.
+
+    Parameters
+    ----------
+    world_from_body : ndarray, shape (..., 3, 3)
+    pose_cov : ndarray, shape (..., 6, 6)
+
+    Returns
+    -------
+    ndarray, shape (..., 6, 6)
+    """
+    jacobian = np.zeros_like(pose_cov)
+    jacobian[..., :3, 3:] = jacobian[..., 3:, :3] = world_from_body
+    cov = jacobian @ pose_cov @ jacobian.swapaxes(-1, -2)
+    return np.asarray(0.5 * (cov + cov.swapaxes(-1, -2)))

@@ -1,0 +1,222 @@
+"""What four papers say and what is true of it: every equation, table, figure and claim.
+
+`magfusion papers` prints it and a page of the documentation is made of it; a test holds that
+nothing is missing and that every function, test and scenario that an entry names is there.
+"""
+
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Literal, Self, get_args
+
+from pydantic import Field, model_validator
+
+from magfusion.errors import InputError
+from magfusion.files.yaml_files import StrictModel, read_yaml
+
+Finding = Literal["right", "misprint", "false", "not reproducible", "unclear"]
+Kind = Literal["equation", "table", "figure", "claim"]
+FINDINGS: dict[Finding, str] = {
+    "right": "it holds as printed",
+    "misprint": "a symbol is wrong, and it is clear which one is meant",
+    "false": "it does not hold; the counter-example is given",
+    "not reproducible": "what it depends on is not printed, or does not lead to what is",
+    "unclear": "the source has lost it, or does not say enough; what is here is a reading",
+}
+KINDS: dict[Kind, str] = {"equation": "Eq", "table": "Table", "figure": "Fig", "claim": "Claim"}
+ROOMS = {
+    "000": "p000_tracker",
+    "001": "p001_magnetometer",
+    "002": "p002_beacon",
+    "004": "p004_fingerprints",
+}
+_ASKED = re.compile(r"(?:(eq|tab|fig|claim)[a-z]*)?[\s.(]*(\d*)[\s.)]*", re.ASCII)
+
+
+class Citation(StrictModel):
+    """Where a paper was published; ``doi_note`` says where the DOI is from, or that none is."""
+
+    authors: list[str]
+    title: str
+    original_title: str
+    journal: str
+    original_journal: str
+    year: int
+    issue: str
+    pages: str
+    doi: str | None
+    doi_note: str
+
+    @property
+    def text(self) -> str:
+        """The citation on one line."""
+        doi = f"doi:{self.doi}" if self.doi else "no DOI known"
+        return (
+            f"{', '.join(self.authors)}: {self.title} ({self.original_title})."
+            f" {self.journal} ({self.original_journal}) {self.issue}, {self.pages} ({self.year})."
+            f" {doi} ({self.doi_note})."
+        )
+
+
+class Entry(StrictModel):
+    """One equation, table, figure or claim.
+
+    Parameters
+    ----------
+    says : str
+        What the paper says, in a few words.
+    where : str
+        The section, of what has no printed number.
+    finding : str
+        One of `FINDINGS`.
+    why : str
+        The correction, the counter-example, or what is missing.
+    figures : str
+        What the paper prints, and what is found here.
+    functions : list of str
+        Where it can be called; a name without dots is one of the room's ``equations``.
+    tests : list of str
+        Node ids of what shows it.
+    scenario : str, optional
+        The file that shows it at length.
+    """
+
+    says: str
+    where: str = ""
+    finding: Finding
+    why: str = ""
+    figures: str = ""
+    functions: list[str] = Field(default_factory=list)
+    tests: list[str] = Field(default_factory=list)
+    scenario: str | None = None
+
+    @model_validator(mode="after")
+    def _told(self) -> Self:
+        if self.finding != "right" and not self.why:
+            raise ValueError(f"a finding of {self.finding} needs its why")
+        if not (self.why or self.functions or self.tests or self.scenario):
+            raise ValueError("nothing shows it; give why, functions, tests or scenario")
+        return self
+
+
+_Entries = dict[int, Entry]
+
+
+class _File(StrictModel):
+    about: str
+    note: str = ""
+    citation: Citation
+    equations: _Entries
+    tables: _Entries
+    figures: _Entries
+    claims: _Entries = Field(default_factory=dict)
+
+
+class Numbered(StrictModel):
+    """An entry with its paper and number, as a reader asks for it."""
+
+    paper: str
+    category: Kind
+    number: int
+    entry: Entry
+
+    @property
+    def name(self) -> str:
+        """As ``Eq 7``."""
+        return f"{KINDS[self.category]} {self.number}"
+
+    @property
+    def functions(self) -> list[str]:
+        """Whole dotted paths of what computes it."""
+        room = f"magfusion.papers.{ROOMS[self.paper]}.equations"
+        return [f if "." in f else f"{room}.{f}" for f in self.entry.functions]
+
+    def content(self) -> dict[str, object]:
+        """Return it as plain values, as ``--json`` prints it."""
+        named = {"paper": self.paper, "name": self.name, "category": self.category}
+        return (
+            named
+            | {"number": self.number}
+            | self.entry.model_dump()
+            | {"functions": self.functions}
+        )
+
+
+class Paper(StrictModel):
+    """A paper and all that it says, in the order of its numbers; a note on our copy of it."""
+
+    number: str
+    about: str
+    note: str
+    citation: Citation
+    entries: list[Numbered]
+
+    def of(self, kind: Kind) -> list[Numbered]:
+        """Return the entries of one kind."""
+        return [one for one in self.entries if one.category == kind]
+
+    def asked(self, words: str) -> list[Numbered]:
+        """Return what is asked for as ``7``, ``eq 7``, ``fig. 8`` or ``claims``.
+
+        Raises
+        ------
+        InputError
+            Where the paper has no such thing.
+        """
+        parts = _ASKED.fullmatch(words.lower())
+        if parts is None or not any(parts.groups()):
+            raise InputError(f"{words!r} is no number of paper {self.number}; {self._offer()}")
+        kind = next(k for k in get_args(Kind) if k.startswith(parts[1] or "eq"))
+        found = [one for one in self.of(kind) if int(parts[2] or one.number) == one.number]
+        if not found:
+            raise InputError(f"paper {self.number} has no {words.strip()!r}; {self._offer()}")
+        return found
+
+    def _offer(self) -> str:
+        held = [
+            f"{KINDS[kind].lower()} {few[0].number}" + f" to {few[-1].number}" * (len(few) > 1)
+            for kind in KINDS
+            if (few := self.of(kind))
+        ]
+        return f"it has {', '.join(held)}"
+
+
+def paper(name: str) -> Paper:
+    """Return one of the papers of `ROOMS`, by its number or its DOI.
+
+    Raises
+    ------
+    InputError
+        Where there is no such paper.
+    """
+    if name in ROOMS:
+        return _read(name)
+    found = [one for one in papers() if one.citation.doi == name.lower()]
+    if not found:
+        raise InputError(f"there is no paper {name!r}; give one of {', '.join(ROOMS)}")
+    return found[0]
+
+
+def papers() -> list[Paper]:
+    """Return all papers."""
+    return [_read(number) for number in ROOMS]
+
+
+@cache
+def _read(number: str) -> Paper:
+    file = read_yaml(Path(__file__).parent / ROOMS[number] / "register.yaml", _File)
+    entries = list(_numbered(number, file))
+    return Paper(
+        number=number,
+        about=file.about,
+        note=file.note,
+        citation=file.citation,
+        entries=entries,
+    )
+
+
+def _numbered(number: str, file: _File) -> Iterator[Numbered]:
+    for kind in get_args(Kind):
+        for place, entry in sorted(getattr(file, f"{kind}s").items()):
+            yield Numbered(paper=number, category=kind, number=place, entry=entry)

@@ -1,0 +1,126 @@
+"""States as they are made, for Foxglove: a WebSocket server that the app opens."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from magfusion.errors import InputError
+from magfusion.estimation.integrity.judgement import JudgedState
+from magfusion.files.stream import json_line
+from magfusion.results.odometry import odometry_of
+
+HOST = "127.0.0.1"
+_NS = 1_000_000_000
+_STATE = {
+    "title": "magfusion.State",
+    "type": "object",
+    "properties": {
+        "time": {"type": "number"},
+        "started": {"type": "boolean"},
+        "lost": {"type": "boolean"},
+        "verdict": {"type": ["string", "null"]},
+        "protection_level_m": {"type": ["number", "null"]},
+        "protection_level_deg": {"type": ["number", "null"]},
+        "reset_counter": {"type": "integer"},
+        "position": {"type": "array", "items": {"type": "number"}},
+        "quaternion": {"type": "array", "items": {"type": "number"}},
+        "velocity": {"type": "array", "items": {"type": "number"}},
+        "distortion": {"type": "object", "additionalProperties": {"type": "number"}},
+    },
+}
+
+
+class FoxgloveServer:
+    """Serves ``/magfusion/state``, and ``/magfusion/pose`` and ``/tf`` of states not lost.
+
+    Who listens too slowly misses messages; nothing waits for that.
+
+    Parameters
+    ----------
+    address : str
+        ``[HOST:]PORT``; without a host only this machine is served.
+    epoch_ns : int
+        When the time of states is zero (ns since 1970).
+    frame, child : str
+        Names of the frames.
+
+    Raises
+    ------
+    InputError
+        Where it cannot listen there, or foxglove-sdk is not installed.
+    """
+
+    def __init__(self, address: str, epoch_ns: int, frame: str, child: str) -> None:
+        try:
+            import foxglove
+            from foxglove import channels, messages
+        except ImportError as error:
+            raise InputError(
+                "--foxglove: foxglove-sdk is not installed; pip install 'magfusion[foxglove]'"
+            ) from error
+        host, port = _parted(address)
+        context = self._context = foxglove.Context()  # kept, since it takes its channels along
+        try:
+            self._server = foxglove.start_server(
+                name="magfusion", host=host, port=port, context=context
+            )
+        except RuntimeError as error:
+            raise InputError(
+                f"--foxglove {address!r}: it cannot listen there ({str(error).splitlines()[0]});"
+                " give another port, or an address of this machine"
+            ) from error
+        self._state = foxglove.Channel("/magfusion/state", schema=_STATE, context=context)
+        self._pose = channels.PoseInFrameChannel("/magfusion/pose", context=context)
+        self._transform = channels.FrameTransformChannel("/tf", context=context)
+        self._messages, self._epoch_ns = messages, epoch_ns
+        self._frame, self._child = frame, child
+
+    @property
+    def port(self) -> int:
+        """Where it listens."""
+        return self._server.port
+
+    def take(self, state: JudgedState | None, told: Mapping[str, Any]) -> None:
+        """Publish what is told of a state, and its pose if it has one."""
+        stamp = max(0, self._epoch_ns + round(float(told["time"]) * _NS))
+        self._state.log(json_line(dict(told)), log_time=stamp)
+        if state is None or state.lost:
+            return
+        found, make = odometry_of(state, self._epoch_ns), self._messages
+        x, y, z = found.position_world.tolist()
+        place = make.Vector3(x=x, y=y, z=z)
+        w, x, y, z = found.quaternion.tolist()
+        turn, time = make.Quaternion(x=x, y=y, z=z, w=w), make.Timestamp(*divmod(stamp, _NS))
+        pose = make.PoseInFrame(
+            timestamp=time,
+            frame_id=self._frame,
+            pose=make.Pose(position=place, orientation=turn),
+        )
+        transform = make.FrameTransform(
+            timestamp=time,
+            parent_frame_id=self._frame,
+            child_frame_id=self._child,
+            translation=place,
+            rotation=turn,
+        )
+        self._pose.log(pose, log_time=stamp)
+        self._transform.log(transform, log_time=stamp)
+
+    def close(self) -> None:
+        """End; who is still connected is told."""
+        self._server.stop()
+
+
+def _parted(address: str) -> tuple[str, int]:
+    """Return host and port of ``[HOST:]PORT``.
+
+    Raises
+    ------
+    InputError
+    """
+    host, _, port = address.rpartition(":")
+    if not port.isdecimal() or int(port) > 65535 or address.startswith(":"):
+        raise InputError(
+            f"--foxglove {address!r}: is no address to listen at; write a port, as 8765, or"
+            " HOST:PORT, as 0.0.0.0:8765 for everybody on the network"
+        )
+    return host.strip("[]") or HOST, int(port)

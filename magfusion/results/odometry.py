@@ -1,0 +1,64 @@
+"""One state as robots take it: pose and velocity, and what both may be off by."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.state import ROTATION, VELOCITY, State
+from magfusion.model.fixed_axes import fixed_axes_covariance
+from magfusion.units import Array
+
+_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Odometry:
+    """Pose in a world with z up, velocity in body axes.
+
+    Parameters
+    ----------
+    stamp_ns : int
+        Since the epoch of the drive phases, or 1970 where that is known to be so.
+    position_world, velocity_body : ndarray, shape (3,)
+        (m, m/s)
+    quaternion : ndarray, shape (4,)
+        Of ``world_from_body``, w first.
+    pose_cov : ndarray, shape (6, 6)
+        Position, then rotation, about the axes of the world (m^2, rad^2).
+    velocity_cov_body : ndarray, shape (3, 3)
+        (m^2/s^2)
+    """
+
+    stamp_ns: int
+    position_world: Array
+    quaternion: Array
+    velocity_body: Array
+    pose_cov: Array
+    velocity_cov_body: Array
+
+
+def odometry_of(state: State, epoch_ns: int = 0) -> Odometry:
+    """Return what robots take of a state.
+
+    Parameters
+    ----------
+    epoch_ns : int
+        When the time of states is zero (ns since 1970); no format has stamps before that.
+    """
+    world_from_body = state.world_from_body
+    velocity_body = world_from_body.T @ state.velocity_world
+    # v_body = exp(-phi) R^T v_world: an attitude that is off turns the velocity, too.
+    x, y, z = velocity_body
+    by_rotation = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    jacobian = np.zeros((3, 9))
+    jacobian[:, ROTATION], jacobian[:, VELOCITY] = by_rotation, world_from_body.T
+    velocity_cov = jacobian @ state.cov[:9, :9] @ jacobian.T
+    return Odometry(
+        stamp_ns=max(0, epoch_ns + round(state.time * _NS)),
+        position_world=state.position_world,
+        quaternion=Rotation.from_matrix(world_from_body).as_quat(scalar_first=True),
+        velocity_body=velocity_body,
+        pose_cov=fixed_axes_covariance(world_from_body, state.cov[:6, :6]),
+        velocity_cov_body=0.5 * (velocity_cov + velocity_cov.T),
+    )

@@ -1,0 +1,124 @@
+"""States as nav_msgs/Odometry by DDS, which nodes of ROS 2 receive; no ROS is installed here."""
+
+import os
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.integrity.judgement import JudgedState
+from magfusion.files.odometry_bag import UNKNOWN_VARIANCE
+from magfusion.results.odometry import Odometry, odometry_of
+
+_TOPIC = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
+_LAST_DOMAIN = 232  # its ports are the last ones that there are
+_NS = 1_000_000_000
+_DEPTH = 10  # messages that a reader may be late by, as the default of ROS
+
+
+def odometry_message(odometry: Odometry, frame: str, child: str) -> Any:
+    """Return a message; rates of turning, which no state has, are zero and their variance is huge.
+
+    Parameters
+    ----------
+    frame, child : str
+        Names of world and body.
+    """
+    from magfusion.results import ros_messages as ros
+
+    twist_cov = UNKNOWN_VARIANCE * np.eye(6)
+    twist_cov[:3, :3] = odometry.velocity_cov_body
+    w, x, y, z = odometry.quaternion.tolist()
+    pose = ros.Pose(ros.Point(*odometry.position_world.tolist()), ros.Quaternion(x, y, z, w))
+    twist = ros.Twist(ros.Vector3(*odometry.velocity_body.tolist()), ros.Vector3(0.0, 0.0, 0.0))
+    return ros.Odometry(
+        ros.Header(ros.Time(*divmod(odometry.stamp_ns, _NS)), frame),
+        child,
+        ros.PoseWithCovariance(pose, odometry.pose_cov.ravel().tolist()),
+        ros.TwistWithCovariance(twist, twist_cov.ravel().tolist()),
+    )
+
+
+class RosPublisher:
+    """Publishes the odometry of states that are not lost, in the domain ``ROS_DOMAIN_ID``.
+
+    Parameters
+    ----------
+    topic : str
+        As ROS writes it, ``/robot/odometry``.
+    epoch_ns : int
+        When the time of states is zero (ns since 1970).
+    frame, child : str
+        Names of the frames.
+
+    Raises
+    ------
+    InputError
+        Where the topic or the domain is none, or cyclonedds is not installed.
+    """
+
+    def __init__(self, topic: str, epoch_ns: int, frame: str, child: str) -> None:
+        if not _TOPIC.fullmatch(topic):
+            raise InputError(f"--ros2 {topic!r}: is no topic; write one as /robot/odometry")
+        domain = _domain()
+        try:
+            from cyclonedds.core import DDSException, Policy, Qos
+            from cyclonedds.domain import DomainParticipant
+            from cyclonedds.pub import DataWriter
+            from cyclonedds.topic import Topic
+            from cyclonedds.util import duration
+        except ImportError as error:
+            raise InputError(
+                "--ros2: cyclonedds is not installed; pip install 'magfusion[ros2]'"
+            ) from error
+        from magfusion.results.ros_messages import Odometry as Message
+
+        # Reliable, since readers of ROS ask for that, but it waits for none.
+        asked = Qos(
+            Policy.Reliability.Reliable(max_blocking_time=duration(seconds=0)),
+            Policy.History.KeepLast(_DEPTH),
+            Policy.Durability.Volatile,
+        )
+        try:
+            self._participant = DomainParticipant(domain)
+            self._writer = DataWriter(
+                self._participant, Topic(self._participant, f"rt{topic}", Message), qos=asked
+            )
+        except DDSException as error:
+            raise InputError(
+                f"--ros2 {topic!r}: DDS does not start in domain {domain} ({error}); see to the"
+                " network, ROS_DOMAIN_ID and CYCLONEDDS_URI"
+            ) from error
+        self._refusal, self._epoch_ns, self._frames = DDSException, epoch_ns, (frame, child)
+        self._unsent, self._why = 0, ""
+
+    def take(self, state: JudgedState | None, told: Mapping[str, Any]) -> None:  # noqa: ARG002
+        """Publish a state that is not lost."""
+        if state is None or state.lost:
+            return
+        try:
+            self._writer.write(odometry_message(odometry_of(state, self._epoch_ns), *self._frames))
+        except self._refusal as error:
+            self._unsent, self._why = self._unsent + 1, str(error)
+
+    def close(self) -> str | None:
+        """Leave the domain; return what went wrong."""
+        del self._writer, self._participant
+        if not self._unsent:
+            return None
+        return f"--ros2: {self._unsent} messages could not be sent ({self._why})"
+
+
+def _domain() -> int:
+    """Return the domain that ROS would take.
+
+    Raises
+    ------
+    InputError
+    """
+    text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
+    if not text.isdecimal() or int(text) > _LAST_DOMAIN:
+        raise InputError(f"ROS_DOMAIN_ID: found {text!r}; it should be from 0 to {_LAST_DOMAIN}")
+    return int(text)

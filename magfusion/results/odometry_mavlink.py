@@ -1,0 +1,161 @@
+"""States as MAVLink's ODOMETRY over UDP, as PX4 and ArduPilot take them from outside."""
+
+import socket
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.integrity.judgement import JudgedState
+from magfusion.model.trust import Verdict
+from magfusion.results.odometry import Odometry, odometry_of
+
+# Of the vehicle that it is on board of, which is 1 unless somebody changed it.
+SYSTEM = 1
+HEARTBEAT = 1.0  # s
+# Forward, right, down of forward, left, up.
+_FRD = np.array([1.0, -1.0, -1.0])
+_FRD_COV = np.outer(_FRD, _FRD)
+_UPPER = np.triu_indices(6)
+_ADDRESS = "udpout:HOST:PORT"
+
+
+def quality_percent(state: JudgedState) -> int:
+    """Return how good a state is, from 1 to 100 as MAVLink has it; 0 says that nobody knows.
+
+    Who receives it can set a limit: ``100 / (1 + protection level in metres)``, half of that where
+    the state is doubtful.  50 asks for a trustworthy one that is protected to a metre.
+    """
+    level = state.judgement.protection_level_m
+    if level is None:
+        return 0
+    share = 1.0 if state.verdict is Verdict.TRUSTWORTHY else 0.5
+    return max(1, int(share * 100.0 / (1.0 + level)))
+
+
+def odometry_message(odometry: Odometry, quality: int, resets: int) -> Any:
+    """Return a message ODOMETRY, from MAV_FRAME_BODY_FRD to MAV_FRAME_LOCAL_FRD.
+
+    Both frames are ours turned by half a turn about x.  The local one has a heading of its own, as
+    our world: it is not north.  Rates of turning, which no state has, are NaN.
+
+    Parameters
+    ----------
+    resets : int
+        How often the estimate has jumped.
+    """
+    from pymavlink.dialects.v20 import common
+
+    velocity_cov = np.full((6, 6), np.nan)
+    velocity_cov[:3, :3] = _FRD_COV * odometry.velocity_cov_body
+    w, x, y, z = odometry.quaternion.tolist()
+    return common.MAVLink_odometry_message(
+        odometry.stamp_ns // 1000,
+        common.MAV_FRAME_LOCAL_FRD,
+        common.MAV_FRAME_BODY_FRD,
+        *(_FRD * odometry.position_world).tolist(),
+        [w, x, -y, -z],
+        *(_FRD * odometry.velocity_body).tolist(),
+        *(3 * [float("nan")]),
+        (np.tile(_FRD_COV, (2, 2)) * odometry.pose_cov)[_UPPER].tolist(),
+        velocity_cov[_UPPER].tolist(),
+        reset_counter=resets % 256,
+        # There is no word for magnetic beacons, and PX4 refuses what it does not take for vision.
+        estimator_type=common.MAV_ESTIMATOR_TYPE_VIO,
+        quality=quality,
+    )
+
+
+class MavlinkSender:
+    """Sends a heartbeat and the odometry of every state that is not lost.
+
+    Nothing waits for who receives it, or minds that nobody does.
+
+    Parameters
+    ----------
+    address : str
+        ``udpout:HOST:PORT``.
+    epoch_ns : int
+        When the time of states is zero (ns since 1970).
+
+    Raises
+    ------
+    InputError
+        Where it is no address, or pymavlink is not installed.
+    """
+
+    def __init__(self, address: str, epoch_ns: int) -> None:
+        try:
+            from pymavlink.dialects.v20 import common
+        except ImportError as error:
+            raise InputError(
+                "--mavlink: pymavlink is not installed; pip install 'magfusion[mavlink]'"
+            ) from error
+        family, self._to = _resolved(address)
+        self._socket = socket.socket(family, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._mav = common.MAVLink(
+            self, SYSTEM, common.MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY, use_native=False
+        )
+        self._common, self._epoch_ns, self._beat = common, epoch_ns, -np.inf
+        self._unsent, self._why = 0, ""
+
+    def take(self, state: JudgedState | None, told: Mapping[str, Any]) -> None:
+        """Send what there is to say; a lost state has no odometry, only the heartbeat says so."""
+        found = state if state is not None and not state.lost else None
+        time = float(told["time"])
+        if not self._beat <= time < self._beat + HEARTBEAT:
+            self._mav.send(self._heartbeat(state))
+            self._beat = time
+        if found is not None:
+            odometry = odometry_of(found, self._epoch_ns)
+            quality = quality_percent(found)
+            self._mav.send(odometry_message(odometry, quality, found.reset_counter))
+
+    def write(self, message: bytes) -> None:
+        """Send the bytes of a message, or count that it cannot be."""
+        try:
+            self._socket.sendto(message, self._to)
+        except OSError as error:
+            self._unsent, self._why = self._unsent + 1, error.strerror or str(error)
+
+    def close(self) -> str | None:
+        """End; return what went wrong."""
+        self._socket.close()
+        if not self._unsent:
+            return None
+        return f"--mavlink: {self._unsent} messages could not be sent ({self._why})"
+
+    def _heartbeat(self, state: JudgedState | None) -> Any:
+        common = self._common
+        status = common.MAV_STATE_CALIBRATING
+        if state is not None:
+            status = common.MAV_STATE_CRITICAL if state.lost else common.MAV_STATE_ACTIVE
+        kind, pilot = common.MAV_TYPE_ONBOARD_CONTROLLER, common.MAV_AUTOPILOT_INVALID
+        return common.MAVLink_heartbeat_message(kind, pilot, 0, 0, status, 3)
+
+
+def _resolved(address: str) -> tuple[int, Any]:
+    """Return family and socket address of ``udpout:HOST:PORT``.
+
+    Raises
+    ------
+    InputError
+    """
+    kind, _, place = address.partition(":")
+    host, _, port = place.rpartition(":")
+    if kind != "udpout" or not host or not (port.isdecimal() and 0 < int(port) < 65536):
+        raise InputError(
+            f"--mavlink {address!r}: is no address to send to; write {_ADDRESS}, as in"
+            " udpout:192.168.4.1:14540"
+        )
+    try:
+        found = socket.getaddrinfo(host.strip("[]"), int(port), type=socket.SOCK_DGRAM)
+    except (OSError, UnicodeError) as error:
+        raise InputError(
+            f"--mavlink {address!r}: the host {host} is not known"
+            f" ({getattr(error, 'strerror', None) or error}); give its IP address"
+        ) from error
+    family, _, _, _, to = found[0]
+    return family, to

@@ -1,0 +1,101 @@
+"""nav_msgs/Odometry and what it is made of, as ROS 2 sends them by DDS: field by field.
+
+Nothing here is of ROS itself: on the wire a message is its fields in this order, and its name.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import array, float64, int32, uint32
+
+if TYPE_CHECKING:
+    Covariance = list[float]
+else:
+    Covariance = array[float64, 36]
+
+
+@dataclass
+class Time(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
+    """Seconds and nanoseconds since 1970."""
+
+    sec: int32
+    nanosec: uint32
+
+
+@dataclass
+class Header(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
+    """When, and in which frame."""
+
+    stamp: Time
+    frame_id: str
+
+
+@dataclass
+class Point(IdlStruct, typename="geometry_msgs.msg.dds_.Point_"):
+    """A place (m)."""
+
+    x: float64
+    y: float64
+    z: float64
+
+
+@dataclass
+class Quaternion(IdlStruct, typename="geometry_msgs.msg.dds_.Quaternion_"):
+    """An attitude, w last."""
+
+    x: float64
+    y: float64
+    z: float64
+    w: float64
+
+
+@dataclass
+class Pose(IdlStruct, typename="geometry_msgs.msg.dds_.Pose_"):
+    """Place and attitude."""
+
+    position: Point
+    orientation: Quaternion
+
+
+@dataclass
+class PoseWithCovariance(IdlStruct, typename="geometry_msgs.msg.dds_.PoseWithCovariance_"):
+    """A pose, and the covariance of position and rotation about fixed axes, row by row."""
+
+    pose: Pose
+    covariance: Covariance
+
+
+@dataclass
+class Vector3(IdlStruct, typename="geometry_msgs.msg.dds_.Vector3_"):
+    """A free vector."""
+
+    x: float64
+    y: float64
+    z: float64
+
+
+@dataclass
+class Twist(IdlStruct, typename="geometry_msgs.msg.dds_.Twist_"):
+    """Velocity (m/s) and rate of turning (rad/s)."""
+
+    linear: Vector3
+    angular: Vector3
+
+
+@dataclass
+class TwistWithCovariance(IdlStruct, typename="geometry_msgs.msg.dds_.TwistWithCovariance_"):
+    """A twist and its covariance, row by row."""
+
+    twist: Twist
+    covariance: Covariance
+
+
+@dataclass
+class Odometry(IdlStruct, typename="nav_msgs.msg.dds_.Odometry_"):
+    """Pose in the header's frame, twist in the child's."""
+
+    header: Header
+    child_frame_id: str
+    pose: PoseWithCovariance
+    twist: TwistWithCovariance

@@ -1,0 +1,224 @@
+"""What the papers claim beside their equations, and what is wrong with it."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import tracker_as_printed
+from scipy.spatial.transform import Rotation
+from tracker_table1 import TABLE
+
+from magfusion.calibration.magnetometer import from_paper, to_paper
+from magfusion.model.physics.dipole import dipole_field
+from magfusion.model.physics.solenoid import solenoid_field
+from magfusion.papers.p000_tracker.bench import bench_points, helmert, measure
+from magfusion.papers.p001_magnetometer import equations as p001
+from magfusion.papers.p002_beacon import equations as p002
+from magfusion.papers.p004_fingerprints import equations as p004
+from magfusion.papers.p004_fingerprints.fingerprint import (
+    NEIGHBOURS,
+    fingerprint_database,
+    locate_by_differential_range,
+    nearest,
+)
+from magfusion.papers.p004_fingerprints.rssi import fit_lines, trilaterate
+from magfusion.receiver.ellipse import plane_normal
+from magfusion.simulation.worlds import S0, draw_world
+from magfusion.units import DEGREE, NANOTESLA, Array
+
+# 000 -------------------------------------------------------------------------------------------
+
+
+def test_000_one_silent_slot_does_not_determine_nine_entries() -> None:
+    """Two hums that the silent slot measures alike, and that differ in the three columns of A."""
+    slot, hum, phase = 5e-3, 2.0 * np.pi * 50.0, 1.0  # s, rad/s, rad
+    begin = slot * np.arange(4.0)
+    middle = begin[3] + 0.5 * slot
+
+    def columns(sign: float) -> Array:
+        time = begin[:, None] + np.linspace(0.0, slot, 2001)
+        return np.mean(np.cos(hum * (time - middle) + sign * phase), axis=1)
+
+    one, other = columns(1.0), columns(-1.0)
+    assert one[3] == pytest.approx(other[3], abs=1e-12)
+    assert np.max(np.abs(one[:3] - other[:3])) > 0.5  # of the hum's amplitude
+
+
+def test_000_the_printed_correction_makes_known_errors_worse() -> None:
+    found = tracker_as_printed.run(tracker_as_printed.Config(poses=5000))
+    assert found.not_corrected == pytest.approx(2.45, abs=0.12)  # deg
+    assert found.as_printed == pytest.approx(4.84, abs=0.25)
+    assert found.put_right < 0.02
+
+
+def test_000_the_scenario_ends_with_one_json_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["tracker_as_printed.py", "--quick"])
+    tracker_as_printed.main()
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert told["put_right"] < told["not_corrected"] < told["as_printed"]
+
+
+def test_000_rows_of_table_1_that_cannot_be() -> None:
+    target, before, after = TABLE[:, 0], TABLE[:, 1], TABLE[:, 2]
+    assert before[3, 1] > 90.0  # deg, of an arcsine
+    assert after[3, 1] > 90.0
+    repeated = after[7:10, :2]  # yaw and pitch of rows 8 to 10, calibrated
+    np.testing.assert_array_equal(repeated, np.tile(before[7, :2], (3, 1)))
+    others = np.delete(after - target, [7, 8, 9], axis=0)[:, :2]
+    assert np.median(np.abs(others)) < 0.3 * np.min(repeated)
+    assert np.min(target) == 0.0
+    assert np.max(target) == 90.0
+    assert np.count_nonzero(np.count_nonzero(target, axis=1) > 1) == 3
+
+
+def test_000_four_readings_of_a_single_axis_probe_do_not_see_a_tilt() -> None:
+    """The derivative by the tilt of the component along the coil is zero at all four points."""
+    points = bench_points(0.3)  # m
+    tilt = 1.0 * DEGREE
+    turns = Rotation.from_rotvec(tilt * np.array([[0, 0, 0], [0, 1, 0], [0, 0, 1]])).as_matrix()
+    coils = np.swapaxes(turns, 1, 2)  # rows are the three coils' axes
+    field = dipole_field(points[:, :, None, None], coils)  # (axis, side, tilt, coil, 3)
+    of_x = field[1:, :, :, 0]  # of the coil along x, at the four points across it
+    along = of_x[..., 0] / np.abs(of_x[0, 0, 0, 0])
+    np.testing.assert_allclose(along[:, :, 1:] - along[:, :, :1], 0.0, rtol=0, atol=tilt**2)
+    across = np.linalg.norm(of_x[..., 1:], axis=-1) / np.abs(of_x[0, 0, 0, 0])
+    assert np.max(across[:, :, 1:]) > tilt  # which a probe of three axes does see
+    whole = np.moveaxis(field, (2, 3), (0, 1))  # (tilt, coil, axis, side, 3)
+    found = helmert(measure(whole, 0.3, on_axis=False).moments)
+    np.testing.assert_allclose(
+        np.linalg.norm(found, axis=1), tilt * np.array([0.0, 1.0, 1.0]), rtol=1e-3, atol=1e-9
+    )
+
+
+# 001 -------------------------------------------------------------------------------------------
+
+NED = np.array([2.7e-5, -4e-6, 4.7e-5])  # T
+BIAS, SCALE = np.array([6e-6, -2e-6, 3e-6]), np.array([1.1, 0.93, 1.02])
+E = np.array([[0.0, 0.02, -0.01], [0.015, 0.0, 0.03], [-0.02, 0.01, 0.0]])
+
+
+def test_001_eq_12_and_13_give_eq_16_only_with_the_field_for_m() -> None:
+    exy, ezy, by, ky = E[1, 0], E[1, 2], BIAS[1], SCALE[1]
+    (bn, be, bd), sensor = NED, (BIAS, SCALE, E)
+    last = [p001.eq_14_y_at_3(NED, *sensor), p001.eq_15_y_at_4(NED, *sensor)]
+    for mn, md, exact in ((bn, bd, True), (bn, 1.3 * bd, False), (0.7 * bn, bd, False)):
+        first = [by + ky * (be + exy * bn + ezy * md), by + ky * (-be - exy * mn + ezy * md)]
+        found = p001.eq_16_misalignment(np.array([*first, *last]), bd, ky)
+        assert bool(abs(found - ezy) < 1e-9) is exact
+    # And as they are called here, they are those with the field.
+    called = [p001.eq_12_y_at_1(NED, *sensor), p001.eq_13_y_at_2(NED, *sensor)]
+    assert p001.eq_16_misalignment(np.array([*called, *last]), bd, ky) == pytest.approx(ezy)
+
+
+def test_001_eq_14_alone_determines_no_parameter() -> None:
+    """One reading of four unknowns: another sensor has the same."""
+    sensor = (BIAS, SCALE, E)
+    other = (BIAS + np.array([0.0, 1e-6, 0.0]), SCALE, E.copy())
+    other[2][1, 2] += 1e-6 / (SCALE[1] * NED[2])
+    assert p001.eq_14_y_at_3(NED, *other) == pytest.approx(p001.eq_14_y_at_3(NED, *sensor))
+    assert p001.eq_12_y_at_1(NED, *other) != pytest.approx(p001.eq_12_y_at_1(NED, *sensor))
+
+
+def test_001_scale_and_misalignment_are_the_sensors_and_soft_iron_is_one_with_them() -> None:
+    rng = np.random.default_rng(11)
+    instrument, offset = from_paper(BIAS, SCALE, E)
+    assert np.max(np.abs(to_paper(instrument, offset)[2])) > 0.01  # far from any iron
+    soft_iron = np.eye(3) + 0.1 * rng.standard_normal((3, 3))
+    field = 5e-5 * rng.standard_normal((40, 3))  # T
+    measured = (field @ soft_iron.T) @ instrument.T + offset
+    one_sensor = to_paper(instrument @ soft_iron, offset)  # which has no iron about it
+    voltage = np.stack(
+        [v(field, *one_sensor) for v in (p001.eq_01_voltage_x, p001.eq_02_voltage_y)]
+        + [p001.eq_03_voltage_z(field, *one_sensor)],
+        axis=1,
+    )
+    np.testing.assert_allclose(voltage, measured, rtol=0, atol=1e-18)
+
+
+# 002 -------------------------------------------------------------------------------------------
+
+
+def test_002_the_preferred_attitudes_are_those_of_the_arccosine() -> None:
+    """Elements with independent errors: atan2 has the same variance at every lambda."""
+    sigma, lamdas = 1e-4, np.array([2.0, 45.0, 88.0]) * DEGREE
+    rng = np.random.default_rng(12)
+    variance, by_arccosine = [], []
+    for lamda in lamdas:
+        true = Rotation.from_euler("ZYX", [0.9, 0.3, lamda]).as_matrix()
+        drawn = true + sigma * rng.standard_normal((20_000, 3, 3))
+        variance.append(np.var(p002.eq_21_angles(drawn)[:, 2]))
+        elements = np.full((3, 3), sigma**2)
+        by_arccosine.append(float(p002.eq_31_variance_of_lambda(true, elements)))
+    np.testing.assert_allclose(variance, (sigma / np.cos(0.3)) ** 2, rtol=0.05)
+    assert by_arccosine[0] > 500.0 * by_arccosine[2]
+
+
+def test_002_twice_its_size_is_near_for_the_papers_beacon() -> None:
+    rng = np.random.default_rng(13)
+    direction = rng.standard_normal((4000, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    moment = np.array([0.0, 0.0, 1.0])
+    share = []
+    for distance in (0.7, 2.0):  # m; the coil is 35 cm long and 15 cm wide
+        dipole = dipole_field(distance * direction, moment)
+        off = solenoid_field(distance * direction, moment, 0.075, 0.35) - dipole
+        share.append(np.sqrt(np.mean(np.sum(off**2, axis=1) / np.sum(dipole**2, axis=1))))
+    assert share == pytest.approx([0.075, 0.0094], rel=0.05)
+
+
+# 004 -------------------------------------------------------------------------------------------
+
+
+def test_004_phasors_use_the_samples_better_than_pairs() -> None:
+    """115 A m^2 at 20 m and 45 degrees, a minute at 200 Hz, 3 nT: Eq 8 to 11 and the phasors."""
+    rng = np.random.default_rng(14)
+    count, runs, quarter = 12_000, 120, 2  # samples; 25 Hz at 200 Hz
+    phase = 0.5 * np.pi / quarter * np.arange(count)
+    true = p004.eq_02_direction(np.array(45.0 * DEGREE), np.array(0.4))
+    clean = p004.eq_04_field(20.0 * true, np.array([115.0, 115.0]), phase)
+    errors: dict[str, list[float]] = {"phasors": [], "pairs": [], "one a period": []}
+    for _ in range(runs):
+        seen = clean + 3.0 * NANOTESLA * rng.standard_normal((count, 3))
+        pairs = np.cross(seen[:-quarter], seen[quarter:])
+        phasor = 2.0 / count * np.exp(-1j * phase) @ seen
+        normals = (plane_normal(phasor), pairs.mean(axis=0), pairs[:: 4 * quarter].mean(axis=0))
+        for name, normal in zip(errors, normals, strict=True):
+            cosine = p004.eq_07_direction(normal) @ true
+            errors[name].append(np.arccos(min(1.0, float(cosine))) / DEGREE)
+    phasors, pairs, few = (np.sqrt(np.mean(np.square(e))) for e in errors.values())
+    assert phasors == pytest.approx(1.28, rel=0.2)  # deg
+    assert pairs > 1.3 * phasors
+    assert few > 3.0 * phasors
+
+
+def test_004_the_mean_over_beacons_of_eq_29_costs_its_gain() -> None:
+    """Algorithm 3 with Eq 28 put right, and Eq 29 as it is printed, in noise alone."""
+    errors = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        world = draw_world(S0, rng)
+        known = fingerprint_database(world.survey(rng), world.site)
+        target = world.layout.draw_targets(rng, 100)
+        amplitude = p004.eq_25_fingerprint(
+            world.measure(target, np.eye(3), rng).phasor_sensor[:, :, None]
+        )
+        reach = p004.distances(known.position_world, known.beacons_world)
+        slope = fit_lines(reach, known.amplitude).slope
+        _, point = nearest(known, amplitude, NEIGHBOURS)
+        fixed = p004.eq_28_range(reach[point], amplitude[:, None], known.amplitude[point], slope)
+        apart = np.mean(np.abs(fixed - reach[point]), axis=-1)  # over the beacons
+        found = np.concatenate(
+            [
+                trilaterate(one[None], points, points.mean(axis=0) + np.array([0.0, 0.0, 0.1]))
+                for one, points in zip(apart, known.position_world[point], strict=True)
+            ]
+        )
+        found[:, 2] = target[:, 2]  # which fingerprints of one height cannot tell
+        ours = locate_by_differential_range(known, amplitude)
+        errors.append([np.linalg.norm(p - target, axis=1).mean() for p in (found, ours)])
+    printed, right = np.mean(errors, axis=0)
+    assert printed > 0.08  # m
+    assert right == pytest.approx(0.008, rel=0.3)

@@ -1,0 +1,136 @@
+"""The figures that README and CHANGELOG print are those that their commands give."""
+
+import ast
+import json
+import os
+import re
+import subprocess
+from functools import cache
+from pathlib import Path
+from typing import Any, Self
+
+import pytest
+from page_blocks import SCRIPTS
+from pydantic import Field, model_validator
+
+from magfusion.files.yaml_files import StrictModel, read_yaml
+
+ROOT = Path(__file__).parents[1]
+LOGS = ROOT.parent / "shared" / "logs"
+
+
+class Figure(StrictModel):
+    """One number: by a key of the command's JSON, or held by a test."""
+
+    value: str
+    key: list[str | int] = Field(default_factory=list)
+    factor: float = 1.0
+    within: float | None = None
+    test: str | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if bool(self.key) == bool(self.test) or bool(self.key) != bool(self.within):
+            raise ValueError("give key and within, or test")
+        return self
+
+
+class Told(StrictModel):
+    """A sentence with figures, and the command that makes them."""
+
+    file: str = Field(alias="in")
+    says: str
+    command: str | None = None
+    slow: bool = False
+    by_hand: str | None = None
+    figures: list[Figure]
+
+    @model_validator(mode="after")
+    def _measured(self) -> Self:
+        if (self.command is None) != all(figure.test for figure in self.figures):
+            raise ValueError("give a command where a figure has a key, and only there")
+        return self
+
+
+class _Register(StrictModel):
+    figures: list[Told]
+    given: list[str]
+
+
+REGISTER = read_yaml(Path(__file__).with_name("told_figures.yaml"), _Register)
+
+
+@cache
+def _flat(name: str) -> str:
+    return " ".join((ROOT / name).read_text(encoding="utf-8").split())
+
+
+@pytest.mark.parametrize("told", REGISTER.figures, ids=lambda told: told.says[:50])
+def test_the_figures_are_printed_and_what_holds_them_is_there(told: Told) -> None:
+    assert told.says in _flat(told.file)
+    for figure in told.figures:
+        assert figure.value in told.says
+        if figure.test is not None:
+            path, _, name = figure.test.partition("::")
+            tree = ast.parse((ROOT / path).read_text())
+            assert name in {n.name for n in tree.body if isinstance(n, ast.FunctionDef)}
+
+
+MEASURED = [
+    pytest.param(told, id=told.says[:50], marks=[pytest.mark.slow] if told.slow else [])
+    for told in REGISTER.figures
+    if told.command
+]
+
+
+@pytest.mark.parametrize("told", MEASURED)
+def test_the_command_gives_the_figures(told: Told, tmp_path: Path) -> None:
+    assert told.command is not None
+    if "{logs}" in told.command and not LOGS.is_dir():
+        pytest.skip("the shared logs are not beside the repository")
+    found = _measured(told.command, tmp_path)
+    for figure in told.figures:
+        if figure.key:
+            value: Any = found
+            for part in figure.key:
+                value = value[part]
+            assert figure.factor * float(value) == pytest.approx(
+                float(figure.value), abs=figure.within
+            ), figure.key
+
+
+def _measured(command: str, directory: Path) -> Any:
+    """Run a command; return what its last line has in JSON."""
+    line = command.replace("{logs}", str(LOGS)).replace("scenarios/", f"{ROOT}/scenarios/")
+    done = subprocess.run(
+        line.split(),
+        cwd=directory,
+        env=os.environ | {"PATH": os.pathsep.join([str(SCRIPTS), os.environ["PATH"]])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d[\d.,]*\d|(?<![\w.])\d\b")
+
+
+def test_every_number_in_the_readmes_prose_is_measured_or_given() -> None:
+    """Outside of its blocks, which `test_readme` runs, and of what it points to."""
+    prose = re.sub(r"^```.*?^```$", "", (ROOT / "README.md").read_text(), flags=re.M | re.S)
+    prose = " ".join(re.sub(r"\]\([^)]*\)|`[^`]*`|^#+.*$", " ", prose, flags=re.M).split())
+    known = [t.says for t in REGISTER.figures if t.file == "README.md"] + REGISTER.given
+    for phrase in known:
+        prose = prose.replace(phrase, " ")
+    assert not NUMBER.findall(prose), "put them into told_figures.yaml"
+
+
+def test_what_is_given_is_in_the_readme() -> None:
+    assert all(phrase in _flat("README.md") for phrase in REGISTER.given)
+
+
+def test_the_drift_of_the_readme_is_that_of_its_page() -> None:
+    (told,) = re.findall(r"-?[\d.]+ ± [\d.]+ mm and -?[\d.]+ ± [\d.]+° a day", _flat("README.md"))
+    assert told in _flat("docs/jobs/drift.md")
