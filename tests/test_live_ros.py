@@ -161,6 +161,14 @@ def test_a_name_that_is_no_topic_is_refused(log: Path, refuse: Refuse, name: str
     assert f"--ros2 {name!r}: is no topic; write one as /robot/odometry" in said
 
 
+def test_frames_are_named_for_somebody(log: Path, refuse: Refuse) -> None:
+    said = refuse("navigate", "-", "--site", log / "site.yaml", "--frame", "map")
+    assert "--frame and --child are for --foxglove and --ros2; give one of them" in said
+    for names in (("--frame", "body"), ("--child", "world"), ("--child", " ")):
+        said = refuse("navigate", "-", "--site", log / "site.yaml", "--ros2", "/odometry", *names)
+        assert "must differ" in said or "must name a frame" in said
+
+
 @pytest.mark.parametrize("number", ["233", "-1", "home"])
 def test_a_domain_that_is_none_is_refused(
     log: Path, refuse: Refuse, monkeypatch: pytest.MonkeyPatch, number: str

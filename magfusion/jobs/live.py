@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TextIO
 
+from magfusion.errors import InputError
 from magfusion.jobs.settings import FrameSettings, option
 
 if TYPE_CHECKING:
@@ -48,6 +49,12 @@ class LiveSettings(FrameSettings):
         metavar="TOPIC",
         note="magfusion[ros2]",
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        named = (self.frame, self.child) != (FrameSettings.frame, FrameSettings.child)
+        if named and self.foxglove is None and self.ros2 is None:
+            raise InputError("--frame and --child are for --foxglove and --ros2; give one of them")
 
 
 @contextmanager
