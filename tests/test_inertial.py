@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.motion_shape import motion_at
 from magfusion.estimation.preintegration import (
     cut_at_epochs,
     low_passed,
     low_passed_rate_at,
-    motion_at,
     preintegrate,
 )
 from magfusion.model.samples import ImuSamples

@@ -12,11 +12,11 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.motion_shape import motion_at
 from magfusion.estimation.preintegration import (
     BRIDGE_ACCEL_NOISE,
     BRIDGE_GYRO_NOISE,
     GAP_SAMPLES,
-    motion_at,
 )
 from magfusion.estimation.solve.bordered import eliminate
 from magfusion.estimation.state import MOTION

@@ -18,7 +18,6 @@ from magfusion.model.strapdown import resting
 from magfusion.model.trajectory import Trajectory
 from magfusion.receiver.admission import Windows
 from magfusion.receiver.cycles import whole_cycles
-from magfusion.receiver.lockin import window_operator
 from magfusion.receiver.receiver import LockinReceiver, Receiver
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.turn import on_clock
@@ -77,9 +76,9 @@ class Demodulation:
                 )
             return self.log.steady
         assert self.windows is not None
-        site, settings = calibration.site, self.receiver.lockin().settings
+        site, receiver = calibration.site, self.receiver.lockin()
         imu = on_clock(calibration.on_log_rate(self.log.imu), calibration.time_offset)
-        operator = window_operator(waveform, imu, site, settings, self.windows)
+        operator = receiver.operator(waveform, imu, self.windows, site)
         offset = site.platform.magnetometer.offset
         _, steady = operator.demodulate(waveform.measured_sensor - offset)
         return replace(steady, measured_sensor=steady.measured_sensor + offset)
@@ -107,7 +106,7 @@ class Demodulation:
             found, _ = self.receiver.phasors(waveform, known, windows, site)
             return MotionCompensated.of_slots(found)
         length = self.receiver.settings.window
-        operator = window_operator(waveform, known, site, self.receiver.settings, windows)
+        operator = self.receiver.operator(waveform, known, windows, site)
         if self.blind is not None:
             operator = replace(operator, apart=self.blind)
         wave = demodulate_about(operator, waveform.measured_sensor, states, imu, calibration)

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.preintegration import Increments, cut_at_epochs, preintegrate
+from magfusion.model.quaternion import cross, product, turned
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel
 from magfusion.receiver.admission import meets
@@ -176,12 +177,12 @@ def _halves(increments: Increments, joined: int, start: IntArray, bias: Array) -
         rotation = (np.moveaxis(increments.gyro_body[rows], 2, 0) - gyro_bias) * dt
         gained = (np.moveaxis(increments.accel_body[rows], 2, 0) - accel_bias) * dt
         square = np.sum(rotation**2, axis=0)
-        once = _cross(rotation, gained)
-        twice = _cross(rotation, once)
+        once = cross(rotation, gained)
+        twice = cross(rotation, once)
         b, c, d = _coefficients(square)
-        position += velocity * dt + _turned(turn, (0.5 * gained + c * once + d * twice) * dt)
-        velocity += _turned(turn, gained + b * once + c * twice)
-        turn = _product(turn, _quaternion(rotation, square))
+        position += velocity * dt + turned(turn, (0.5 * gained + c * once + d * twice) * dt)
+        velocity += turned(turn, gained + b * once + c * twice)
+        turn = product(turn, _quaternion(rotation, square))
         path += np.sqrt(square)
         total += dt
     return _Halves(turn, velocity, position, total, path)
@@ -249,23 +250,4 @@ def _quaternion(rotation: Array, square: Array) -> Array:
     out[0] = 1.0 - x * (1 / 2 - x * (1 / 24 - x * (1 / 720 - x * (1 / 40320 - x / 3628800))))
     share = 1.0 - x * (1 / 6 - x * (1 / 120 - x * (1 / 5040 - x * (1 / 362880 - x / 39916800))))
     out[1:] = 0.5 * share * rotation
-    return out
-
-
-def _product(a: Array, b: Array) -> Array:
-    out = np.empty_like(a)
-    out[0] = a[0] * b[0] - np.sum(a[1:] * b[1:], axis=0)
-    out[1:] = a[0] * b[1:] + b[0] * a[1:] + _cross(a[1:], b[1:])
-    return out
-
-
-def _turned(quaternion: Array, vector: Array) -> Array:
-    lever = 2.0 * _cross(quaternion[1:], vector)
-    return np.asarray(vector + quaternion[0] * lever + _cross(quaternion[1:], lever))
-
-
-def _cross(a: Array, b: Array) -> Array:
-    out = np.empty_like(b)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        out[i] = a[j] * b[k] - a[k] * b[j]
     return out

@@ -4,49 +4,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.estimation.preintegration import low_passed, motion_at
+from magfusion.estimation.motion_shape import MotionShape
 from magfusion.estimation.state import State, as_trajectory
 from magfusion.model.field import observe_earth
 from magfusion.model.parameters import Calibration, linearize_channels, predict_channels
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
 from magfusion.model.trajectory import Trajectory
+from magfusion.model.waveform import Motion, carriers, predicted_waveform
 from magfusion.receiver.admission import Windows
 from magfusion.receiver.lockin import WindowOperator, window_operator
 from magfusion.receiver.receiver import LockinReceiver
 from magfusion.receiver.turn import on_clock
 from magfusion.units import Array, BoolArray, ComplexArray
 
-OFFSET_STEP = 5e-4  # s; of the difference quotient
 # By how much a motion that was found without an IMU errs within a window, one sigma.
 MISSED_SPIN, MISSED_PUSH = 1.5, 3.0  # rad/s^2, m/s^2
-
-
-def predicted_waveform(
-    motion: Trajectory, calibration: Calibration, earth_field_world: Array
-) -> Array:
-    """Return the samples that a magnetometer takes along a motion.
-
-    Parameters
-    ----------
-    motion : Trajectory
-        At the sample times.
-    earth_field_world : ndarray, shape (3,)
-        (T)
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        (T), measured axes, without noise.
-    """
-    site = calibration.site
-    phasor = predict_channels(
-        calibration, motion.time, motion.world_from_body, motion.position_world
-    )
-    frequencies = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
-    carrier = np.exp(2j * np.pi * frequencies * motion.time[:, None])
-    beacons = np.einsum("ncx,nc->nx", phasor, carrier).real
-    earth = observe_earth(site.platform.magnetometer, motion.world_from_body, earth_field_world)
-    return beacons + earth.measured_sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,20 +73,24 @@ def demodulate_about(
     site, known = calibration.site, states if path is None else path
     earth = np.zeros(3) if site.earth_field_world is None else site.earth_field_world
 
-    def predicted(stream: ImuSamples, time_offset: float) -> Array:
-        motion = motion_at(known, stream, time_offset, site.gravity, operator.time)
-        return predicted_waveform(motion, calibration, earth)
-
-    offset, slow = calibration.time_offset, low_passed(imu)
-    rest, left = operator.demodulate(measured_sensor - predicted(imu, offset))
-    change = predicted(slow, offset + OFFSET_STEP) - predicted(slow, offset - OFFSET_STEP)
+    offset, designs = calibration.time_offset, operator.designs
+    shape = MotionShape.of(known, imu, offset, site.gravity)
+    carrier = carriers(designs.frequencies_hz, designs.time)
+    predicted, change = predicted_waveform(
+        shape.at(designs.time),
+        calibration,
+        earth,
+        carrier,
+        Motion(*shape.by_time_offset(designs.time)),
+    )
+    rest, left = operator.demodulate(measured_sensor - predicted)
     at_centre = predict_channels(
         calibration, states.time, states.world_from_body, states.position_world
     )
     steady = observe_earth(site.platform.magnetometer, states.world_from_body, earth)
     return MotionCompensated(
         fields=replace(rest, phasor_sensor=rest.phasor_sensor + at_centre),
-        by_time_offset=operator.apply(change / (2.0 * OFFSET_STEP)),
+        by_time_offset=operator.apply(change),
         steady=replace(left, measured_sensor=left.measured_sensor + steady.measured_sensor),
     )
 

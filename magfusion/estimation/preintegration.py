@@ -1,17 +1,13 @@
-"""Inertial data between field epochs: preintegration, and the motion inside an interval."""
+"""Inertial data between field epochs: cut, averaged and preintegrated."""
 
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 from scipy.ndimage import uniform_filter1d
-from scipy.spatial.transform import Rotation, Slerp
 
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel
-from magfusion.model.strapdown import attitude_at, attitude_from_gyro
-from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
 # What may happen while the IMU is silent: the motion of a person or a vehicle.
@@ -153,7 +149,7 @@ def low_passed(imu: ImuSamples) -> ImuSamples:
 
     White noise in a derivative would pass for information on the time offset.
     """
-    size = 2 * _reach(imu) + 1
+    size = 2 * low_pass_reach(imu) + 1
     gyro, accel = (
         uniform_filter1d(stream, size, axis=0, mode="nearest")
         for stream in (imu.gyro_body, imu.accel_body)
@@ -176,7 +172,7 @@ def low_passed_rate_at(imu: ImuSamples, time_offset: float, wanted: Array) -> Ar
     ndarray, shape (m, 3)
         (rad/s)
     """
-    last, reach = len(imu) - 1, _reach(imu)
+    last, reach = len(imu) - 1, low_pass_reach(imu)
     before = np.clip(np.searchsorted(imu.time, wanted - time_offset) - 1, 0, max(last - 1, 0))
     after = np.minimum(before + 1, last)
     ends = np.zeros((2, len(wanted), 3))
@@ -187,76 +183,7 @@ def low_passed_rate_at(imu: ImuSamples, time_offset: float, wanted: Array) -> Ar
     return np.asarray(((1.0 - share) * ends[0] + share * ends[1]) / (2 * reach + 1))
 
 
-def _reach(imu: ImuSamples) -> int:
+def low_pass_reach(imu: ImuSamples) -> int:
+    """Return over how many samples on either side `low_passed` averages."""
     usual = float(np.median(np.diff(imu.time)))
     return int(0.5 * RATE_SPAN / usual)
-
-
-def motion_at(
-    states: Trajectory, imu: ImuSamples, time_offset: float, gravity: float, wanted: Array
-) -> Trajectory:
-    """Return the motion at any times: the IMU's shape between the states, through the states.
-
-    Parameters
-    ----------
-    states : Trajectory
-        With velocity and biases, at the field epochs.
-    time_offset : float
-        (s)
-    gravity : float
-        (m/s^2)
-    wanted : ndarray, shape (m,)
-        Strictly increasing (s).
-
-    Returns
-    -------
-    Trajectory
-        Pose and velocity at ``wanted``.  The IMU is integrated once over the log; what it then
-        lacks at the states is spread over the intervals, smoothly.
-    """
-    if states.velocity_world is None or states.gyro_bias_body is None:
-        raise ValueError("states must have velocity and biases")
-    assert states.accel_bias_body is not None
-    time = imu.time + time_offset
-    gyro = imu.gyro_body - _interpolated(time, states.time, states.gyro_bias_body)
-    accel = imu.accel_body - _interpolated(time, states.time, states.accel_bias_body)
-    chain = attitude_from_gyro(time, gyro)
-    at_states = attitude_at(chain, time, gyro, states.time)
-    world_from_start = Rotation.from_matrix(states.world_from_body) * at_states.inv()
-    turned = _turn_at(states.time, world_from_start, time) * chain
-    world_accel = turned.apply(accel) - [0.0, 0.0, gravity]
-    step = np.diff(time)[:, None]
-    gained = np.cumsum(0.5 * (world_accel[:-1] + world_accel[1:]) * step, axis=0)
-    velocity = np.concatenate([np.zeros((1, 3)), gained])
-    # Exact for an acceleration that is linear between samples.
-    inner = (2.0 * world_accel[:-1] + world_accel[1:]) * step**2 / 6.0
-    moved = np.cumsum(velocity[:-1] * step + inner, axis=0)
-    position = np.concatenate([np.zeros((1, 3)), moved])
-    path = CubicHermiteSpline(time, position, velocity)
-    lack = CubicHermiteSpline(
-        states.time,
-        states.position_world - path(states.time),
-        states.velocity_world - path.derivative()(states.time),
-    )
-    attitude = _turn_at(states.time, world_from_start, wanted) * attitude_at(
-        chain, time, gyro, wanted
-    )
-    inside = np.clip(wanted, states.time[0], states.time[-1])
-    beyond = (wanted - inside)[:, None]
-    return Trajectory(
-        time=wanted,
-        world_from_body=attitude.as_matrix(),
-        position_world=path(wanted) + lack(inside) + lack.derivative()(inside) * beyond,
-        velocity_world=path.derivative()(wanted) + lack.derivative()(inside),
-    )
-
-
-def _interpolated(time: Array, known: Array, values: Array) -> Array:
-    return np.stack([np.interp(time, known, axis) for axis in values.T], axis=1)
-
-
-def _turn_at(known: Array, rotations: Rotation, wanted: Array) -> Rotation:
-    """Interpolate slowly varying rotations, holding the ends."""
-    if len(known) == 1:
-        return Rotation.concatenate([rotations] * len(wanted))
-    return Slerp(known, rotations)(np.clip(wanted, known[0], known[-1]))

@@ -258,6 +258,54 @@ def _seen(
     )
 
 
+class Driven(NamedTuple):
+    """The field of coils that carry known currents.
+
+    Parameters
+    ----------
+    field_world : ndarray, shape (n, 3)
+        (T)
+    along_world : ndarray, shape (n, 3), optional
+        Its derivative along a displacement (T a unit of it).
+    """
+
+    field_world: Array
+    along_world: Array | None
+
+
+def driven_field(
+    beacon: Beacon, position_world: Array, current: Array, along_world: Array | None = None
+) -> Driven:
+    """Return the field of a beacon at points, its coils' currents given.
+
+    Parameters
+    ----------
+    position_world : ndarray, shape (n, 3)
+        (m)
+    current : ndarray, shape (n, coils)
+        Of each coil, as a share of its peak.
+    along_world : ndarray, shape (n, 3), optional
+        A displacement of the points, or their velocity.
+    """
+    world_from_beacon = beacon.world_from_beacon
+    offset = (position_world - beacon.position_world) @ world_from_beacon
+    if along_world is None:
+        coils, gradients = coil_fields(beacon, offset), None
+    else:
+        coils, gradients = coil_fields_and_gradients(beacon, offset)
+    mapped = _mapped(beacon, offset, coils)
+    if mapped is not None:
+        coils = (mapped.correction @ coils[..., None])[..., 0]
+    field = np.einsum("nc,ncx->nx", current, coils) @ world_from_beacon.T
+    if along_world is None or gradients is None:
+        return Driven(field, None)
+    if mapped is not None:
+        gradients = mapped.correction @ gradients + mapped.slope
+    slope = np.einsum("nc,ncxy->nxy", current, gradients)
+    along = np.einsum("nxy,ny->nx", slope, along_world @ world_from_beacon)
+    return Driven(field, along @ world_from_beacon.T)
+
+
 @dataclass(frozen=True, eq=False)
 class EarthObservation:
     """Predicted steady field with its Jacobian blocks, by what is on the other side of each.

@@ -7,7 +7,9 @@ that is a sum over three points on the axis, a long coil's that of Gauss and Leg
 is of the fourth power of size over distance.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -90,6 +92,15 @@ def points_apart(magnetometer: Magnetometer) -> list[Magnetometer]:
 
 def joined_phasors(apart: list[ComplexArray], magnetometer: Magnetometer) -> ComplexArray:
     """Return what the coils measure, of the phasors (..., tones, 3) at `points_apart`."""
+    return _joined_axes(apart, magnetometer)
+
+
+def joined_samples(apart: list[Array], magnetometer: Magnetometer) -> Array:
+    """Return what the coils measure, of the samples (..., 3) at `points_apart`."""
+    return _joined_axes(apart, magnetometer)
+
+
+def _joined_axes(apart: Sequence[Any], magnetometer: Magnetometer) -> Any:
     weights = _along(magnetometer)[1]
     count = len(weights)
     rows = [sum(w * apart[i * count + k][..., i] for k, w in enumerate(weights)) for i in range(3)]

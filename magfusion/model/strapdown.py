@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.model.quaternion import components, composed, product
 from magfusion.model.site import MotionModel
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -30,17 +31,19 @@ def rotation_increments(time: Array, gyro_body: Array) -> Rotation:
     return Rotation.from_rotvec(0.5 * (before + after) * dt + coning)
 
 
-def _prefix_products(rotations: Rotation) -> Rotation:
-    """Products of the first 1, 2, ... rotations: those of neighbouring pairs, then the odd ones."""
-    n = len(rotations)
+def _prefix_products(quaternion: Array) -> Array:
+    """Products of the first 1, 2, ... rotations: those of neighbouring pairs, then the odd ones.
+
+    Of and to shape (4, n), scalar first.
+    """
+    n = quaternion.shape[1]
     if n == 1:
-        return rotations
-    quaternion = rotations.as_quat()
-    pairs = _prefix_products(rotations[: n - 1 : 2] * rotations[1::2])
-    quaternion[1::2] = pairs.as_quat()
+        return quaternion
+    out = quaternion.copy()
+    out[:, 1::2] = _prefix_products(product(quaternion[:, : n - 1 : 2], quaternion[:, 1::2]))
     if n > 2:
-        quaternion[2::2] = (pairs[: (n - 1) // 2] * rotations[2::2]).as_quat()
-    return Rotation.from_quat(quaternion)
+        out[:, 2::2] = product(out[:, 1 : n - 1 : 2], quaternion[:, 2::2])
+    return out
 
 
 def attitude_from_gyro(time: Array, gyro_body: Array) -> Rotation:
@@ -58,9 +61,10 @@ def attitude_from_gyro(time: Array, gyro_body: Array) -> Rotation:
     Rotation
         n rotations, the first the identity.
     """
-    steps = rotation_increments(time, gyro_body)
-    first = Rotation.identity(1)
-    return _prefix_products(Rotation.concatenate([first, steps]))
+    steps = np.empty((4, len(time)))
+    steps[:, 0] = [1.0, 0.0, 0.0, 0.0]
+    steps[:, 1:] = components(rotation_increments(time, gyro_body))
+    return Rotation.from_quat(_prefix_products(steps).T, scalar_first=True)
 
 
 def attitude_at(attitude: Rotation, time: Array, gyro_body: Array, wanted: Array) -> Rotation:
@@ -82,7 +86,7 @@ def attitude_at(attitude: Rotation, time: Array, gyro_body: Array, wanted: Array
         m rotations.
     """
     index = _sample_before(time, wanted)
-    return attitude[index] * _turn_since(index, time, gyro_body, wanted)
+    return composed(attitude[index], _turn_since(index, time, gyro_body, wanted))
 
 
 def attitude_from_gyro_at(time: Array, gyro_body: Array, wanted: Array) -> Rotation:
@@ -103,30 +107,34 @@ def attitude_from_gyro_at(time: Array, gyro_body: Array, wanted: Array) -> Rotat
         m rotations, as of `attitude_at` on the chain of `attitude_from_gyro`.
     """
     index = _sample_before(time, wanted)
-    quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (len(wanted), 1))
-    carried = Rotation.identity()
+    quaternion = np.tile([[1.0], [0.0], [0.0], [0.0]], len(wanted))
+    carried = quaternion[:, :1]
     for lo in range(0, len(time) - 1, CHUNK):
         piece = slice(lo, lo + CHUNK + 1)
-        steps = rotation_increments(time[piece], gyro_body[piece])
-        here = np.flatnonzero((index > lo) & (index <= lo + len(steps)))
-        turned = carried * _products_of_first(steps, np.append(index[here] - lo, len(steps)))
-        quaternion[here] = turned[:-1].as_quat()
-        carried = turned[-1]
-    return Rotation.from_quat(quaternion) * _turn_since(index, time, gyro_body, wanted)
+        steps = components(rotation_increments(time[piece], gyro_body[piece]))
+        count = steps.shape[1]
+        here = np.flatnonzero((index > lo) & (index <= lo + count))
+        turned = product(carried, _products_of_first(steps, np.append(index[here] - lo, count)))
+        quaternion[:, here] = turned[:, :-1]
+        carried = turned[:, -1:]
+    since = components(_turn_since(index, time, gyro_body, wanted))
+    return Rotation.from_quat(product(quaternion, since).T, scalar_first=True)
 
 
-def _products_of_first(rotations: Rotation, count: IntArray) -> Rotation:
-    """Products of the first rotations, as many as each count tells, by products of pairs."""
-    n = len(rotations)
+def _products_of_first(quaternion: Array, count: IntArray) -> Array:
+    """Products of the first rotations, as many as each count tells, by products of pairs.
+
+    Of shape (4, n) to shape (4, len(count)), scalar first.
+    """
+    n = quaternion.shape[1]
     if n == 1:
-        return Rotation.from_rotvec(count[:, None] * rotations.as_rotvec())
-    pairs = rotations[: n - 1 : 2] * rotations[1::2]
-    quaternion = _products_of_first(pairs, count // 2).as_quat()
+        return np.where(count > 0, quaternion, [[1.0], [0.0], [0.0], [0.0]])
+    pairs = product(quaternion[:, : n - 1 : 2], quaternion[:, 1::2])
+    out = _products_of_first(pairs, count // 2)
     odd = np.flatnonzero(count % 2)
     if len(odd):
-        before = Rotation.from_quat(quaternion[odd])
-        quaternion[odd] = (before * rotations[count[odd] - 1]).as_quat()
-    return Rotation.from_quat(quaternion)
+        out[:, odd] = product(out[:, odd], quaternion[:, count[odd] - 1])
+    return out
 
 
 def _sample_before(time: Array, wanted: Array) -> IntArray:

@@ -6,9 +6,7 @@ still, what is found back into those of the window's centre, and the design hold
 each tone.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import starmap
 
 import numpy as np
 
@@ -21,21 +19,19 @@ from magfusion.receiver.admission import (
     silences,
     usual_step,
 )
+from magfusion.receiver.design import Designs, Maps, nuisances_hz
 from magfusion.receiver.noise import (
-    FittedWindows,
     noise_beside_tones,
     not_below,
     smoothed_over_windows,
 )
 from magfusion.receiver.turn import on_clock, standing_in, turn_of
 from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz
-from magfusion.units import Array, BoolArray, ComplexArray, IntArray
+from magfusion.units import Array, BoolArray, ComplexArray
 
-CHUNK = 1000  # windows demodulated at once: they fit in memory
 MOST_COMPARED = 50  # windows by which two clocks are compared
 LEAST_COMPARED = 0.8  # of the samples of the fullest
 UNSEEN_TURN = 1.0  # rad/s; of a person or a vehicle, while the gyro is silent
-WORST_CONDITION = 1e8  # of a normal matrix; beyond, the samples do not tell its columns apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +40,9 @@ class WindowOperator:
 
     Parameters
     ----------
+    designs : Designs
+        Of the sample times alone.
     channels : tuple of (str, int)
-    frequencies_hz, nuisance_hz : ndarray
-        Tones, and lines that are fitted beside them (Hz).
-    time : ndarray, shape (samples,)
-        (s)
     still_from_measured : ndarray, shape (samples, 3, 3)
         Takes each sample to axes that do not turn with the body.
     measured_from_still : ndarray, shape (windows, 3, 3)
@@ -62,12 +56,8 @@ class WindowOperator:
         Whose noise is not that of their neighbours: there the turn was found without a gyro.
     """
 
-    settings: LockinSettings
+    designs: Designs
     channels: tuple[tuple[str, int], ...]
-    frequencies_hz: Array
-    nuisance_hz: Array
-    time: Array
-    windows: Windows
     still_from_measured: Array
     measured_from_still: Array
     declared_noise: float
@@ -87,7 +77,13 @@ class WindowOperator:
         complex ndarray, shape (n, channels, 3)
             (T), measured axes at the centre of the window.
         """
-        return np.concatenate(list(starmap(self._phasor, self._fitted(measured_sensor))))
+        still = self._still(measured_sensor)
+        return np.concatenate(
+            [
+                self._phasor(rows, maps.solver[:, 1:] @ _of_windows(still, maps))
+                for rows, maps in self.designs.pieces()
+            ]
+        )
 
     def demodulate(self, measured_sensor: Array) -> tuple[FieldSamples, SteadyFields]:
         """Turn raw samples into phasors and the steady field beside them, each with covariance.
@@ -100,27 +96,28 @@ class WindowOperator:
             have been taken off: the gyro turns with the samples what does not turn with the
             platform.
         """
-        n, parts = len(self.frequencies_hz), []
-        for rows, fit in self._fitted(measured_sensor):
-            turn = self.measured_from_still[rows]
-            beside_hz = np.concatenate([self.nuisance_hz, self.settings.lines_hz])
-            noise = noise_beside_tones(self.frequencies_hz, beside_hz, fit)
-            own = np.einsum("nii->ni", fit.inverse)
-            found = self._phasor(rows, fit)
+        still, parts = self._still(measured_sensor), []
+        n = len(self.designs.frequencies_hz)
+        for rows, maps in self.designs.pieces():
+            turn, field = self.measured_from_still[rows], _of_windows(still, maps)
+            fitted = maps.solver @ field
+            noise = noise_beside_tones(maps.probes @ field[:, None], maps.told)
+            found = self._phasor(rows, fitted[:, 1:])
+            own = maps.variance
             parts.append(
                 (
                     found,
-                    self._bent(rows, fit) * np.sum(np.abs(found) ** 2, axis=-1),
-                    0.5 * (own[:, 2 : 2 + n] + own[:, 2 + n : 2 + 2 * n]),
+                    self._bent(rows, maps) * np.sum(np.abs(found) ** 2, axis=-1),
+                    0.5 * (own[:, 1 : 1 + n] + own[:, 1 + n :]),
                     turn[:, None] @ noise @ np.swapaxes(turn, 1, 2)[:, None],
-                    (turn @ fit.coefficients[:, 0, :, None])[..., 0],
+                    (turn @ fitted[:, 0, :, None])[..., 0],
                     own[:, 0],
                 )
             )
         phasor, bent, unit, noise, constant, constant_unit = (
             np.concatenate(part) for part in zip(*parts, strict=True)
         )
-        centre, settings = self.windows.centre, self.settings
+        centre, settings = self.designs.windows.centre, self.designs.settings
         smooth = smoothed_over_windows(
             noise, centre, settings.step, settings.noise_windows, self.unseen | self.apart
         )
@@ -135,59 +132,48 @@ class WindowOperator:
         beside = constant_unit[:, None, None] * np.mean(smooth, axis=1)
         return samples, SteadyFields(centre, constant, beside)
 
-    def _fitted(self, measured_sensor: Array) -> Iterator[tuple[slice, FittedWindows]]:
-        """Yield the windows in pieces, each with the design fitted to a waveform."""
-        still = (self.still_from_measured @ measured_sensor[..., None])[..., 0]
-        for begin in range(0, len(self.windows), CHUNK):
-            rows = slice(begin, begin + CHUNK)
-            some = self.windows.rows(rows)
-            index, weight, elapsed = _padded(some, self.time)
-            design = _design(elapsed, self.settings, self.frequencies_hz, self.nuisance_hz)
-            design *= weight[..., None]
-            field, projected = still[index] * weight[..., None], np.swapaxes(design, -1, -2)
-            inverse = np.asarray(np.linalg.inv(projected @ design))
-            fitted = inverse @ (projected @ field)
-            yield rows, FittedWindows(elapsed, weight, design, inverse, field, fitted)
-
     def unexplained(self, measured_sensor: Array) -> Array:
         """Return the power that the design leaves of each window, shape (n,) (T^2)."""
-        out = []
-        for _, fit in self._fitted(measured_sensor):
-            left = fit.field - fit.design @ fit.coefficients
-            out.append(np.sum(left**2, axis=(1, 2)) / np.sum(fit.weight, axis=1))
+        still, out = self._still(measured_sensor), []
+        for _, maps in self.designs.pieces():
+            design = self.designs.design(maps.elapsed, maps.weight)
+            field, projected = _of_windows(still, maps), np.swapaxes(design, -1, -2)
+            fitted = np.linalg.solve(projected @ design, projected @ field)
+            left = field - design @ fitted
+            out.append(np.sum(left**2, axis=(1, 2)) / np.sum(maps.weight, axis=1))
         return np.concatenate(out)
 
-    def _bent(self, rows: slice, fit: FittedWindows) -> Array:
+    def _still(self, measured_sensor: Array) -> Array:
+        """Return the samples in axes that stand still, shape (samples, 3)."""
+        return np.einsum("nij,nj->ni", self.still_from_measured, measured_sensor)
+
+    def _bent(self, rows: slice, maps: Maps) -> Array:
         """Return the relative variance of phasors by the square of a turn that is not seen.
 
         Shape (n, channels): what the design makes of a tone that falls with the square of time.
         """
-        n, out = len(self.frequencies_hz), np.zeros((len(fit.elapsed), len(self.frequencies_hz)))
-        unseen = self.unseen[rows]
+        n = len(self.designs.frequencies_hz)
+        out, unseen = np.zeros((len(maps.elapsed), n)), self.unseen[rows]
         if not np.any(unseen):
             return out
-        design, elapsed = fit.design[unseen], fit.elapsed[unseen]
+        elapsed = maps.elapsed[unseen]
+        cosine = self.designs.design(elapsed, maps.weight[unseen])[..., 2 : 2 + n]
         square = (UNSEEN_TURN * elapsed[..., None]) ** 2  # half of it for each axis across
-        falling = square * design[..., 2 : 2 + n]
-        made = fit.inverse[unseen] @ (np.swapaxes(design, -1, -2) @ falling)
-        out[unseen] = np.einsum("nii->ni", made[:, 2 : 2 + n]) ** 2
+        out[unseen] = np.einsum("ntm,nmt->nt", maps.solver[unseen, 1 : 1 + n], square * cosine) ** 2
         return out
 
-    def _phasor(self, rows: slice, fit: FittedWindows) -> ComplexArray:
-        n, centre = len(self.frequencies_hz), self.windows.centre[rows]
-        cosine, sine = fit.coefficients[:, 2 : 2 + n], fit.coefficients[:, 2 + n : 2 + 2 * n]
-        reference = np.exp(-2j * np.pi * self.frequencies_hz * centre[:, None])
+    def _phasor(self, rows: slice, fitted: Array) -> ComplexArray:
+        """Return phasors of the cosines and sines, shape (n, 2 tones, 3), of some windows."""
+        frequencies, centre = self.designs.frequencies_hz, self.designs.windows.centre[rows]
+        cosine, sine = np.split(fitted, 2, axis=1)
+        reference = np.exp(-2j * np.pi * frequencies * centre[:, None])
         still = (cosine - 1j * sine) * reference[..., None]
         return still @ np.swapaxes(self.measured_from_still[rows], 1, 2)
 
 
-def _nuisances_hz(settings: LockinSettings, frequencies: Array, nyquist_hz: float) -> Array:
-    if settings.mains_hz <= 0:
-        return np.zeros(0)
-    lines = np.arange(settings.mains_hz, 0.95 * nyquist_hz, settings.mains_hz)[:6]
-    others = np.concatenate([frequencies, settings.lines_hz])
-    apart = np.min(np.abs(lines[:, None] - others), axis=1) * settings.window
-    return lines[apart > 0.8]
+def _of_windows(still: Array, maps: Maps) -> Array:
+    """Return the samples of windows, zero where they are padded, shape (n, m, 3)."""
+    return still[maps.index] * maps.weight[..., None]
 
 
 def window_operator(
@@ -197,6 +183,7 @@ def window_operator(
     settings: LockinSettings,
     windows: Windows,
     imu_step: float | None = None,
+    designs: Designs | None = None,
 ) -> WindowOperator:
     """Return the map from a waveform to phasors, with the gyro's turn of each sample.
 
@@ -210,19 +197,17 @@ def window_operator(
         That were admitted.
     imu_step : float, optional
         Usual time between two inertial samples (s): a piece of a stream may have none.
+    designs : Designs, optional
+        Of the same windows, where they are known.
     """
-    frequencies, nyquist_hz = channel_frequencies_hz(site), sample_rate_hz(waveform) / 2.0
+    nyquist_hz = sample_rate_hz(waveform) / 2.0
     step = usual_step(imu.time, "imu") if imu_step is None else imu_step
     margin = 2.0 * step + 3.0 * site.platform.imu.time_offset_sigma
     silence = silences(imu.time, step, margin)
     measured_from_still = turn_of(standing_in(imu, silence), site)
     return WindowOperator(
-        settings=settings,
+        designs=designs_of(waveform, site, settings, windows) if designs is None else designs,
         channels=site.channels,
-        frequencies_hz=frequencies,
-        nuisance_hz=_nuisances_hz(settings, frequencies, nyquist_hz),
-        time=waveform.time,
-        windows=windows,
         still_from_measured=np.asarray(np.linalg.inv(measured_from_still(waveform.time))),
         measured_from_still=measured_from_still(windows.centre),
         declared_noise=site.platform.magnetometer.noise_density * float(np.sqrt(nyquist_hz)),
@@ -231,12 +216,13 @@ def window_operator(
     )
 
 
-def _padded(windows: Windows, time: Array) -> tuple[IntArray, BoolArray, Array]:
-    """Return the samples of windows, which of them are no padding, and their times (s)."""
-    reach = np.arange(int(np.max(windows.count)))
-    weight = reach < windows.count[:, None]
-    index = np.minimum(windows.first[:, None] + reach, len(time) - 1)
-    return index, weight, np.where(weight, time[index] - windows.centre[:, None], 0.0)
+def designs_of(
+    waveform: Waveform, site: Site, settings: LockinSettings, windows: Windows
+) -> Designs:
+    """Return what the lock-in makes of the sample times of windows."""
+    frequencies, nyquist_hz = channel_frequencies_hz(site), sample_rate_hz(waveform) / 2.0
+    nuisances = nuisances_hz(settings, frequencies, nyquist_hz)
+    return Designs(settings, frequencies, nuisances, waveform.time, windows)
 
 
 def unexplained(log: Log, site: Site, settings: LockinSettings) -> Array:
@@ -258,73 +244,3 @@ def unexplained(log: Log, site: Site, settings: LockinSettings) -> Array:
     imu = on_clock(log.imu, site.platform.imu.time_offset)
     operator = window_operator(waveform, imu, site, settings, windows)
     return operator.unexplained(waveform.measured_sensor - site.platform.magnetometer.offset)
-
-
-def separable(step: float, settings: LockinSettings, frequencies_hz: Array) -> bool:
-    """Return whether the samples of a whole window, ``step`` apart (s), tell its columns apart."""
-    elapsed = _whole_window(step, settings)
-    design = _design(
-        elapsed,
-        settings,
-        frequencies_hz,
-        _nuisances_hz(settings, frequencies_hz, 0.5 / step),
-    )[0]
-    enough = design.shape[0] > design.shape[1]
-    return enough and bool(np.linalg.cond(design.T @ design) < WORST_CONDITION)
-
-
-def _whole_window(step: float, settings: LockinSettings) -> Array:
-    """Return the times of a whole window's samples from its centre, shape (1, samples) (s)."""
-    return np.arange(-0.5 * settings.window + 0.5 * step, 0.5 * settings.window, step)[None]
-
-
-def variance_growth(
-    windows: Windows, time: Array, step: float, settings: LockinSettings, frequencies_hz: Array
-) -> Array:
-    """Return how many times the variance of a window's phasors is that of a whole window.
-
-    By the conditioning of the design at the samples that are there, the worst tone.
-
-    Parameters
-    ----------
-    time : ndarray
-        Of all samples (s).
-    step : float
-        Between two samples of a whole window (s).
-    """
-    nuisance_hz = _nuisances_hz(settings, frequencies_hz, 0.5 / step)
-
-    def variance(elapsed: Array, weight: BoolArray) -> Array:
-        design = _design(elapsed, settings, frequencies_hz, nuisance_hz) * weight[..., None]
-        normal = np.swapaxes(design, -1, -2) @ design
-        good = np.linalg.cond(normal) < WORST_CONDITION
-        normal[~good] = np.eye(normal.shape[-1])
-        own = np.diagonal(np.linalg.inv(normal), axis1=-2, axis2=-1)
-        return np.where(good[:, None], own[:, 2 : 2 + 2 * len(frequencies_hz)], np.inf)
-
-    whole = _whole_window(step, settings)
-    usual, out = variance(whole, np.ones_like(whole, dtype=bool)), []
-    for begin in range(0, len(windows), CHUNK):
-        _, weight, elapsed = _padded(windows.rows(slice(begin, begin + CHUNK)), time)
-        out.append(np.max(variance(elapsed, weight) / usual, axis=1))
-    return np.concatenate(out)
-
-
-def _design(
-    elapsed: Array, settings: LockinSettings, frequencies: Array, nuisances: Array
-) -> Array:
-    """Columns: constant, drift, each tone's cosines, sines and their ramps, mains, other lines."""
-    ramp = elapsed[..., None] * (2.0 / settings.window)
-    other = 2.0 * np.pi * elapsed[..., None] * np.array(settings.lines_hz)
-    along, across = np.cos(other), np.sin(other)
-    angle = 2.0 * np.pi * elapsed[..., None] * frequencies
-    cosine, sine = np.cos(angle), np.sin(angle)
-    mains = 2.0 * np.pi * elapsed[..., None] * nuisances
-    return np.concatenate(
-        [
-            *(np.ones_like(ramp), ramp, cosine, sine, ramp * cosine, ramp * sine),
-            *(np.cos(mains), np.sin(mains)),
-            *(along, across, ramp * along, ramp * across),
-        ],
-        axis=-1,
-    )

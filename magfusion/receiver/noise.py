@@ -1,40 +1,12 @@
 """The noise that a window holds, measured beside the tones rather than taken from a data sheet."""
 
-from typing import NamedTuple
-
 import numpy as np
 
-from magfusion.units import Array, BoolArray
+from magfusion.units import Array, BoolArray, IntArray
 
 LEFT = 1e-6  # of what probes are, from which what the design left of them counts
 LEAST_SHARE = 0.1  # of the declared noise; held and coarse samples may show none
 LEAST_NOISE = 1e-18  # T; rounding of the Earth's field
-
-
-class FittedWindows(NamedTuple):
-    """A design fitted to the samples of n windows, padded to m samples each.
-
-    Parameters
-    ----------
-    elapsed : ndarray, shape (n, m)
-        Sample times from the centre of the window (s).
-    weight : bool ndarray, shape (n, m)
-        False where a row is padding.
-    design : ndarray, shape (n, m, k)
-    inverse : ndarray, shape (n, k, k)
-        Inverse of its normal matrix.
-    field : ndarray, shape (n, m, 3)
-        Samples in axes that stand still (T).
-    coefficients : ndarray, shape (n, k, 3)
-        (T)
-    """
-
-    elapsed: Array
-    weight: BoolArray
-    design: Array
-    inverse: Array
-    field: Array
-    coefficients: Array
 
 
 def _probe_frequencies(
@@ -48,46 +20,70 @@ def _probe_frequencies(
     return frequencies_hz[tone] + shift * np.array([-1.0, 1.0])
 
 
-def noise_beside_tones(frequencies_hz: Array, nuisance_hz: Array, fit: FittedWindows) -> Array:
-    """Return the covariance per sample of the noise around each tone, in the axes of the fit.
+def probes_left(
+    frequencies_hz: Array,
+    nuisance_hz: Array,
+    elapsed: Array,
+    weight: BoolArray,
+    design: Array,
+    inverse: Array,
+) -> tuple[Array, IntArray]:
+    """Return the maps from samples to what a design leaves of probe tones beside each tone.
 
-    Probe tones are fitted to what the design leaves of the window; the power in them, divided by
-    what the design left of the probes themselves, is unbiased for white noise.  A short window
-    leaves fewer directions than there are axes: what it says nothing of is taken for as noisy.
+    Their power, divided by what the design left of the probes themselves, is unbiased for white
+    noise.  A short window leaves fewer directions than there are axes.
 
     Parameters
     ----------
     frequencies_hz, nuisance_hz : ndarray
         Lines in the design (Hz).
+    elapsed, weight : ndarray, shape (n, m)
+        Sample times from the centre of the window (s); False where a row is padding.
+    design, inverse : ndarray, shape (n, m, k) and (n, k, k)
+        With the inverse of its normal matrix.
+
+    Returns
+    -------
+    ndarray, shape (n, tones, 4, m)
+        White noise of a variance of one gives as much in each direction that is told, others zero.
+    int ndarray, shape (n, tones)
+        How many are told.
+    """
+    window = float(np.max(elapsed) - np.min(elapsed))
+    tones = range(len(frequencies_hz))
+    probes_hz = [_probe_frequencies(k, frequencies_hz, nuisance_hz, window) for k in tones]
+    angle = 2.0 * np.pi * np.array(probes_hz)[None, ..., None] * elapsed[:, None, None]
+    probe = np.concatenate([np.cos(angle), np.sin(angle)], axis=2) * weight[:, None, None]
+    across = probe.reshape(len(elapsed), -1, elapsed.shape[1])
+    removed = (across @ design @ inverse) @ np.swapaxes(design, -1, -2)
+    left = (across - removed).reshape(probe.shape)
+    value, vector = np.linalg.eigh(left @ np.swapaxes(probe, -1, -2))
+    told = value > LEFT * np.sum(probe**2, axis=(-2, -1))[..., None]
+    scale = np.where(told, 1.0 / np.sqrt(np.where(told, value, 1.0)), 0.0)
+    return (scale[..., None] * np.swapaxes(vector, -1, -2)) @ left, np.sum(told, axis=-1)
+
+
+def noise_beside_tones(seen: Array, told: IntArray) -> Array:
+    """Return the covariance per sample of the noise around each tone, in the axes of the samples.
+
+    What a window says nothing of is taken for as noisy.
+
+    Parameters
+    ----------
+    seen : ndarray, shape (n, tones, 4, 3)
+        What is left of probes (T).
+    told : int ndarray, shape (n, tones)
+        As of `probes_left`.
 
     Returns
     -------
     ndarray, shape (n, tones, 3, 3)
         (T^2)
     """
-    window = float(np.max(fit.elapsed) - np.min(fit.elapsed))
-    projected = np.swapaxes(fit.design, -1, -2)
-    noise = np.empty((len(fit.elapsed), len(frequencies_hz), 3, 3))
-    for tone in range(len(frequencies_hz)):
-        probes = _probe_frequencies(tone, frequencies_hz, nuisance_hz, window)
-        angle = 2.0 * np.pi * fit.elapsed[..., None] * probes
-        probe = np.concatenate([np.cos(angle), np.sin(angle)], axis=-1) * fit.weight[..., None]
-        mixed = projected @ probe
-        across, removed = np.swapaxes(probe, -1, -2), np.swapaxes(mixed, -1, -2)
-        left = across @ probe - removed @ fit.inverse @ mixed
-        power = across @ fit.field - removed @ fit.coefficients
-        value, vector = np.linalg.eigh(left)
-        told = value > LEFT * np.trace(across @ probe, axis1=-2, axis2=-1)[:, None]
-        seen = (
-            np.swapaxes(vector, -1, -2) @ power / np.sqrt(np.where(told, value, np.inf))[..., None]
-        )
-        degrees = np.maximum(np.sum(told, axis=-1), 1)[:, None, None]
-        own = np.swapaxes(seen, -1, -2) @ seen / degrees
-        unseen = (1.0 - degrees / probe.shape[-1]) * np.trace(own, axis1=-2, axis2=-1)[
-            :, None, None
-        ]
-        noise[:, tone] = own + unseen / 3.0 * np.eye(3)
-    return noise
+    degrees = np.maximum(told, 1)[..., None, None]
+    own = np.swapaxes(seen, -1, -2) @ seen / degrees
+    unseen = (1.0 - degrees / seen.shape[-2]) * np.trace(own, axis1=-2, axis2=-1)[..., None, None]
+    return own + unseen / 3.0 * np.eye(3)
 
 
 def not_below(noise_cov: Array, sigma: float) -> Array:

@@ -24,7 +24,8 @@ from magfusion.receiver.admission import (
     sample_rate_hz,
     usual_step,
 )
-from magfusion.receiver.lockin import separable, variance_growth, window_operator
+from magfusion.receiver.design import Designs, separable, variance_growth
+from magfusion.receiver.lockin import WindowOperator, designs_of, window_operator
 from magfusion.receiver.slots import (
     SlotSettings,
     check_carriers,
@@ -301,6 +302,7 @@ class LockinReceiver(Receiver):
     def __init__(self, site: Site, settings: LockinSettings | None = None) -> None:
         super().__init__(site)
         self._given = settings
+        self._designs: Designs | None = None
 
     @cached_property
     def settings(self) -> LockinSettings:
@@ -340,8 +342,20 @@ class LockinReceiver(Receiver):
         self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
     ) -> tuple[FieldSamples, IntArray]:
         """Return the phasors of windows without what is known of the motion but the turns."""
-        operator = window_operator(waveform, imu, site, self.settings, windows)
+        operator = self.operator(waveform, imu, windows, site)
         return operator.demodulate(waveform.measured_sensor)[0], windows.number
+
+    def operator(
+        self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
+    ) -> WindowOperator:
+        """Return the map from a waveform to phasors, as of `window_operator`.
+
+        What is made of the sample times alone is kept until others come.
+        """
+        known = self._designs
+        if known is None or known.windows is not windows or known.time is not waveform.time:
+            known = self._designs = designs_of(waveform, site, self.settings, windows)
+        return window_operator(waveform, imu, site, self.settings, windows, designs=known)
 
     def _driven(self, number: IntArray) -> BoolArray:
         return np.ones(len(number), dtype=bool)

@@ -17,7 +17,7 @@ from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import Site
 from magfusion.model.strapdown import attitude_at, attitude_from_gyro
 from magfusion.model.trust import Finding, Verdict
-from magfusion.receiver.lockin import separable
+from magfusion.receiver.design import separable
 from magfusion.receiver.receiver import usual_lockin
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings

@@ -1,0 +1,212 @@
+"""The motion between states, of the IMU's shape; and how it changes with the IMU's time offset."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+from scipy.ndimage import uniform_filter1d
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.preintegration import low_pass_reach
+from magfusion.model.quaternion import components, composed, turned
+from magfusion.model.samples import ImuSamples
+from magfusion.model.strapdown import attitude_at, attitude_from_gyro
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array
+
+
+@dataclass(frozen=True, eq=False)
+class MotionShape:
+    """The IMU integrated once over a log, and what it lacks at the states spread between them.
+
+    Parameters
+    ----------
+    states : Trajectory
+        With velocity and biases, at the field epochs.
+    time : ndarray, shape (n,)
+        Of the inertial samples, on the log's clock (s).
+    gyro_body : ndarray, shape (n, 3)
+        Freed of the bias (rad/s).
+    chain : Rotation
+        ``body(0)_from_body(k)``.
+    world_from_start : Rotation
+        At the states.
+    world_from_body : Rotation
+        At the inertial samples.
+    accel_world, velocity_world, position_world : ndarray, shape (n, 3)
+        As integrated from rest at the origin (m/s^2, m/s, m).
+    reach : int
+        Inertial samples on either side over which `by_time_offset` averages.
+    """
+
+    states: Trajectory
+    time: Array
+    gyro_body: Array
+    chain: Rotation
+    world_from_start: Rotation
+    world_from_body: Rotation
+    accel_world: Array
+    velocity_world: Array
+    position_world: Array
+    gravity: float
+    reach: int
+
+    @staticmethod
+    def of(
+        states: Trajectory, imu: ImuSamples, time_offset: float, gravity: float
+    ) -> "MotionShape":
+        """Integrate an inertial stream through states.
+
+        Parameters
+        ----------
+        time_offset : float
+            (s)
+        gravity : float
+            (m/s^2)
+        """
+        if states.velocity_world is None or states.gyro_bias_body is None:
+            raise ValueError("states must have velocity and biases")
+        assert states.accel_bias_body is not None
+        time = imu.time + time_offset
+        gyro = imu.gyro_body - _interpolated(time, states.time, states.gyro_bias_body)
+        accel = imu.accel_body - _interpolated(time, states.time, states.accel_bias_body)
+        chain = attitude_from_gyro(time, gyro)
+        at_states = attitude_at(chain, time, gyro, states.time)
+        world_from_start = composed(Rotation.from_matrix(states.world_from_body), at_states.inv())
+        world_from_body = composed(_turn_at(states.time, world_from_start, time), chain)
+        world_accel = turned(components(world_from_body), accel.T).T - [0.0, 0.0, gravity]
+        velocity, position = _integrated(time, world_accel)
+        return MotionShape(
+            states=states,
+            time=time,
+            gyro_body=gyro,
+            chain=chain,
+            world_from_start=world_from_start,
+            world_from_body=world_from_body,
+            accel_world=world_accel,
+            velocity_world=velocity,
+            position_world=position,
+            gravity=gravity,
+            reach=low_pass_reach(imu),
+        )
+
+    def at(self, wanted: Array) -> Trajectory:
+        """Return the motion at any times.
+
+        Parameters
+        ----------
+        wanted : ndarray, shape (m,)
+            Strictly increasing (s).
+
+        Returns
+        -------
+        Trajectory
+            Pose and velocity.
+        """
+        states = self.states
+        assert states.velocity_world is not None
+        path = CubicHermiteSpline(self.time, self.position_world, self.velocity_world)
+        speed = path.derivative()
+        lack = CubicHermiteSpline(
+            states.time,
+            states.position_world - path(states.time),
+            states.velocity_world - speed(states.time),
+        )
+        attitude = composed(
+            _turn_at(states.time, self.world_from_start, wanted),
+            attitude_at(self.chain, self.time, self.gyro_body, wanted),
+        )
+        inside = np.clip(wanted, states.time[0], states.time[-1])
+        beyond = (wanted - inside)[:, None]
+        slope = lack.derivative()(inside)
+        return Trajectory(
+            time=wanted,
+            world_from_body=attitude.as_matrix(),
+            position_world=path(wanted) + lack(inside) + slope * beyond,
+            velocity_world=speed(wanted) + slope,
+        )
+
+    def by_time_offset(self, wanted: Array) -> tuple[Array, Array]:
+        """Return the derivative of the motion by the IMU's time offset, the states where they are.
+
+        The stream's shape comes later by it: everywhere the body has yet to turn and to move as
+        much as it does in that time, less what it has at the states.  Rate and specific force are
+        averaged (`low_passed`): white noise in a derivative would pass for information.
+
+        Returns
+        -------
+        tuple of ndarray, shape (m, 3)
+            Rotation (rad/s) and position (m/s), world axes.
+        """
+        known = self.states.time
+        slow_body = self._averaged(self.gyro_body)
+        rate = turned(components(self.world_from_body), slow_body.T).T
+        at_states = _interpolated(known, self.time, rate)
+        # What the states hold back of the turn tilts the specific force.
+        force = self.accel_world + np.array([0.0, 0.0, self.gravity])
+        held = _interpolated(self.time, known, at_states)
+        speed, moved = _integrated(self.time, np.cross(held, force))
+        change = CubicHermiteSpline(
+            self.time,
+            self._averaged(moved - self.velocity_world),
+            self._averaged(speed - self.accel_world),
+        )
+        between = CubicHermiteSpline(known, change(known), change.derivative()(known))
+        inside = np.clip(wanted, known[0], known[-1])
+        beyond = (wanted - inside)[:, None] * between.derivative()(inside)
+        by_position = change(wanted) - between(inside) - beyond
+        by_rotation = _interpolated(wanted, known, at_states) - _interpolated(
+            wanted, self.time, rate
+        )
+        return by_rotation, by_position
+
+    def _averaged(self, values: Array) -> Array:
+        return uniform_filter1d(values, 2 * self.reach + 1, axis=0, mode="nearest")
+
+
+def motion_at(
+    states: Trajectory, imu: ImuSamples, time_offset: float, gravity: float, wanted: Array
+) -> Trajectory:
+    """Return the motion at any times: the IMU's shape between the states, through the states.
+
+    Parameters
+    ----------
+    states : Trajectory
+        With velocity and biases, at the field epochs.
+    time_offset : float
+        (s)
+    gravity : float
+        (m/s^2)
+    wanted : ndarray, shape (m,)
+        Strictly increasing (s).
+
+    Returns
+    -------
+    Trajectory
+        Pose and velocity at ``wanted``.
+    """
+    return MotionShape.of(states, imu, time_offset, gravity).at(wanted)
+
+
+def _integrated(time: Array, rate: Array) -> tuple[Array, Array]:
+    """Return the integral of samples (n, 3) that are linear in between, and its integral."""
+    step, zero = np.diff(time)[:, None], np.zeros((1, 3))
+    once = np.concatenate([zero, np.cumsum(0.5 * (rate[:-1] + rate[1:]) * step, axis=0)])
+    inner = (2.0 * rate[:-1] + rate[1:]) * step**2 / 6.0
+    twice = np.concatenate([zero, np.cumsum(once[:-1] * step + inner, axis=0)])
+    return once, twice
+
+
+def _interpolated(time: Array, known: Array, values: Array) -> Array:
+    return np.stack([np.interp(time, known, axis) for axis in values.T], axis=1)
+
+
+def _turn_at(known: Array, rotations: Rotation, wanted: Array) -> Rotation:
+    """Interpolate slowly varying rotations along great circles, holding the ends."""
+    if len(known) == 1:
+        return Rotation.concatenate([rotations] * len(wanted))
+    inside = np.clip(wanted, known[0], known[-1])
+    index = np.clip(np.searchsorted(known, inside, side="right") - 1, 0, len(known) - 2)
+    between = composed(rotations[:-1].inv(), rotations[1:]).as_rotvec()
+    share = (inside - known[index]) / np.diff(known)[index]
+    return composed(rotations[index], Rotation.from_rotvec(share[:, None] * between[index]))

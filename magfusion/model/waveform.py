@@ -1,0 +1,117 @@
+"""What a magnetometer reads along a motion, sample by sample, and how that changes.
+
+Of real numbers all through: the coils' currents at every sample, and the field that they make.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.model.field import driven_field
+from magfusion.model.parameters import Calibration
+from magfusion.model.receive_coils import is_apart, joined_samples, points_apart
+from magfusion.model.site import Magnetometer, Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, ComplexArray
+
+
+class Motion(NamedTuple):
+    """How a motion changes, shape (n, 3) both, world axes.
+
+    Parameters
+    ----------
+    rotation_world : ndarray
+        (rad/s, or rad of whatever it changes by)
+    position_world : ndarray
+        Of the body (m/s)
+    """
+
+    rotation_world: Array
+    position_world: Array
+
+
+def carriers(frequencies_hz: Array, time: Array) -> ComplexArray:
+    """Return what the phasors turn with, shape (n, channels)."""
+    return np.exp(2j * np.pi * frequencies_hz * time[:, None])
+
+
+def predicted_waveform(
+    motion: Trajectory,
+    calibration: Calibration,
+    earth_field_world: Array,
+    carrier: ComplexArray,
+    change: Motion | None = None,
+) -> tuple[Array, Array]:
+    """Return the samples that a magnetometer takes along a motion.
+
+    Parameters
+    ----------
+    motion : Trajectory
+        At the sample times.
+    earth_field_world : ndarray, shape (3,)
+        (T)
+    carrier : complex ndarray, shape (n, channels)
+        As of `carriers`.
+    change : Motion, optional
+        Of the motion.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        (T), measured axes, without noise.
+    ndarray, shape (n, 3)
+        By what it changes with; zero where no change is given.
+    """
+    magnetometer = calibration.site.platform.magnetometer
+    currents = _currents(calibration, motion.time, carrier)
+    if not is_apart(magnetometer):
+        field, by = _at_point(
+            magnetometer, motion, calibration.site, earth_field_world, currents, change
+        )
+        return field + magnetometer.offset, by
+    apart = [
+        _at_point(at, motion, calibration.site, earth_field_world, currents, change)
+        for at in points_apart(magnetometer)
+    ]
+    field, by = (joined_samples([part[k] for part in apart], magnetometer) for k in range(2))
+    return field + magnetometer.offset, by
+
+
+def _currents(calibration: Calibration, time: Array, carrier: ComplexArray) -> list[Array]:
+    """Return the current of each beacon's coils as a share of its peak, shape (n, coils)."""
+    still = not np.any(calibration.drift)
+    phase = calibration.phase if still else calibration.drive_phase(time)
+    drive = carrier * (np.exp(calibration.log_gain) * np.exp(1j * phase))
+    out, start = [], 0
+    for beacon in calibration.site.beacons:
+        tones = slice(start, start + len(beacon.tones))
+        out.append(np.asarray((drive[:, tones] @ beacon.excitation.T).real))
+        start = tones.stop
+    return out
+
+
+def _at_point(
+    magnetometer: Magnetometer,
+    motion: Trajectory,
+    site: Site,
+    earth_field_world: Array,
+    currents: list[Array],
+    change: Motion | None,
+) -> tuple[Array, Array]:
+    """Return what a magnetometer reads whose axes are at one point, without its offset."""
+    rotation = motion.world_from_body
+    lever = rotation @ magnetometer.position_body
+    along = None
+    if change is not None:
+        along = change.position_world + np.cross(change.rotation_world, lever)
+    field, by = np.tile(earth_field_world, (len(rotation), 1)), np.zeros((len(rotation), 3))
+    for beacon, current in zip(site.beacons, currents, strict=True):
+        driven = driven_field(beacon, motion.position_world + lever, current, along)
+        field += driven.field_world
+        if driven.along_world is not None:
+            by += driven.along_world
+    measured_from_body = (magnetometer.matrix @ magnetometer.body_from_sensor.T).T
+    if change is not None:
+        by += np.cross(field, change.rotation_world)
+        by = np.einsum("nji,nj->ni", rotation, by) @ measured_from_body
+    return np.einsum("nji,nj->ni", rotation, field) @ measured_from_body, by

@@ -1,0 +1,198 @@
+"""What a lock-in makes of sample times alone: its design, and the maps from samples to phasors.
+
+No sample and no motion is in it, so that it is made once of a log, and kept while it fits memory.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.receiver.admission import Windows
+from magfusion.receiver.noise import probes_left
+from magfusion.receiver.windows import LockinSettings
+from magfusion.units import Array, BoolArray, IntArray
+
+CHUNK = 1000  # windows demodulated at once: they fit in memory
+KEPT = 256 * 2**20  # bytes of maps that are kept; what is more is made anew
+WORST_CONDITION = 1e8  # of a normal matrix; beyond, the samples do not tell its columns apart
+
+
+class Maps(NamedTuple):
+    """The maps of n windows, padded to m samples each.
+
+    Parameters
+    ----------
+    index : int ndarray, shape (n, m)
+        Of the samples.
+    weight : bool ndarray, shape (n, m)
+        False where a row is padding.
+    elapsed : ndarray, shape (n, m)
+        Sample times from the centre of the window (s).
+    solver : ndarray, shape (n, 1 + 2 tones, m)
+        To the constant, the cosines and the sines.
+    variance : ndarray, shape (n, 1 + 2 tones)
+        Of these, for samples with a variance of one.
+    probes : ndarray, shape (n, tones, 4, m)
+        To what is left beside each tone, of a variance of one.
+    told : int ndarray, shape (n, tones)
+        How many of those the window tells of.
+    """
+
+    index: IntArray
+    weight: BoolArray
+    elapsed: Array
+    solver: Array
+    variance: Array
+    probes: Array
+    told: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Designs:
+    """The designs of windows.
+
+    Parameters
+    ----------
+    frequencies_hz, nuisance_hz : ndarray
+        Tones, and lines that are fitted beside them (Hz).
+    time : ndarray, shape (samples,)
+        (s)
+    """
+
+    settings: LockinSettings
+    frequencies_hz: Array
+    nuisance_hz: Array
+    time: Array
+    windows: Windows
+    kept: dict[int, Maps] = field(default_factory=dict)
+
+    def pieces(self) -> Iterator[tuple[slice, Maps]]:
+        """Yield windows with their maps, as many at once as fit in memory."""
+        for begin in range(0, len(self.windows), CHUNK):
+            rows = slice(begin, begin + CHUNK)
+            known = self.kept.get(begin)
+            maps = self._maps(self.windows.rows(rows)) if known is None else known
+            if known is None and self._size() + _size(maps) < KEPT:
+                self.kept[begin] = maps
+            yield rows, maps
+
+    def _size(self) -> int:
+        return sum(map(_size, self.kept.values()))
+
+    def design(self, elapsed: Array, weight: BoolArray) -> Array:
+        """Return the columns that are fitted to windows, shape (n, m, columns)."""
+        found = design_of(elapsed, self.settings, self.frequencies_hz, self.nuisance_hz)
+        found *= weight[..., None]
+        return found
+
+    def _maps(self, windows: Windows) -> Maps:
+        index, weight, elapsed = padded(windows, self.time)
+        design, n = self.design(elapsed, weight), len(self.frequencies_hz)
+        projected = np.swapaxes(design, -1, -2)
+        inverse = np.asarray(np.linalg.inv(projected @ design))
+        told = np.r_[0, 2 : 2 + 2 * n]
+        beside_hz = np.concatenate([self.nuisance_hz, self.settings.lines_hz])
+        probes = probes_left(self.frequencies_hz, beside_hz, elapsed, weight, design, inverse)
+        return Maps(
+            index=index,
+            weight=weight,
+            elapsed=elapsed,
+            solver=inverse[:, told] @ projected,
+            variance=np.einsum("nii->ni", inverse)[:, told],
+            probes=probes[0],
+            told=probes[1],
+        )
+
+
+def _size(maps: Maps) -> int:
+    return sum(part.nbytes for part in maps)
+
+
+def nuisances_hz(settings: LockinSettings, frequencies: Array, nyquist_hz: float) -> Array:
+    """Return the harmonics of the mains that are fitted beside the tones (Hz)."""
+    if settings.mains_hz <= 0:
+        return np.zeros(0)
+    lines = np.arange(settings.mains_hz, 0.95 * nyquist_hz, settings.mains_hz)[:6]
+    others = np.concatenate([frequencies, settings.lines_hz])
+    apart = np.min(np.abs(lines[:, None] - others), axis=1) * settings.window
+    return lines[apart > 0.8]
+
+
+def padded(windows: Windows, time: Array) -> tuple[IntArray, BoolArray, Array]:
+    """Return the samples of windows, which of them are no padding, and their times (s)."""
+    reach = np.arange(int(np.max(windows.count)))
+    weight = reach < windows.count[:, None]
+    index = np.minimum(windows.first[:, None] + reach, len(time) - 1)
+    return index, weight, np.where(weight, time[index] - windows.centre[:, None], 0.0)
+
+
+def separable(step: float, settings: LockinSettings, frequencies_hz: Array) -> bool:
+    """Return whether the samples of a whole window, ``step`` apart (s), tell its columns apart."""
+    elapsed = _whole_window(step, settings)
+    design = design_of(
+        elapsed,
+        settings,
+        frequencies_hz,
+        nuisances_hz(settings, frequencies_hz, 0.5 / step),
+    )[0]
+    enough = design.shape[0] > design.shape[1]
+    return enough and bool(np.linalg.cond(design.T @ design) < WORST_CONDITION)
+
+
+def _whole_window(step: float, settings: LockinSettings) -> Array:
+    """Return the times of a whole window's samples from its centre, shape (1, samples) (s)."""
+    return np.arange(-0.5 * settings.window + 0.5 * step, 0.5 * settings.window, step)[None]
+
+
+def variance_growth(
+    windows: Windows, time: Array, step: float, settings: LockinSettings, frequencies_hz: Array
+) -> Array:
+    """Return how many times the variance of a window's phasors is that of a whole window.
+
+    By the conditioning of the design at the samples that are there, the worst tone.
+
+    Parameters
+    ----------
+    time : ndarray
+        Of all samples (s).
+    step : float
+        Between two samples of a whole window (s).
+    """
+    nuisance_hz = nuisances_hz(settings, frequencies_hz, 0.5 / step)
+
+    def variance(elapsed: Array, weight: BoolArray) -> Array:
+        design = design_of(elapsed, settings, frequencies_hz, nuisance_hz) * weight[..., None]
+        normal = np.swapaxes(design, -1, -2) @ design
+        good = np.linalg.cond(normal) < WORST_CONDITION
+        normal[~good] = np.eye(normal.shape[-1])
+        own = np.diagonal(np.linalg.inv(normal), axis1=-2, axis2=-1)
+        return np.where(good[:, None], own[:, 2 : 2 + 2 * len(frequencies_hz)], np.inf)
+
+    whole = _whole_window(step, settings)
+    usual, out = variance(whole, np.ones_like(whole, dtype=bool)), []
+    for begin in range(0, len(windows), CHUNK):
+        _, weight, elapsed = padded(windows.rows(slice(begin, begin + CHUNK)), time)
+        out.append(np.max(variance(elapsed, weight) / usual, axis=1))
+    return np.concatenate(out)
+
+
+def design_of(
+    elapsed: Array, settings: LockinSettings, frequencies: Array, nuisances: Array
+) -> Array:
+    """Columns: constant, drift, each tone's cosines, sines and their ramps, mains, other lines."""
+    ramp = elapsed[..., None] * (2.0 / settings.window)
+    other = 2.0 * np.pi * elapsed[..., None] * np.array(settings.lines_hz)
+    along, across = np.cos(other), np.sin(other)
+    angle = 2.0 * np.pi * elapsed[..., None] * frequencies
+    cosine, sine = np.cos(angle), np.sin(angle)
+    mains = 2.0 * np.pi * elapsed[..., None] * nuisances
+    return np.concatenate(
+        [
+            *(np.ones_like(ramp), ramp, cosine, sine, ramp * cosine, ramp * sine),
+            *(np.cos(mains), np.sin(mains)),
+            *(along, across, ramp * along, ramp * across),
+        ],
+        axis=-1,
+    )
