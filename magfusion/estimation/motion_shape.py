@@ -8,9 +8,18 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.preintegration import low_pass_reach
-from magfusion.model.quaternion import components, composed, turned
+from magfusion.model.quaternion import (
+    components,
+    cross,
+    inverse,
+    matrices,
+    of_vectors,
+    product,
+    turned,
+    unit,
+)
 from magfusion.model.samples import ImuSamples
-from magfusion.model.strapdown import attitude_at, attitude_from_gyro
+from magfusion.model.strapdown import turn_at, turn_from_gyro
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
@@ -27,11 +36,11 @@ class MotionShape:
         Of the inertial samples, on the log's clock (s).
     gyro_body : ndarray, shape (n, 3)
         Freed of the bias (rad/s).
-    chain : Rotation
-        ``body(0)_from_body(k)``.
-    world_from_start : Rotation
+    chain : ndarray, shape (4, n)
+        ``body(0)_from_body(k)``, quaternions, scalar first.
+    world_from_start : ndarray, shape (4, states)
         At the states.
-    world_from_body : Rotation
+    world_from_body : ndarray, shape (4, n)
         At the inertial samples.
     accel_world, velocity_world, position_world : ndarray, shape (n, 3)
         As integrated from rest at the origin (m/s^2, m/s, m).
@@ -42,9 +51,9 @@ class MotionShape:
     states: Trajectory
     time: Array
     gyro_body: Array
-    chain: Rotation
-    world_from_start: Rotation
-    world_from_body: Rotation
+    chain: Array
+    world_from_start: Array
+    world_from_body: Array
     accel_world: Array
     velocity_world: Array
     position_world: Array
@@ -70,11 +79,12 @@ class MotionShape:
         time = imu.time + time_offset
         gyro = imu.gyro_body - _interpolated(time, states.time, states.gyro_bias_body)
         accel = imu.accel_body - _interpolated(time, states.time, states.accel_bias_body)
-        chain = attitude_from_gyro(time, gyro)
-        at_states = attitude_at(chain, time, gyro, states.time)
-        world_from_start = composed(Rotation.from_matrix(states.world_from_body), at_states.inv())
-        world_from_body = composed(_turn_at(states.time, world_from_start, time), chain)
-        world_accel = turned(components(world_from_body), accel.T).T - [0.0, 0.0, gravity]
+        chain = turn_from_gyro(time, gyro)
+        at_states = turn_at(chain, time, gyro, states.time)
+        known = components(Rotation.from_matrix(states.world_from_body))
+        world_from_start = product(known, inverse(at_states))
+        world_from_body = product(_turn_at(states.time, world_from_start, time), chain)
+        world_accel = turned(world_from_body, accel.T).T - [0.0, 0.0, gravity]
         velocity, position = _integrated(time, world_accel)
         return MotionShape(
             states=states,
@@ -112,16 +122,16 @@ class MotionShape:
             states.position_world - path(states.time),
             states.velocity_world - speed(states.time),
         )
-        attitude = composed(
+        attitude = product(
             _turn_at(states.time, self.world_from_start, wanted),
-            attitude_at(self.chain, self.time, self.gyro_body, wanted),
+            turn_at(self.chain, self.time, self.gyro_body, wanted),
         )
         inside = np.clip(wanted, states.time[0], states.time[-1])
         beyond = (wanted - inside)[:, None]
         slope = lack.derivative()(inside)
         return Trajectory(
             time=wanted,
-            world_from_body=attitude.as_matrix(),
+            world_from_body=matrices(unit(attitude)),
             position_world=path(wanted) + lack(inside) + slope * beyond,
             velocity_world=speed(wanted) + slope,
         )
@@ -140,12 +150,12 @@ class MotionShape:
         """
         known = self.states.time
         slow_body = self._averaged(self.gyro_body)
-        rate = turned(components(self.world_from_body), slow_body.T).T
+        rate = turned(self.world_from_body, slow_body.T).T
         at_states = _interpolated(known, self.time, rate)
         # What the states hold back of the turn tilts the specific force.
         force = self.accel_world + np.array([0.0, 0.0, self.gravity])
         held = _interpolated(self.time, known, at_states)
-        speed, moved = _integrated(self.time, np.cross(held, force))
+        speed, moved = _integrated(self.time, cross(held.T, force.T).T)
         change = CubicHermiteSpline(
             self.time,
             self._averaged(moved - self.velocity_world),
@@ -201,12 +211,16 @@ def _interpolated(time: Array, known: Array, values: Array) -> Array:
     return np.stack([np.interp(time, known, axis) for axis in values.T], axis=1)
 
 
-def _turn_at(known: Array, rotations: Rotation, wanted: Array) -> Rotation:
-    """Interpolate slowly varying rotations along great circles, holding the ends."""
+def _turn_at(known: Array, turn: Array, wanted: Array) -> Array:
+    """Interpolate slowly varying rotations along great circles, holding the ends.
+
+    Of shape (4, states) to shape (4, m), scalar first.
+    """
     if len(known) == 1:
-        return Rotation.concatenate([rotations] * len(wanted))
+        return np.repeat(turn, len(wanted), axis=1)
     inside = np.clip(wanted, known[0], known[-1])
     index = np.clip(np.searchsorted(known, inside, side="right") - 1, 0, len(known) - 2)
-    between = composed(rotations[:-1].inv(), rotations[1:]).as_rotvec()
+    between = product(inverse(turn[:, :-1]), turn[:, 1:])
+    rotation = Rotation.from_quat(between.T, scalar_first=True).as_rotvec().T
     share = (inside - known[index]) / np.diff(known)[index]
-    return composed(rotations[index], Rotation.from_rotvec(share[:, None] * between[index]))
+    return product(turn[:, index], of_vectors(share * rotation[:, index]))

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.model.physics.dipole import dipole_field, dipole_gradient
+from magfusion.model.physics.dipole import dipole_field, dipole_field_along, dipole_gradient
 from magfusion.model.physics.loop import loop_field, loop_field_and_gradient
 from magfusion.model.site import Beacon, Coil
 from magfusion.units import Array, IntArray
@@ -107,3 +107,48 @@ def coil_fields_and_gradients(beacon: Beacon, offset_beacon: Array) -> tuple[Arr
         np.asarray(np.add.reduceat(field, loops.first, axis=-2)),
         np.asarray(np.add.reduceat(gradient, loops.first, axis=-3)),
     )
+
+
+class Driven(NamedTuple):
+    """The field of coils that carry known currents.
+
+    Parameters
+    ----------
+    field : ndarray, shape (n, 3)
+        (T)
+    along : ndarray, shape (n, 3), optional
+        Its derivative along a displacement (T a unit of it).
+    """
+
+    field: Array
+    along: Array | None
+
+
+def driven_dipoles(
+    beacon: Beacon, offset_beacon: Array, current: Array, along_beacon: Array | None
+) -> Driven:
+    """Return the field of coils without a size: of those at one place that of one moment.
+
+    Parameters
+    ----------
+    offset_beacon : ndarray, shape (n, 3)
+        From the beacon's origin, beacon axes (m).
+    current : ndarray, shape (n, coils)
+        Of each coil, as a share of its peak.
+    along_beacon : ndarray, shape (n, 3), optional
+        A displacement of the points.
+
+    Returns
+    -------
+    Driven
+        Beacon axes.
+    """
+    field, along = np.zeros_like(offset_beacon), np.zeros_like(offset_beacon)
+    centres, place = np.unique(beacon.centres_beacon, axis=0, return_inverse=True)
+    for k, centre in enumerate(centres):
+        here = place == k
+        moment, offset = current[:, here] @ beacon.moments_beacon[here], offset_beacon - centre
+        field += dipole_field(offset, moment)
+        if along_beacon is not None:
+            along += dipole_field_along(offset, moment, along_beacon)
+    return Driven(field, None if along_beacon is None else along)

@@ -8,7 +8,13 @@ from typing import NamedTuple, overload
 
 import numpy as np
 
-from magfusion.model.coil_field import coil_fields, coil_fields_and_gradients
+from magfusion.model.coil_field import (
+    Driven,
+    coil_fields,
+    coil_fields_and_gradients,
+    driven_dipoles,
+    is_sized,
+)
 from magfusion.model.receive_coils import (
     Observation,
     is_apart,
@@ -258,25 +264,10 @@ def _seen(
     )
 
 
-class Driven(NamedTuple):
-    """The field of coils that carry known currents.
-
-    Parameters
-    ----------
-    field_world : ndarray, shape (n, 3)
-        (T)
-    along_world : ndarray, shape (n, 3), optional
-        Its derivative along a displacement (T a unit of it).
-    """
-
-    field_world: Array
-    along_world: Array | None
-
-
 def driven_field(
     beacon: Beacon, position_world: Array, current: Array, along_world: Array | None = None
 ) -> Driven:
-    """Return the field of a beacon at points, its coils' currents given.
+    """Return the field of a beacon at points, its coils' currents given, world axes.
 
     Parameters
     ----------
@@ -289,21 +280,26 @@ def driven_field(
     """
     world_from_beacon = beacon.world_from_beacon
     offset = (position_world - beacon.position_world) @ world_from_beacon
-    if along_world is None:
-        coils, gradients = coil_fields(beacon, offset), None
+    along = None if along_world is None else along_world @ world_from_beacon
+    if is_sized(beacon) or beacon.field_map is not None:
+        driven = _driven_coils(beacon, offset, current, along)
     else:
-        coils, gradients = coil_fields_and_gradients(beacon, offset)
+        driven = driven_dipoles(beacon, offset, current, along)
+    by = None if driven.along is None else driven.along @ world_from_beacon.T
+    return Driven(driven.field @ world_from_beacon.T, by)
+
+
+def _driven_coils(beacon: Beacon, offset: Array, current: Array, along: Array | None) -> Driven:
+    """Return the field of coils of any size, with the beacon's map, as `driven_dipoles`."""
+    coils, gradients = coil_fields_and_gradients(beacon, offset)
     mapped = _mapped(beacon, offset, coils)
     if mapped is not None:
         coils = (mapped.correction @ coils[..., None])[..., 0]
-    field = np.einsum("nc,ncx->nx", current, coils) @ world_from_beacon.T
-    if along_world is None or gradients is None:
-        return Driven(field, None)
-    if mapped is not None:
         gradients = mapped.correction @ gradients + mapped.slope
-    slope = np.einsum("nc,ncxy->nxy", current, gradients)
-    along = np.einsum("nxy,ny->nx", slope, along_world @ world_from_beacon)
-    return Driven(field, along @ world_from_beacon.T)
+    field = np.einsum("nc,ncx->nx", current, coils)
+    if along is None:
+        return Driven(field, None)
+    return Driven(field, np.einsum("nc,ncxy,ny->nx", current, gradients, along, optimize=True))
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,10 +12,15 @@ from magfusion.units import Array
 
 def product(a: Array, b: Array) -> Array:
     """Return the products ``a b`` of quaternions, shape (4, ...), scalar first."""
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    out[0] = a[0] * b[0] - np.sum(a[1:] * b[1:], axis=0)
-    out[1:] = a[0] * b[1:] + b[0] * a[1:] + cross(a[1:], b[1:])
-    return out
+    (p, q, r, s), (w, x, y, z) = a, b
+    return np.stack(
+        [
+            p * w - q * x - r * y - s * z,
+            p * x + q * w + r * z - s * y,
+            p * y - q * z + r * w + s * x,
+            p * z + q * y - r * x + s * w,
+        ]
+    )
 
 
 def turned(quaternion: Array, vector: Array) -> Array:
@@ -26,18 +31,40 @@ def turned(quaternion: Array, vector: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Return the cross products of vectors, shape (3, ...)."""
-    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        out[i] = a[j] * b[k] - a[k] * b[j]
-    return out
-
-
-def composed(a: Rotation, b: Rotation) -> Rotation:
-    """Return the rotations ``a * b``: one and many, or as many of both."""
-    both = product(components(a), components(b))
-    return Rotation.from_quat(both.T, scalar_first=True)
+    (p, q, r), (x, y, z) = a, b
+    return np.stack([q * z - r * y, r * x - p * z, p * y - q * x])
 
 
 def components(rotation: Rotation) -> Array:
     """Return the quaternions of rotations, shape (4, n), scalar first; (4, 1) of a single one."""
     return np.ascontiguousarray(np.atleast_2d(rotation.as_quat(scalar_first=True)).T)
+
+
+def inverse(quaternion: Array) -> Array:
+    """Return the inverse of unit quaternions, shape (4, ...), scalar first."""
+    return np.concatenate([quaternion[:1], -quaternion[1:]])
+
+
+def of_vectors(rotation: Array) -> Array:
+    """Return the quaternions, shape (4, ...), of rotation vectors, shape (3, ...) (rad)."""
+    half = 0.5 * np.sqrt(np.sum(rotation**2, axis=0))
+    return np.concatenate([np.cos(half)[None], 0.5 * np.sinc(half / np.pi) * rotation])
+
+
+def matrices(quaternion: Array) -> Array:
+    """Return the matrices, shape (n, 3, 3), of unit quaternions, shape (4, n), scalar first."""
+    w, x, y, z = quaternion
+    out = np.empty((len(w), 3, 3))
+    out[:, 0, 0], out[:, 1, 1], out[:, 2, 2] = (
+        1.0 - 2.0 * (y * y + z * z),
+        1.0 - 2.0 * (x * x + z * z),
+        1.0 - 2.0 * (x * x + y * y),
+    )
+    for i, j, product, turn in ((0, 1, x * y, w * z), (2, 0, x * z, w * y), (1, 2, y * z, w * x)):
+        out[:, i, j], out[:, j, i] = 2.0 * (product - turn), 2.0 * (product + turn)
+    return out
+
+
+def unit(quaternion: Array) -> Array:
+    """Return quaternions, shape (4, ...), without what rounding adds to their length."""
+    return quaternion / np.sqrt(np.sum(quaternion**2, axis=0))

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.model.quaternion import components, composed, product
+from magfusion.model.quaternion import components, cross, of_vectors, product, unit
 from magfusion.model.site import MotionModel
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -25,10 +25,14 @@ def rotation_increments(time: Array, gyro_body: Array) -> Rotation:
     Rotation
         n - 1 rotations ``body(k)_from_body(k+1)``; second-order coning included.
     """
+    return Rotation.from_rotvec(_increments(time, gyro_body))
+
+
+def _increments(time: Array, gyro_body: Array) -> Array:
     before, after = gyro_body[:-1], gyro_body[1:]
     dt = np.diff(time)[:, None]
-    coning = np.cross(before, after) * dt**2 / 12.0
-    return Rotation.from_rotvec(0.5 * (before + after) * dt + coning)
+    coning = cross(before.T, after.T).T * dt**2 / 12.0
+    return np.asarray(0.5 * (before + after) * dt + coning)
 
 
 def _prefix_products(quaternion: Array) -> Array:
@@ -61,10 +65,15 @@ def attitude_from_gyro(time: Array, gyro_body: Array) -> Rotation:
     Rotation
         n rotations, the first the identity.
     """
+    return Rotation.from_quat(turn_from_gyro(time, gyro_body).T, scalar_first=True)
+
+
+def turn_from_gyro(time: Array, gyro_body: Array) -> Array:
+    """Return `attitude_from_gyro` as quaternions, shape (4, n), scalar first."""
     steps = np.empty((4, len(time)))
     steps[:, 0] = [1.0, 0.0, 0.0, 0.0]
-    steps[:, 1:] = components(rotation_increments(time, gyro_body))
-    return Rotation.from_quat(_prefix_products(steps).T, scalar_first=True)
+    steps[:, 1:] = of_vectors(_increments(time, gyro_body).T)
+    return unit(_prefix_products(steps))
 
 
 def attitude_at(attitude: Rotation, time: Array, gyro_body: Array, wanted: Array) -> Rotation:
@@ -85,8 +94,14 @@ def attitude_at(attitude: Rotation, time: Array, gyro_body: Array, wanted: Array
     Rotation
         m rotations.
     """
+    found = turn_at(components(attitude), time, gyro_body, wanted)
+    return Rotation.from_quat(found.T, scalar_first=True)
+
+
+def turn_at(turn: Array, time: Array, gyro_body: Array, wanted: Array) -> Array:
+    """Return `attitude_at` of and as quaternions, shape (4, n) and (4, m), scalar first."""
     index = _sample_before(time, wanted)
-    return composed(attitude[index], _turn_since(index, time, gyro_body, wanted))
+    return product(turn[:, index], _turn_since(index, time, gyro_body, wanted))
 
 
 def attitude_from_gyro_at(time: Array, gyro_body: Array, wanted: Array) -> Rotation:
@@ -111,13 +126,13 @@ def attitude_from_gyro_at(time: Array, gyro_body: Array, wanted: Array) -> Rotat
     carried = quaternion[:, :1]
     for lo in range(0, len(time) - 1, CHUNK):
         piece = slice(lo, lo + CHUNK + 1)
-        steps = components(rotation_increments(time[piece], gyro_body[piece]))
+        steps = of_vectors(_increments(time[piece], gyro_body[piece]).T)
         count = steps.shape[1]
         here = np.flatnonzero((index > lo) & (index <= lo + count))
         turned = product(carried, _products_of_first(steps, np.append(index[here] - lo, count)))
         quaternion[:, here] = turned[:, :-1]
         carried = turned[:, -1:]
-    since = components(_turn_since(index, time, gyro_body, wanted))
+    since = _turn_since(index, time, gyro_body, wanted)
     return Rotation.from_quat(product(quaternion, since).T, scalar_first=True)
 
 
@@ -142,14 +157,14 @@ def _sample_before(time: Array, wanted: Array) -> IntArray:
     return np.clip(before, 0, len(time) - 1)
 
 
-def _turn_since(index: IntArray, time: Array, gyro_body: Array, wanted: Array) -> Rotation:
-    """Return the turn from samples to the times that follow them."""
+def _turn_since(index: IntArray, time: Array, gyro_body: Array, wanted: Array) -> Array:
+    """Return the turn from samples to the times that follow them, shape (4, m), scalar first."""
     after = np.minimum(index + 1, len(time) - 1)
     span = np.where(after > index, time[after] - time[index], 1.0)
     ahead = wanted - time[index]
     share = np.clip(0.5 * ahead / span, 0.0, 0.5)[:, None]
     rate = (1.0 - share) * gyro_body[index] + share * gyro_body[after]
-    return Rotation.from_rotvec(rate * ahead[:, None])
+    return of_vectors((rate * ahead[:, None]).T)
 
 
 def mean_about(time: Array, vector: Array, wanted: Array, span: float) -> Array:

@@ -107,9 +107,9 @@ def _at_point(
     field, by = np.tile(earth_field_world, (len(rotation), 1)), np.zeros((len(rotation), 3))
     for beacon, current in zip(site.beacons, currents, strict=True):
         driven = driven_field(beacon, motion.position_world + lever, current, along)
-        field += driven.field_world
-        if driven.along_world is not None:
-            by += driven.along_world
+        field += driven.field
+        if driven.along is not None:
+            by += driven.along
     measured_from_body = (magnetometer.matrix @ magnetometer.body_from_sensor.T).T
     if change is not None:
         by += np.cross(field, change.rotation_world)

@@ -24,8 +24,8 @@ class Maps(NamedTuple):
 
     Parameters
     ----------
-    index : int ndarray, shape (n, m)
-        Of the samples.
+    sample : int ndarray, shape (n, m)
+        Number of each sample.
     weight : bool ndarray, shape (n, m)
         False where a row is padding.
     elapsed : ndarray, shape (n, m)
@@ -40,7 +40,7 @@ class Maps(NamedTuple):
         How many of those the window tells of.
     """
 
-    index: IntArray
+    sample: IntArray
     weight: BoolArray
     elapsed: Array
     solver: Array
@@ -96,7 +96,7 @@ class Designs:
         beside_hz = np.concatenate([self.nuisance_hz, self.settings.lines_hz])
         probes = probes_left(self.frequencies_hz, beside_hz, elapsed, weight, design, inverse)
         return Maps(
-            index=index,
+            sample=index,
             weight=weight,
             elapsed=elapsed,
             solver=inverse[:, told] @ projected,

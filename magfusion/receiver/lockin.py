@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magfusion.model.quaternion import inverse, matrices, turned
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.admission import (
@@ -25,7 +26,7 @@ from magfusion.receiver.noise import (
     not_below,
     smoothed_over_windows,
 )
-from magfusion.receiver.turn import on_clock, standing_in, turn_of
+from magfusion.receiver.turn import body_turn_of, measured_from_body, on_clock, standing_in
 from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz
 from magfusion.units import Array, BoolArray, ComplexArray
 
@@ -43,8 +44,9 @@ class WindowOperator:
     designs : Designs
         Of the sample times alone.
     channels : tuple of (str, int)
-    still_from_measured : ndarray, shape (samples, 3, 3)
-        Takes each sample to axes that do not turn with the body.
+    body_from_measured : ndarray, shape (3, 3)
+    still_from_body : ndarray, shape (4, samples)
+        Takes each sample to axes that do not turn with the body; quaternions, scalar first.
     measured_from_still : ndarray, shape (windows, 3, 3)
         Takes the fields back at the centre of each window.
     declared_noise : float
@@ -58,7 +60,8 @@ class WindowOperator:
 
     designs: Designs
     channels: tuple[tuple[str, int], ...]
-    still_from_measured: Array
+    body_from_measured: Array
+    still_from_body: Array
     measured_from_still: Array
     declared_noise: float
     unseen: BoolArray
@@ -145,7 +148,7 @@ class WindowOperator:
 
     def _still(self, measured_sensor: Array) -> Array:
         """Return the samples in axes that stand still, shape (samples, 3)."""
-        return np.einsum("nij,nj->ni", self.still_from_measured, measured_sensor)
+        return turned(self.still_from_body, self.body_from_measured @ measured_sensor.T).T
 
     def _bent(self, rows: slice, maps: Maps) -> Array:
         """Return the relative variance of phasors by the square of a turn that is not seen.
@@ -173,7 +176,7 @@ class WindowOperator:
 
 def _of_windows(still: Array, maps: Maps) -> Array:
     """Return the samples of windows, zero where they are padded, shape (n, m, 3)."""
-    return still[maps.index] * maps.weight[..., None]
+    return still[maps.sample] * maps.weight[..., None]
 
 
 def window_operator(
@@ -204,12 +207,15 @@ def window_operator(
     step = usual_step(imu.time, "imu") if imu_step is None else imu_step
     margin = 2.0 * step + 3.0 * site.platform.imu.time_offset_sigma
     silence = silences(imu.time, step, margin)
-    measured_from_still = turn_of(standing_in(imu, silence), site)
+    still_from_body = body_turn_of(standing_in(imu, silence))
+    from_body = measured_from_body(site)
+    at_centre = matrices(inverse(still_from_body(windows.centre)))
     return WindowOperator(
         designs=designs_of(waveform, site, settings, windows) if designs is None else designs,
         channels=site.channels,
-        still_from_measured=np.asarray(np.linalg.inv(measured_from_still(waveform.time))),
-        measured_from_still=measured_from_still(windows.centre),
+        body_from_measured=np.asarray(np.linalg.inv(from_body)),
+        still_from_body=still_from_body(waveform.time),
+        measured_from_still=from_body @ at_centre,
         declared_noise=site.platform.magnetometer.noise_density * float(np.sqrt(nyquist_hz)),
         unseen=meets_silence(windows, settings.window, waveform.time, silence),
         apart=np.zeros(len(windows), dtype=bool),

@@ -5,9 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from magfusion.model.quaternion import inverse, matrices, unit
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
-from magfusion.model.strapdown import attitude_at, attitude_from_gyro
+from magfusion.model.strapdown import turn_at, turn_from_gyro
 from magfusion.units import Array
 
 
@@ -60,11 +61,20 @@ def turn_of(imu: ImuSamples, site: Site) -> Callable[[Array], Array]:
     imu : ImuSamples
         As from `on_clock`.
     """
-    attitude, sensor = attitude_from_gyro(imu.time, imu.gyro_body), site.platform.magnetometer
-    measured_from_body = sensor.matrix @ sensor.body_from_sensor.T
+    still_from_body, from_body = body_turn_of(imu), measured_from_body(site)
+    return lambda time: from_body @ matrices(inverse(still_from_body(time)))
 
-    def measured_from_still(time: Array) -> Array:
-        still_from_body = attitude_at(attitude, imu.time, imu.gyro_body, time).as_matrix()
-        return measured_from_body @ np.swapaxes(still_from_body, 1, 2)
 
-    return measured_from_still
+def body_turn_of(imu: ImuSamples) -> Callable[[Array], Array]:
+    """Return what gives, at times (m,), the ``still_from_body`` of `turn_of`, shape (4, m).
+
+    Quaternions, scalar first.
+    """
+    turn = turn_from_gyro(imu.time, imu.gyro_body)
+    return lambda time: unit(turn_at(turn, imu.time, imu.gyro_body, time))
+
+
+def measured_from_body(site: Site) -> Array:
+    """Return what takes a field in the body's axes to those of the magnetometer, (3, 3)."""
+    sensor = site.platform.magnetometer
+    return np.asarray(sensor.matrix @ sensor.body_from_sensor.T)

@@ -45,3 +45,27 @@ def dipole_gradient(offset: Array, moment: Array) -> Array:
     radial = offset[..., :, None] * offset[..., None, :]
     bracket = outer + np.swapaxes(outer, -1, -2) + along * (np.eye(3) - 5.0 * radial / square)
     return 3.0 * MU0_OVER_4PI * bracket / square**2.5
+
+
+def dipole_field_along(offset: Array, moment: Array, along: Array) -> Array:
+    """Return the derivative of the dipole field along displacements, without its whole gradient.
+
+    Parameters
+    ----------
+    offset, moment : ndarray, shape (..., 3)
+        As in `dipole_field` (m, A m^2).
+    along : ndarray, shape (..., 3)
+        Of the point, or its velocity (m, m/s).
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        (T, T/s)
+    """
+    square = np.einsum("...i,...i", offset, offset)[..., None]
+    by_moment = np.einsum("...i,...i", offset, moment)[..., None]
+    outward = np.einsum("...i,...i", offset, along)[..., None]
+    across = np.einsum("...i,...i", moment, along)[..., None]
+    radial = across - 5.0 * by_moment * outward / square
+    bracket = along * by_moment + moment * outward + offset * radial
+    return np.asarray(3.0 * MU0_OVER_4PI * bracket / square**2.5)
