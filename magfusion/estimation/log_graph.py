@@ -168,8 +168,9 @@ def _links(
         bridged.append(int(np.sum(gaps)))
         return found
 
-    start = initial_estimate(states, calibration).values
-    links = links_between(preintegrated, calibration, blocks, lambda _: start)
+    links = links_between(
+        preintegrated, calibration, blocks, lambda _: initial_estimate(states, calibration).values
+    )
     return tuple(links), bridged[0]
 
 

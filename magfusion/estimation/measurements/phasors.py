@@ -1,6 +1,6 @@
 """Phasors of the beacons as a measurement."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -64,6 +64,7 @@ class FieldPhasors(Measurement):
     moving: BoolArray
     robust: str | None = None
     excess: Array | None = None
+    predicted: "_Predicted" = field(default_factory=lambda: _Predicted())
 
     @property
     def loss(self) -> Loss | None:
@@ -91,6 +92,17 @@ class FieldPhasors(Measurement):
         self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
     ) -> Rows:
         """Return the rows at an estimate, a group for each channel."""
+        value, by_pose, by_calibration = self.predicted.of(self, states, calibration, blocks)
+        return Rows(
+            error=(self.sqrt_information @ (value - self.measured)[..., None])[..., 0],
+            by_pose=self.sqrt_information @ by_pose,
+            by_calibration=self.sqrt_information @ by_calibration,
+        )
+
+    def unwhitened(
+        self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
+    ) -> tuple[Array, Array, Array]:
+        """Return the prediction, and its derivatives by poses and calibration."""
         velocity_body = np.swapaxes(states.world_from_body, 1, 2) @ states.velocity_world[..., None]
         twist_body = np.concatenate([self.rate_body, velocity_body[..., 0]], axis=1)
         lag, world_from_body, position_world = self._at_field(states, calibration)
@@ -110,11 +122,7 @@ class FieldPhasors(Measurement):
             elif block.parameter == CLOCK_RATE:
                 run = self.time - calibration.imu_begin
                 by_calibration[..., block.columns.start] += run[:, None, None] * by_lag
-        return Rows(
-            error=(self.sqrt_information @ (value - self.measured)[..., None])[..., 0],
-            by_pose=self.sqrt_information @ by_pose,
-            by_calibration=self.sqrt_information @ by_calibration,
-        )
+        return value, by_pose, by_calibration
 
     def without(self, rejected: BoolArray) -> "FieldPhasors":
         """Return the measurement without some channels, shape (channels,)."""
@@ -133,6 +141,38 @@ class FieldPhasors(Measurement):
             states.world_from_body @ turn,
             states.position_world - lag[:, None] * states.velocity_world,
         )
+
+
+class _Predicted:
+    """The last prediction of a single epoch: gate, filter and those without each beacon ask for it.
+
+    All share it that differ in their weights alone.
+    """
+
+    def __init__(self) -> None:
+        self._at: tuple[bytes, ...] = ()
+        self._of: tuple[object, ...] = ()
+        self._found: tuple[Array, Array, Array] | None = None
+
+    def of(
+        self,
+        phasors: FieldPhasors,
+        states: States,
+        calibration: Calibration,
+        blocks: tuple[Block, ...],
+    ) -> tuple[Array, Array, Array]:
+        """Return `FieldPhasors.unwhitened`."""
+        if len(states) != 1:
+            return phasors.unwhitened(states, calibration, blocks)
+        pose = states.world_from_body, states.position_world, states.velocity_world
+        at = tuple(part.tobytes() for part in pose)
+        clocks = phasors.rate_body, phasors.by_time_offset, phasors.applied_offset, phasors.moving
+        of = (calibration, blocks, *clocks)
+        alike = at == self._at and all(a is b for a, b in zip(of, self._of, strict=True))
+        if self._found is None or not alike:
+            self._at, self._of = at, of
+            self._found = phasors.unwhitened(states, calibration, blocks)
+        return self._found
 
 
 def field_phasors(

@@ -236,6 +236,8 @@ class SiteParameter(Parameter):
     def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
         """Return the step between two states of the part."""
         a, b = (getattr(self.part(c.site, owner), self.attribute) for c in (old, new))
+        if a is b:
+            return np.zeros(1 if np.ndim(a) == 0 else 3 if self.is_rotation else np.size(a))
         if self.is_rotation:
             return Rotation.from_matrix(a.T @ b).as_rotvec()
         return ((b - a) / self.si).ravel()
