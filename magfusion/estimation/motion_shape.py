@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -115,25 +114,26 @@ class MotionShape:
         """
         states = self.states
         assert states.velocity_world is not None
-        path = CubicHermiteSpline(self.time, self.position_world, self.velocity_world)
-        speed = path.derivative()
-        lack = CubicHermiteSpline(
+        path = self.time, self.position_world, self.velocity_world
+        at_states, speed_at_states = _hermite(*path, states.time)
+        position, velocity = _hermite(*path, wanted)
+        inside = np.clip(wanted, states.time[0], states.time[-1])
+        lack, slope = _hermite(
             states.time,
-            states.position_world - path(states.time),
-            states.velocity_world - speed(states.time),
+            states.position_world - at_states,
+            states.velocity_world - speed_at_states,
+            inside,
         )
         attitude = product(
             _turn_at(states.time, self.world_from_start, wanted),
             turn_at(self.chain, self.time, self.gyro_body, wanted),
         )
-        inside = np.clip(wanted, states.time[0], states.time[-1])
         beyond = (wanted - inside)[:, None]
-        slope = lack.derivative()(inside)
         return Trajectory(
             time=wanted,
             world_from_body=matrices(unit(attitude)),
-            position_world=path(wanted) + lack(inside) + slope * beyond,
-            velocity_world=speed(wanted) + slope,
+            position_world=position + lack + slope * beyond,
+            velocity_world=velocity + slope,
         )
 
     def by_time_offset(self, wanted: Array) -> tuple[Array, Array]:
@@ -156,15 +156,15 @@ class MotionShape:
         force = self.accel_world + np.array([0.0, 0.0, self.gravity])
         held = _interpolated(self.time, known, at_states)
         speed, moved = _integrated(self.time, cross(held.T, force.T).T)
-        change = CubicHermiteSpline(
+        change = (
             self.time,
             self._averaged(moved - self.velocity_world),
             self._averaged(speed - self.accel_world),
         )
-        between = CubicHermiteSpline(known, change(known), change.derivative()(known))
         inside = np.clip(wanted, known[0], known[-1])
-        beyond = (wanted - inside)[:, None] * between.derivative()(inside)
-        by_position = change(wanted) - between(inside) - beyond
+        held_back, slope = _hermite(known, *_hermite(*change, known), inside)
+        by_position = _hermite(*change, wanted)[0] - held_back
+        by_position -= slope * (wanted - inside)[:, None]
         by_rotation = _interpolated(wanted, known, at_states) - _interpolated(
             wanted, self.time, rate
         )
@@ -205,6 +205,19 @@ def _integrated(time: Array, rate: Array) -> tuple[Array, Array]:
     inner = (2.0 * rate[:-1] + rate[1:]) * step**2 / 6.0
     twice = np.concatenate([zero, np.cumsum(once[:-1] * step + inner, axis=0)])
     return once, twice
+
+
+def _hermite(known: Array, value: Array, slope: Array, wanted: Array) -> tuple[Array, Array]:
+    """Return values and slopes at some times of the cubics through those at the known ones."""
+    index = np.clip(np.searchsorted(known, wanted, side="right") - 1, 0, len(known) - 2)
+    step = (known[index + 1] - known[index])[:, None]
+    share = (wanted - known[index])[:, None] / step
+    rise, begin, end = value[index + 1] - value[index], slope[index] * step, slope[index + 1] * step
+    square, cube = 3.0 * rise - 2.0 * begin - end, begin + end - 2.0 * rise
+    return (
+        value[index] + share * (begin + share * (square + share * cube)),
+        (begin + share * (2.0 * square + 3.0 * share * cube)) / step,
+    )
 
 
 def _interpolated(time: Array, known: Array, values: Array) -> Array:

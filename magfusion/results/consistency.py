@@ -1,7 +1,7 @@
 """Whether an estimator's covariance is consistent: chi-square tests of normalised errors."""
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from magfusion.units import Array, IntArray
 
@@ -24,7 +24,7 @@ def average_nees_bounds(dof: int, runs: int, confidence: float = 0.95) -> tuple[
         Lower and upper bound; the expectation is ``dof`` (Bar-Shalom, Li and Kirubarajan, 5.4.2).
     """
     tail = 0.5 * (1.0 - confidence)
-    low, high = chi2.ppf([tail, 1.0 - tail], dof * runs) / runs
+    low, high = 2.0 * gammaincinv(0.5 * dof * runs, [tail, 1.0 - tail]) / runs
     return float(low), float(high)
 
 

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.stats import f as fisher
-from scipy.stats import t as student
+from scipy.special import fdtrc, stdtrit
 
 from magfusion.results.trend import trend
 from magfusion.units import Array, BoolArray
@@ -92,7 +91,7 @@ class Slope:
         return self._margin(CONFIDENCE)
 
     def _margin(self, confidence: float) -> float:
-        return float(student.ppf(0.5 + 0.5 * confidence, self.freedom) * self.standard_error)
+        return float(stdtrit(self.freedom, 0.5 + 0.5 * confidence) * self.standard_error)
 
     def verdict(self, limit: float) -> Verdict:
         """Return whether the slope is within plus or minus a limit.
@@ -160,7 +159,7 @@ def common_slope(times: Sequence[Array], values: Sequence[Array]) -> CommonSlope
     mean, cov = np.mean(rates, axis=0), np.cov(rates, rowvar=False) / worlds
     square = float(mean @ np.linalg.solve(cov, mean))
     freedom = worlds - 3
-    chance = float(fisher.sf(square * freedom / (3 * (worlds - 1)), 3, freedom))
+    chance = float(fdtrc(3, freedom, square * freedom / (3 * (worlds - 1))))
     return CommonSlope(mean, np.sqrt(np.diag(cov)), chance)
 
 

@@ -13,7 +13,7 @@ often that it forgets (`tests/test_drift.py`).
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtr, stdtrit
 
 from magfusion.units import Array
 
@@ -76,7 +76,7 @@ def trend(time: Array, value: Array) -> Trend:
         return Trend(middle / span, 0.0, freedom)
     near, far = (_half_width(rate - middle, error, weight, freedom, tail) for tail in _TAILS)
     alike = _freedom_of(far / near, freedom)
-    return Trend(middle / span, near / float(student.ppf(_TAILS[0], alike)) / span, alike)
+    return Trend(middle / span, near / float(stdtrit(alike, _TAILS[0])) / span, alike)
 
 
 def _block_means(time: Array, value: Array) -> tuple[Array, Array]:
@@ -110,12 +110,12 @@ def _fitted(design: Array, value: Array, shape: Array) -> tuple[float, float, fl
 
 def _half_width(offset: Array, error: Array, weight: Array, freedom: float, tail: float) -> float:
     """Return how far from the middle an average of Student's distributions has its quantile."""
-    reach = float(student.ppf(tail, freedom))
+    reach = float(stdtrit(freedom, tail))
     low, high = 0.0, float(np.max(np.abs(offset) + reach * error))
     for _ in range(60):
         half = 0.5 * (low + high)
-        both = student.cdf((half - offset) / error, freedom)
-        both = both + student.cdf((half + offset) / error, freedom)
+        both = stdtr(freedom, (half - offset) / error)
+        both = both + stdtr(freedom, (half + offset) / error)
         if float(weight @ both) < 2.0 * tail:
             low = half
         else:
@@ -128,6 +128,6 @@ def _freedom_of(ratio: float, most: float) -> float:
     low, high = 1.0, float(most)
     for _ in range(50):
         half = 0.5 * (low + high)
-        near, far = student.ppf(_TAILS, half)
+        near, far = stdtrit(half, _TAILS)
         low, high = (half, high) if far / near > ratio else (low, half)
     return high

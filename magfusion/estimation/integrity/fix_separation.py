@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from magfusion.estimation.integrity.separation import (
     Separation,
@@ -90,7 +90,7 @@ class _How:
     def fits(self, fixes: Fixes) -> BoolArray:
         """Tell whether the residuals are not too large for what is declared."""
         rows = 6 * np.sum(self.samples.valid, axis=1) + 3 * (self.gravity is not None)
-        return np.asarray(fixes.cost[:, 0] < chi2.isf(MISFIT, rows))
+        return np.asarray(fixes.cost[:, 0] < chdtri(rows, MISFIT))
 
 
 @dataclass(eq=False)

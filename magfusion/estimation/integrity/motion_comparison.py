@@ -10,7 +10,6 @@ which bend a path as much as a wrong axis does, and would be taken for one.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation, Slerp
 
 from magfusion.estimation.snapshot.fix import Fixes
@@ -294,6 +293,8 @@ def _forces(fixes: Fixes, stamps: Array, imu: ImuSamples, wanted: Array) -> tupl
 
     The mean under a triangle of twice `CURVE_SPAN` is what acceleration makes of positions.
     """
+    from scipy.signal import fftconvolve  # takes as long to import as all else
+
     time = fixes.time
     grid = np.linspace(time[0], time[-1], round((time[-1] - time[0]) / GRID) + 1)
     turns = Slerp(time, Rotation.from_matrix(fixes.world_from_body[:, 0]))(grid).as_matrix()

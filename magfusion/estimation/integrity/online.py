@@ -8,7 +8,7 @@ find the platform elsewhere.  None of them knows the truth.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from magfusion.estimation.integrity.gate import Gate
 from magfusion.estimation.integrity.judgement import Judgement
@@ -148,7 +148,7 @@ class OnlineWitness:
         distance : float
             Chi square of six components.
         """
-        if distance < chi2.isf(1e-6, 6):
+        if distance < chdtri(6, 1e-6):
             self._elsewhere, self._elsewhere_times = None, 0
         else:
             self._elsewhere, self._elsewhere_times = off, self._elsewhere_times + 1
@@ -290,7 +290,7 @@ class OnlineWitness:
                 )
                 found.append(Finding("prior", text, weight=score / DOUBT))
                 inflation = max(inflation, score**2)
-        if number and total > (limit := float(chi2.isf(1e-5, number))):
+        if number and total > (limit := float(chdtri(number, 1e-5))):
             text = (
                 f"Together the {number} calibration parameters are {np.sqrt(total / number):.2g}"
                 " times as far from their declared values as their sigmas say."

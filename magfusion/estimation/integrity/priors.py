@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import log_ndtr
 
 from magfusion.estimation.integrity.statistics import FALSE_ALARMS, SURE, holm, log_p_chi_square
 from magfusion.model.trust import Finding, Trust, Verdict
@@ -71,7 +71,7 @@ def contradiction(
     sigma = np.sqrt(np.maximum(np.diagonal(cov), 0.0))
     told = sigma**2 > MOVED
     deviation = np.where(told, np.abs(scaled) / np.where(told, sigma, 1.0), 0.0)
-    single = np.where(told, np.log(2.0) + norm.logsf(deviation), 0.0)
+    single = np.where(told, np.log(2.0) + log_ndtr(-deviation), 0.0)
     chance = np.append(single, log_p_chi_square(square, freedom))
     speaks, least = holm(chance), float(np.min(chance))
     if not np.any(speaks):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from magfusion.errors import EstimationError
 from magfusion.estimation.snapshot.fix import Fixes
@@ -208,4 +208,4 @@ def _repeated(prior: Trajectory, count: int) -> Trajectory:
 def _agrees(fix: AgreedFix, samples: FieldSamples) -> bool:
     rows = 6 * int(np.sum(samples.valid[0] & ~fix.refused))
     cost = float(fix.fixes.cost[0, 0] - fix.fixes.prior_cost[0, 0])
-    return cost <= float(chi2.isf(DOUBT, rows))
+    return cost <= float(chdtri(rows, DOUBT))

@@ -1,13 +1,13 @@
 """Whether a running estimate went on or jumped, for those who follow it by its changes."""
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from magfusion.estimation.integrity.judgement import Judgement
 from magfusion.estimation.state import State, pose_of
 from magfusion.model.trust import Verdict
 
-UNEXPLAINED = float(chi2.isf(1e-6, 6))  # squared jump of a pose in units of what it was known to
+UNEXPLAINED = float(chdtri(6, 1e-6))  # squared jump of a pose in units of what it was known to
 
 
 class Resets:

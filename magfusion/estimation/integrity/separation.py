@@ -16,8 +16,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import erfc, ndtri
-from scipy.stats import chi
+from scipy.special import erfc, gammainccinv, ndtri
 
 from magfusion.estimation.solve.batched import open_inverse
 from magfusion.model.trust import Risk
@@ -57,7 +56,10 @@ class Radius(NamedTuple):
         """Return a radius that a norm exceeds with no more than a probability."""
         single = -ndtri(0.5 * np.minimum(probability, 0.999 * SINGLE_HOLDS))
         with np.errstate(invalid="ignore"):  # of what is known exactly
-            bounds = single * self.whole, chi.isf(probability, 3) * self.largest
+            bounds = (
+                single * self.whole,
+                np.sqrt(2.0 * gammainccinv(1.5, probability)) * self.largest,
+            )
         return np.fmin(*bounds)
 
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import binary_closing, binary_dilation
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from magfusion.estimation.batch import Smoothed, solved_again
 from magfusion.estimation.integrity.separation import Separation, protection_levels, radii
@@ -159,7 +159,7 @@ def _false_stretches(result: Smoothed, found: Separation, beacon: int) -> BoolAr
     spread = cov + np.eye(error.shape[1]) / repeats
     square = np.sum(error * np.linalg.solve(spread, error[..., None])[..., 0], axis=1)
     heard = np.any(phasors.sqrt_information[:, own] != 0.0, axis=(1, 2, 3))
-    deviates = heard & (square > chi2.isf(UNEXPECTED, error.shape[1]))
+    deviates = heard & (square > chdtri(error.shape[1], UNEXPECTED))
     step = float(np.median(np.diff(result.fields.time)))
     near = np.ones(2 * int(np.ceil(JOINED / step)) + 1, dtype=bool)
     window = np.ones(2 * int(np.ceil(repeats)) + 1, dtype=bool)

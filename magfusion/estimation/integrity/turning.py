@@ -9,9 +9,9 @@ and on real instruments the identity explains 87 to 99.9 % of db/dt.
 from dataclasses import dataclass
 from functools import cache
 from itertools import permutations, product
+from typing import Literal
 
 import numpy as np
-from scipy.signal import oaconvolve
 
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
@@ -122,7 +122,7 @@ def turning(imu: ImuSamples, field_time: Array, field_body: Array, lag: float = 
     size = float(np.median(np.linalg.norm(field, axis=1)))
 
     def passed(value: Array, kernel: Array) -> Array:
-        return np.asarray(oaconvolve(value, kernel[:, None], mode="valid", axes=0)[::every])
+        return _convolved(value, kernel[:, None], mode="valid")[::every]
 
     change = passed((field - np.mean(field, axis=0)) / size, slope)
     both = passed((rate[:, :, None] * field[:, None, :] / size).reshape(-1, 9), low)
@@ -178,6 +178,13 @@ def agrees(log: Log, site: Site) -> bool:
     return found.explained(np.eye(3)) > CONTRADICTED
 
 
+def _convolved(value: Array, kernel: Array, mode: Literal["valid", "same"]) -> Array:
+    """Return each column convolved with a kernel, shape (n, 1)."""
+    from scipy.signal import oaconvolve  # takes as long to import as all else
+
+    return np.asarray(oaconvolve(value, kernel, mode=mode, axes=0))
+
+
 class Clocks:
     """Turn of the field and rates on one grid, by the stamps of each."""
 
@@ -185,11 +192,11 @@ class Clocks:
         self.time = np.arange(time[0], time[-1], LAG_STEP)
         average = max(1, round(1.0 / (CUTOFF * LAG_STEP)))
         window = max(1, round(average * LAG_STEP / float(np.median(np.diff(time)))))
-        smooth = oaconvolve(field, np.full((window, 1), 1.0 / window), mode="same", axes=0)
+        smooth = _convolved(field, np.full((window, 1), 1.0 / window), mode="same")
         self.field = _interpolated(self.time, time, smooth)
         self.change = np.gradient(self.field, LAG_STEP, axis=0)
         rate = _interpolated(self.time, log.imu.time + offset, log.imu.gyro_body)
-        self.rate = oaconvolve(rate, np.full((average, 1), 1.0 / average), mode="same", axes=0)
+        self.rate = _convolved(rate, np.full((average, 1), 1.0 / average), mode="same")
 
     def lag(self, part: slice = slice(None)) -> tuple[float, float]:
         """Return by which shift of the inertial stamps a part agrees best (s), and how well."""
