@@ -19,7 +19,7 @@ from magfusion.estimation.integrity.running import Running
 from magfusion.estimation.integrity.score_online import Sums
 from magfusion.estimation.measurements.earth import EarthField
 from magfusion.estimation.measurements.measurement import Measurement
-from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.measurements.phasors import FieldPhasors, Predictions
 from magfusion.estimation.measurements.pose_fix import PoseFix
 from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
 from magfusion.estimation.state import MOTION, State, states_of
@@ -33,6 +33,10 @@ from magfusion.units import Array
 
 MEASUREMENTS: tuple[type[Measurement], ...] = (FieldPhasors, EarthField, ZeroVelocity, PoseFix)
 ROUNDING = 1e-6  # of a rotation, and of a correlation's least eigenvalue
+
+
+# What is only kept to be shared is made again.
+_FORGOTTEN = Rules({Predictions: lambda _: None}, {Predictions: lambda _: Predictions()})
 
 
 def navigator_rules(
@@ -161,14 +165,14 @@ def _check_window(window: SlidingWindow) -> None:
 def _measurement_data(measurement: Measurement) -> dict[str, Any]:
     return {
         "kind": type(measurement).__name__,
-        **{k: to_plain(v) for k, v in vars(measurement).items()},
+        **{k: to_plain(v, _FORGOTTEN) for k, v in vars(measurement).items()},
     }
 
 
 def _measurement(data: Any, kinds: Mapping[str, type[Measurement]]) -> Measurement:
     _check(isinstance(data, dict) and str(data.get("kind")) in kinds, "is of no known kind")
     own = {name: value for name, value in data.items() if name != "kind"}
-    return from_plain(kinds[str(data["kind"])], own, str(data["kind"]))
+    return from_plain(kinds[str(data["kind"])], own, str(data["kind"]), _FORGOTTEN)
 
 
 @dataclass(frozen=True, eq=False)

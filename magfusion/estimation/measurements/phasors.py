@@ -1,6 +1,7 @@
 """Phasors of the beacons as a measurement."""
 
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -53,6 +54,8 @@ class FieldPhasors(Measurement):
     excess : ndarray, shape (n, channels), optional
         Variance with which it is weighed, since epochs close by have the same model error, in
         units of that of an epoch alone.
+    predicted : Predictions
+        Shared by all that differ from this in their weights alone.
     """
 
     time: Array
@@ -64,7 +67,7 @@ class FieldPhasors(Measurement):
     moving: BoolArray
     robust: str | None = None
     excess: Array | None = None
-    predicted: "_Predicted" = field(default_factory=lambda: _Predicted())
+    predicted: "Predictions" = field(default_factory=lambda: Predictions())
 
     @property
     def loss(self) -> Loss | None:
@@ -143,16 +146,14 @@ class FieldPhasors(Measurement):
         )
 
 
-class _Predicted:
-    """The last prediction of a single epoch: gate, filter and those without each beacon ask for it.
+class Predictions:
+    """The last predictions of a single epoch: gate, score, filter and subsets ask for two in turn.
 
-    All share it that differ in their weights alone.
+    All share them that differ in their weights alone.
     """
 
     def __init__(self) -> None:
-        self._at: tuple[bytes, ...] = ()
-        self._of: tuple[object, ...] = ()
-        self._found: tuple[Array, Array, Array] | None = None
+        self._kept: list[_Prediction] = []
 
     def of(
         self,
@@ -168,11 +169,20 @@ class _Predicted:
         at = tuple(part.tobytes() for part in pose)
         clocks = phasors.rate_body, phasors.by_time_offset, phasors.applied_offset, phasors.moving
         of = (calibration, blocks, *clocks)
-        alike = at == self._at and all(a is b for a, b in zip(of, self._of, strict=True))
-        if self._found is None or not alike:
-            self._at, self._of = at, of
-            self._found = phasors.unwhitened(states, calibration, blocks)
-        return self._found
+        for known in self._kept:
+            if at == known.at and all(a is b for a, b in zip(of, known.of, strict=True)):
+                return known.found
+        found = phasors.unwhitened(states, calibration, blocks)
+        self._kept = [*self._kept[-1:], _Prediction(at, of, found)]
+        return found
+
+
+class _Prediction(NamedTuple):
+    """A prediction with the state, and with all else, that it is of."""
+
+    at: tuple[bytes, ...]
+    of: tuple[object, ...]
+    found: tuple[Array, Array, Array]
 
 
 def field_phasors(
