@@ -291,7 +291,7 @@ def report_uncertain(found: Uncertain, config: Config) -> str:
         f" graph / exact {found.graph_to_exact:.2f}, improvement x{found.improvement:.1f},"
         f" chi2/dof {found.chi2_per_dof:.2f}, NEES {found.nees:.2f} per parameter\n"
         f" within half a metre: {found.volume_position_mm:.2f} mm,"
-        f" {found.volume_attitude_deg:.3f} deg (beside 1.1 mm, 0.15 deg)"
+        f" {found.volume_attitude_deg:.3f} deg (Anser's hardware: 1.1 mm, 0.15 deg)"
     )
 
 

@@ -74,12 +74,15 @@ def test_targets_lie_in_their_box_and_off_the_beacons() -> None:
 
 def test_the_survey_has_a_level_sensor_on_a_half_metre_grid() -> None:
     survey = drawn(S0).survey(np.random.default_rng(1))
-    assert len(survey) == 10 * 7
+    assert len(survey) == 11 * 8
     for axis, step in ((0, 0.5), (1, 0.5)):
         np.testing.assert_allclose(np.diff(np.unique(survey.position_world[:, axis])), step)
-    np.testing.assert_array_equal(survey.world_from_body, np.tile(LEVEL, (70, 1, 1)))
+    np.testing.assert_array_equal(survey.world_from_body, np.tile(LEVEL, (88, 1, 1)))
+    grid = ROOM.grid_world()
+    assert np.all(grid.min(axis=0) <= ROOM.targets_world[0])
+    assert np.all(grid.max(axis=0) >= ROOM.targets_world[1])
     finer = replace(ROOM, spacing=0.25)
-    assert len(finer.grid_world()) == 19 * 13
+    assert len(finer.grid_world()) == 21 * 15
 
 
 def test_a_ring_has_its_beacons_at_equal_distance_and_with_tones_of_their_own() -> None:

@@ -230,6 +230,8 @@ def _conditioned(detected: _DetectedFields, process: _Process) -> FieldMap:
         system = np.eye(len(kernel)) + block_diagonal(information) @ kernel
         weights = np.linalg.solve(system, vector.ravel())
         before, state = state, (kernel @ weights).reshape(count, COMPONENTS)
+        # Where a survey is not of these beacons, steps would grow beyond any gain.
+        state[:, 0] = np.clip(state[:, 0], np.log(_WEAKEST), -np.log(_WEAKEST))
         if np.max(np.abs(state - before)) < SETTLED:
             break
     return FieldMap(

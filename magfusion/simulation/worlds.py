@@ -72,9 +72,8 @@ ROOM = Layout(
     beacons_world=np.array([[0.0, 0.0, 0.0], [6.20, 0.54, 0.0], [3.20, 4.28, 0.0]]),
     frequencies_hz=(25.0, 20.0, 30.0),
     targets_world=np.array([[0.6, 0.6, HEIGHT], [5.1, 3.9, HEIGHT]]),
-    # Whole steps from the targets' lower corner, within their box: the grid with which matching
-    # errs as the independent analysis found, at spacings of 0.25 to 1 m.
-    fingerprints_world=np.array([[0.6, 0.6, HEIGHT], [5.1, 3.6, HEIGHT]]),
+    # The half metres of the floor that hold all targets between them.
+    fingerprints_world=np.array([[0.5, 0.5, HEIGHT], [5.5, 4.0, HEIGHT]]),
 )
 
 
