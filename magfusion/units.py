@@ -1,6 +1,6 @@
 """Constants and the type of every numeric array."""
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -16,3 +16,6 @@ NANOTESLA = 1e-9  # T
 DEGREE = np.pi / 180.0  # rad
 NANOSECOND = 1e-9  # s
 STANDARD_GRAVITY = 9.80665  # m/s^2
+
+# Where states are: at the field epochs, at every inertial sample, or so many a second (Hz).
+Rate = Literal["field", "imu"] | float

@@ -17,7 +17,8 @@ from online_log import WINDOW, OnlineLog, epoch, navigate, online_log
 from test_navigate_stream import EKF, answered, records
 
 from magfusion.errors import InputError
-from magfusion.estimation.navigator import Navigator, NavigatorSettings, restored
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.restored import restored
 from magfusion.estimation.state import State
 from magfusion.files.atomic import whole_file
 from magfusion.files.checkpoint import Checkpoint, read_checkpoint, write_checkpoint

@@ -11,7 +11,8 @@ from test_smoothed_separation import EPOCHS, STEP, _false, _walk
 from magfusion.errors import InputError
 from magfusion.estimation.integrity.bank import SLACK, WIDE, SubsetBank
 from magfusion.estimation.integrity.judgement import JudgedState
-from magfusion.estimation.navigator import Navigator, NavigatorSettings, restored
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.restored import restored
 from magfusion.model.trust import Risk, Verdict
 from magfusion.units import Array
 
@@ -127,7 +128,7 @@ def test_a_checkpoint_with_filters_of_another_shape_is_refused() -> None:
     navigator = Navigator(small.site, NAVIGATOR)
     _feed(navigator, small, 0, 60)
     kept = navigator.checkpoint()
-    kept["parts"]["_update"]["_bank"]["_step"] = np.zeros((1, 3))
+    kept["parts"]["_update"]["bank"]["_step"] = np.zeros((1, 3))
     with pytest.raises(InputError, match="filters of another shape"):
         restored(small.site, NAVIGATOR, kept)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magfusion.estimation.batch import Smoothed, smooth
-from magfusion.estimation.between_epochs import at_imu_rate
+from magfusion.estimation.between_epochs import at_rate
 from magfusion.estimation.navigator import Navigator
 from magfusion.estimation.prepared import LONGEST_STEP
 from magfusion.estimation.state import as_trajectory
@@ -34,7 +34,7 @@ def silent_log(seed: int, motion: str = "static", rests: Rests | None = None) ->
 def resting(request: pytest.FixtureRequest) -> tuple[Log, Smoothed, Trajectory]:
     log = silent_log(request.param)
     result = smooth(log, demo_site(coil_radius=None))
-    return log, result, at_imu_rate(result, log)
+    return log, result, at_rate(result, log, "imu")
 
 
 def navigated(log: Log) -> Trajectory:
@@ -102,7 +102,7 @@ def test_between_the_epochs_the_covariance_meets_that_of_the_epochs(
 def test_in_motion_the_gap_is_no_rest_and_the_claim_holds() -> None:
     log = silent_log(3, "walk", Rests(start=0.0, move=60.0, pause=0.0))
     result = smooth(log, demo_site(coil_radius=None))
-    dense = at_imu_rate(result, log)
+    dense = at_rate(result, log, "imu")
     assert log.truth is not None
     assert dense.pose_cov is not None
     sigma = np.sqrt(np.diagonal(dense.pose_cov, axis1=1, axis2=2))[:, 3:]

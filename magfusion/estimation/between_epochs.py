@@ -5,22 +5,19 @@ the inertial stream drives.  Its mean is `motion_at`; here is its covariance, co
 ends whose errors belong together.  Nothing is interpolated.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.estimation.batch import Smoothed
 from magfusion.estimation.motion_shape import motion_at
-from magfusion.estimation.preintegration import (
-    BRIDGE_ACCEL_NOISE,
-    BRIDGE_GYRO_NOISE,
-    GAP_SAMPLES,
-)
+from magfusion.estimation.preintegration import GAP_SAMPLES
+from magfusion.estimation.reckoning_error import step_noise, step_transitions
 from magfusion.estimation.solve.bordered import eliminate
 from magfusion.estimation.state import MOTION
-from magfusion.model.field import skew
 from magfusion.model.parameters import corrected_imu
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import ImuModel
@@ -28,34 +25,49 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray
 
 CHUNK = 16_384  # samples at a time: their covariances fit the memory
-LEAST_WALK = 1e-9  # of a bias: without any the ends of an interval would be tied
 
 
-def at_imu_rate(result: Smoothed, log: Log) -> Trajectory:
-    """Return the smoothed motion at every IMU sample between the first and the last epoch.
+def at_rate(result: Smoothed, log: Log, rate: Literal["imu"] | float) -> Trajectory:
+    """Return the smoothed motion between the first and the last epoch, at another rate.
 
     With the covariance of the poses.
+
+    Parameters
+    ----------
+    rate : 'imu' or float
+        At every inertial sample, or so many a second (Hz).
     """
     states, offset = result.states, result.calibration.time_offset
     calibration = result.calibration
     imu = calibration.on_log_rate(corrected_imu(calibration, result.blocks, log.imu))
     stamps = imu.time + offset
-    inside = (stamps >= states.time[0]) & (stamps <= states.time[-1])
-    wanted = stamps[inside]
-    dense = motion_at(states, imu, offset, result.declared.site.gravity, wanted)
+    # Every sample is a step of the covariance, whether or not it is asked for.
+    passed, asked = stamps, np.ones(len(stamps), dtype=bool)
+    if rate != "imu":
+        first, last = np.ceil(states.time[0] * rate), np.floor(states.time[-1] * rate)
+        wanted = np.arange(first, last + 1.0) / rate
+        passed = np.union1d(stamps, wanted)
+        asked = np.isin(passed, wanted)
+    inside = (passed >= states.time[0]) & (passed <= states.time[-1])
+    passed, asked = passed[inside], asked[inside]
+    dense = motion_at(states, imu, offset, result.declared.site.gravity, passed)
+
+    def line(known: Array, values: Array | None) -> Array:
+        assert values is not None
+        return np.stack([np.interp(passed, known, axis) for axis in values.T], axis=1)
 
     # A random walk between two of its values: the mean is on the straight line.
-    def line(values: Array | None) -> Array:
-        assert values is not None
-        return np.stack([np.interp(wanted, states.time, axis) for axis in values.T], axis=1)
-
-    gyro_bias, accel_bias = line(states.gyro_bias_body), line(states.accel_bias_body)
-    stream = ImuSamples(wanted, imu.gyro_body[inside], imu.accel_body[inside])
-    return replace(
-        dense,
-        gyro_bias_body=gyro_bias,
-        accel_bias_body=accel_bias,
-        pose_cov=_pose_cov(result, dense, stream, accel_bias),
+    gyro_bias = line(states.time, states.gyro_bias_body)
+    accel_bias = line(states.time, states.accel_bias_body)
+    stream = ImuSamples(passed, line(stamps, imu.gyro_body), line(stamps, imu.accel_body))
+    return Trajectory(
+        time=passed[asked],
+        world_from_body=dense.world_from_body[asked],
+        position_world=dense.position_world[asked],
+        velocity_world=None if dense.velocity_world is None else dense.velocity_world[asked],
+        gyro_bias_body=gyro_bias[asked],
+        accel_bias_body=accel_bias[asked],
+        pose_cov=_pose_cov(result, dense, stream, accel_bias)[asked],
     )
 
 
@@ -188,30 +200,13 @@ def _carried(steps: _Steps, imu: ImuModel) -> tuple[Array, Array]:
     Shape (k, steps, 15, 15): rotation, position, velocity, accelerometer and gyro bias.
     """
     k, count = steps.length.shape
-    wide = np.array([BRIDGE_GYRO_NOISE, BRIDGE_ACCEL_NOISE])
-    usual = np.array([imu.gyro_noise, imu.accel_noise])
-    gyro, accel = np.where(steps.bridged[:, None], np.maximum(wide, usual), usual).T[..., None] ** 2
+    own = step_transitions(steps.length, steps.rotation, steps.force_world)
+    added = step_noise(steps.length, imu, steps.bridged[:, None])
     transition, noise = np.empty((2, k, count, MOTION, MOTION))
     so_far, spread = np.tile(np.eye(MOTION), (k, 1, 1)), np.zeros((k, MOTION, MOTION))
-    eye, index = np.eye(3), np.arange(3)
     for i in range(count):
-        dt, rotation = steps.length[:, i, None, None], steps.rotation[:, i]
-        lever = -np.real(skew(steps.force_world[:, i]))
-        step = np.tile(np.eye(MOTION), (k, 1, 1))
-        step[:, :3, 12:] = -rotation * dt
-        step[:, 3:6, :3], step[:, 6:9, :3] = 0.5 * lever * dt**2, lever * dt
-        step[:, 3:6, 6:9] = eye * dt
-        step[:, 3:6, 9:12], step[:, 6:9, 9:12] = -0.5 * rotation * dt**2, -rotation * dt
+        step = own[:, i]
         so_far = step @ so_far
-        spread = step @ spread @ np.swapaxes(step, 1, 2)
-        length = steps.length[:, i, None]
-        spread[:, index, index] += gyro * length
-        spread[:, 3 + index, 3 + index] += accel * length**3 / 3.0
-        spread[:, 6 + index, 6 + index] += accel * length
-        spread[:, 3 + index, 6 + index] += 0.5 * accel * length**2
-        spread[:, 6 + index, 3 + index] += 0.5 * accel * length**2
-        for begin, walk in ((9, imu.accel_bias_walk), (12, imu.gyro_bias_walk)):
-            rows = begin + index
-            spread[:, rows, rows] += max(walk, LEAST_WALK) ** 2 * length
+        spread = step @ spread @ np.swapaxes(step, 1, 2) + added[:, i]
         transition[:, i], noise[:, i] = so_far, spread
     return transition, noise

@@ -62,7 +62,7 @@ class EpochUpdate:
     _attempts: Attempts
     _pointing: Attempts
     _earth: EarthWeight | None
-    _bank: SubsetBank | None
+    bank: SubsetBank | None
     _compared_at: float
     _since_compared: int
 
@@ -74,7 +74,7 @@ class EpochUpdate:
         earth: bool,
         bank: SubsetBank | None = None,
     ) -> None:
-        self.site, self.blocks, self._bank = site, blocks, bank
+        self.site, self.blocks, self.bank = site, blocks, bank
         self.gate = Gate(site.channels, blocks)
         self.witness = OnlineWitness(site, estimated)
         self.score = OnlineScore(site, estimated, blocks[len(estimated) :], steady=earth)
@@ -194,17 +194,17 @@ class EpochUpdate:
         self, predicted: Propagated | None, measurements: list[Measurement], state: State
     ) -> None:
         """Carry the filters without each beacon on; from None they begin anew."""
-        if self._bank is None:
+        if self.bank is None:
             return
         if predicted is None:
-            self._bank.forget()
+            self.bank.forget()
         else:
-            self._bank.absorb(predicted, measurements, state)
+            self.bank.absorb(predicted, measurements, state)
 
     def _judged(self, state: State, since: float | None) -> Judgement:
         held = self.score.said_of(state)
         said = self.witness.judgement(state, self.gate, since, held)
-        return said if self._bank is None else self._bank.heard(said, state)
+        return said if self.bank is None else self.bank.heard(said, state)
 
     def _compare(self, samples: FieldSamples, state: State) -> None:
         """See from time to time whether a fix finds the platform where the state says."""

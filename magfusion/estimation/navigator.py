@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.carried import Departure
 from magfusion.estimation.ekf import ErrorStateFilter
 from magfusion.estimation.epoch_update import EpochUpdate, Estimator
 from magfusion.estimation.fixed_lag import SlidingWindow
 from magfusion.estimation.initialization.online import NoStart, find_online_start
 from magfusion.estimation.input_queue import Arrivals
 from magfusion.estimation.integrity.bank import SubsetBank
-from magfusion.estimation.integrity.inertial_noise import measured_noise
+from magfusion.estimation.integrity.inertial_noise import measured_noise, with_white_noise
 from magfusion.estimation.integrity.judgement import JudgedState, Judgement, Told, judged_state
 from magfusion.estimation.integrity.resets import Resets
 from magfusion.estimation.integrity.summary import Summary
@@ -28,6 +29,7 @@ from magfusion.estimation.navigator_settings import NavigatorSettings as Navigat
 from magfusion.estimation.process_noise import calibration_process_noise
 from magfusion.estimation.propagation import Propagated, propagate
 from magfusion.estimation.state import State
+from magfusion.estimation.state_of_now import CarriedState, Said, StateOfNow
 from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
 from magfusion.model.parameters import dimension, placed
 from magfusion.model.samples import FieldSamples, SteadyFields
@@ -54,6 +56,7 @@ class Navigator:
     _told: deque[Told]
     _white: list[float]
     _resets: Resets
+    _now: StateOfNow
     summary: Summary
     why_no_start: NoStart
     rival_chi_square: float | None
@@ -80,6 +83,7 @@ class Navigator:
         self._white = [imu.gyro_noise, imu.accel_noise]  # what states are carried with
         self._judgement, self._made, self._told = Judgement(), [], deque()
         self._resets, self.summary = Resets(), Summary()
+        self._now = StateOfNow(self.settings)
         self.why_no_start = NoStart()
         self.rival_chi_square = None
 
@@ -93,8 +97,16 @@ class Navigator:
         InputError
             Where a number is not finite or the clock jumped.
         """
+        self.hear_imu(time, gyro_body, accel_body)
+        self.advance()
+
+    def hear_imu(self, time: Array, gyro_body: Array, accel_body: Array) -> None:
+        """Take inertial samples as `add_imu`, and carry the state to them; leave all else.
+
+        What takes longer is for `advance`, so that the state of now need not wait for it.
+        """
         self._arrived.add_imu(time, gyro_body, accel_body)
-        self._advance()
+        self._now.reach(self._arrived)
 
     def add_magnetometer(self, time: Array, measured_sensor: Array) -> None:
         """Take raw samples of the magnetometer: times (k,), fields (k, 3) (T).
@@ -105,7 +117,7 @@ class Navigator:
             Where a number is not finite or the clock jumped.
         """
         self._arrived.add_magnetometer(time, measured_sensor)
-        self._advance()
+        self.advance()
 
     def add_fields(self, samples: FieldSamples, steady: SteadyFields | None = None) -> None:
         """Take demodulated phasors, channels in the site's order, and the steady fields with them.
@@ -119,7 +131,7 @@ class Navigator:
         late = self._arrived.add_fields(samples, steady if self.settings.earth else None, after)
         if late:
             self.counts["field too late"] += late
-        self._advance()
+        self.advance()
 
     def add_measurement(self, time: float, measurement: Measurement) -> None:
         """Take in anything else that was measured, of one epoch: a state is made at its time (s).
@@ -134,7 +146,7 @@ class Navigator:
         after = -np.inf if self._estimator is None else self._estimator.state.time
         if not self._arrived.add_measurement(time, measurement, after):
             self.counts["measurement too late"] += 1
-        self._advance()
+        self.advance()
 
     # What comes out
 
@@ -156,6 +168,11 @@ class Navigator:
         made, self._made = self._made, []
         return made
 
+    def take_carried(self) -> list[CarriedState]:
+        """Return the states carried on between epochs, at the rate that the settings ask for."""
+        made, self._now.made = self._now.made, []
+        return made
+
     def state(self, time: float | None = None) -> JudgedState:
         """Return the state at a time, carried on by the inertial stream from the last epoch.
 
@@ -173,8 +190,9 @@ class Navigator:
             raise EstimationError("there is no state yet: the navigator is still gathering data")
         last = self._estimator.state
         wanted = self._arrived.inertial if time is None else time
-        state = last if wanted <= last.time else self._propagated(wanted).state
-        return judged_state(state, self._judgement, self._resets.counter)
+        if wanted <= last.time:
+            return judged_state(last, self._judgement, self._resets.counter)
+        return self._now.at(self._arrived, wanted)
 
     @property
     def distortion(self) -> dict[str, float]:
@@ -220,8 +238,8 @@ class Navigator:
         self._arrived.waveform.rows()
         return {"parts": to_plain(self, rules), "estimator": to_plain(self._estimator, rules)}
 
-    def _go_on_from(self, data: Any, rules: Rules) -> None:
-        """Take the state that a checkpoint holds."""
+    def go_on_from(self, data: Any, rules: Rules) -> None:
+        """Take the state that a checkpoint holds; see `magfusion.estimation.restored`."""
         if not isinstance(data, dict) or data.keys() != {"parts", "estimator"}:
             raise InputError("holds no state of a navigator; run without --resume")
         resume(self, data["parts"], "navigator", rules)
@@ -230,14 +248,34 @@ class Navigator:
             state = own.get("state") if isinstance(own, dict) else None
             self._start_at(from_plain(State, state, "estimator.state", rules))
             resume(self._estimator, own, "estimator", rules)
+            self._depart()
 
     # How it goes on
 
-    def _advance(self) -> None:
-        if self._estimator is None and not self._begin():
+    def advance(self) -> None:
+        """Take in all that has come, as far as it is complete; whatever is added does so itself."""
+        changed = self._estimator is None and self._begin()
+        if self._estimator is None:
             return
         while self._step():
-            pass
+            changed = True
+        if changed:
+            self._depart()
+
+    def _depart(self) -> None:
+        """Carry the newest estimate from now on."""
+        assert self._estimator is not None
+        assert self._arrived.usual is not None
+        departure = Departure(
+            self._estimator.state,
+            with_white_noise(self.site, *self._white),
+            self.blocks,
+            self._process_noise,
+            self._arrived.applied_offset,
+            self._arrived.usual,
+        )
+        said = Said(self._judgement, self._resets.counter, self._update.bank)
+        self._now.depart(departure, said, self._arrived)
 
     def _begin(self) -> bool:
         """Find the first state, once enough has come."""
@@ -353,44 +391,9 @@ class Navigator:
         offset, usual = self._arrived.applied_offset, self._arrived.usual
         imu = self._arrived.motion_samples(state.time - offset, time - offset)
         blind = self._arrived.stand_in.covers(state.time - offset, time - offset)
-        noise, blocks, site = self._process_noise, self.blocks, self._site_as_measured()
+        noise, blocks, site = (
+            self._process_noise,
+            self.blocks,
+            with_white_noise(self.site, *self._white),
+        )
         return propagate(state, imu, time, site, offset, noise, usual, blocks, blind=blind)
-
-    def _site_as_measured(self) -> Site:
-        """Return the site with the inertial noise that the samples of the beginning have."""
-        platform, (gyro, accel) = self.site.platform, self._white
-        if (gyro, accel) == (platform.imu.gyro_noise, platform.imu.accel_noise):
-            return self.site
-        imu = replace(platform.imu, gyro_noise=gyro, accel_noise=accel)
-        return replace(self.site, platform=replace(platform, imu=imu))
-
-
-def restored(
-    site: Site,
-    settings: NavigatorSettings,
-    checkpoint: Any,
-    measurements: tuple[type[Measurement], ...] = (),
-) -> Navigator:
-    """Return the navigator of a checkpoint.
-
-    Parameters
-    ----------
-    site, settings
-        Of the navigator that made it.
-    checkpoint : dict
-        What `Navigator.checkpoint` returned.
-    measurements : tuple of type
-        Kinds of measurements from outside the package that were given to it.
-
-    Raises
-    ------
-    InputError
-        Where it is none, or does not fit the site.
-    """
-    navigator = Navigator(site, settings)
-    rules = navigator_rules(site, navigator.blocks, measurements)
-    try:
-        navigator._go_on_from(checkpoint, rules)
-    except np.linalg.LinAlgError as error:
-        raise InputError(f"its covariance is none ({error}); run without --resume") from error
-    return navigator

@@ -6,6 +6,7 @@ from typing import Literal
 from magfusion.estimation.prepared import LONGEST_STEP
 from magfusion.estimation.settings import EstimatorSettings
 from magfusion.model.trust import Risk
+from magfusion.units import Rate
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,13 @@ class NavigatorSettings(EstimatorSettings):
         Without any field a state is made after so long (s).
     risk : Risk, optional
         What the protection levels promise; without it there are none, and an update costs less.
+    rate : 'field', 'imu' or float
+        Where states are made beside those of the epochs: nowhere, at every inertial sample, or so
+        many a second (Hz); they are carried there from the newest epoch.
+    horizon : float
+        So far ahead of that they are told (s).
+    blend : float
+        A correction enters them within so long (s); at once where it is zero.
     """
 
     estimator: Literal["smoother", "ekf"] = "smoother"
@@ -33,3 +41,6 @@ class NavigatorSettings(EstimatorSettings):
     start_duration: float = 6.0
     longest_step: float = LONGEST_STEP
     risk: Risk | None = None
+    rate: Rate = "field"
+    horizon: float = 0.0
+    blend: float = 0.0

@@ -67,7 +67,7 @@ def cut_at_epochs(
     ]
     gyro, accel = (0.5 * (s[:-1] + s[1:]) for s in samples)
     first = np.searchsorted(grid, epochs)
-    silent = np.flatnonzero(_in_gap(time, grid, known))
+    silent = np.flatnonzero(in_gap(time, grid, known))
     bridged = np.zeros(len(epochs) - 1, dtype=bool)
     bridged[np.searchsorted(first, silent, side="right") - 1] = True
     return Increments(gyro, accel, np.diff(grid), first, bridged)
@@ -84,7 +84,7 @@ def _between_samples(time: Array, epochs: Array, usual: float) -> Array:
     return np.concatenate(filled)
 
 
-def _in_gap(time: Array, grid: Array, usual: float) -> BoolArray:
+def in_gap(time: Array, grid: Array, usual: float) -> BoolArray:
     """Tell which steps of the grid lie in a gap of the stream, however short the step itself is."""
     edges = np.concatenate([[min(time[0], grid[0])], time, [max(time[-1], grid[-1])]])
     spacing = np.diff(edges)

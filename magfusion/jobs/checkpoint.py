@@ -4,7 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from magfusion.estimation.navigator import Navigator, NavigatorSettings, restored
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.restored import restored
 from magfusion.files.checkpoint import (
     Checkpoint,
     claim_checkpoint,

@@ -30,7 +30,7 @@ from magfusion.results.plots.log_calibration import write_log_calibration_plot
 from magfusion.results.refinement import parameter_estimates, refined_site
 from magfusion.results.report import observability_figures, write_report
 from magfusion.results.verdict import trust_figures
-from magfusion.units import Array
+from magfusion.units import Array, Rate
 
 if TYPE_CHECKING:
     from magfusion.estimation.batch import SmootherSettings
@@ -45,7 +45,7 @@ def run_joint(
     output: Path,
     report: Report,
     *,
-    imu_rate: bool = False,
+    rate: Rate = "field",
     risk: Risk | None = None,
 ) -> Figures:
     """Refine one site by several logs together.
@@ -72,7 +72,7 @@ def run_joint(
         cluster=settings.cluster,
         workers=settings.workers,
         writes=writes,
-        imu_rate=imu_rate,
+        rate=rate,
         risk=risk,
         report=report,
     )

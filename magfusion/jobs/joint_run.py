@@ -35,6 +35,7 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk, Trust, Verdict
 from magfusion.results.provenance import versions
 from magfusion.simulation.monte_carlo import Crew, crew
+from magfusion.units import Rate
 
 SETTLED = 1e-6  # sigmas; a step of the shared calibration that ends the rounds
 MOST_ROUNDS = 20
@@ -145,7 +146,7 @@ def refine(
     cluster: str | None,
     workers: int | None,
     writes: bool,
-    imu_rate: bool = False,
+    rate: Rate = "field",
     risk: Risk | None = None,
     report: Report,
 ) -> Joint:
@@ -183,7 +184,7 @@ def refine(
         # Held to what the others say, a robust loss soon refuses what says otherwise.
         agreed = before if any(before.of_log) else _agreement(used, logs, shared)
         given = [
-            LastTask(one, agreed.excess, said, writes, imu_rate, risk)
+            LastTask(one, agreed.excess, said, writes, rate, risk)
             for one, said in zip(
                 _round_tasks(used, logs, shared, known), agreed.of_log, strict=True
             )

@@ -28,6 +28,7 @@ from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.errors import trajectory_errors
+from magfusion.units import Rate
 
 if TYPE_CHECKING:
     from magfusion.model.trust import Risk
@@ -92,7 +93,7 @@ class LastTask:
     excess: float
     said: tuple[Finding, ...]
     writes: bool
-    imu_rate: bool
+    rate: Rate
     risk: Risk | None
 
 
@@ -170,7 +171,7 @@ def _written(result: Smoothed, log: Log, site: Site, given: LastTask) -> tuple[S
     )
     done = with_errors(done, log)
     with claim(task.job.output, "smooth") as whole:
-        write_finished(whole, log, done, imu_rate=given.imu_rate)
+        write_finished(whole, log, done, rate=given.rate)
     return done.result, done.trust
 
 

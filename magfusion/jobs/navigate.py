@@ -12,6 +12,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.jobs.live import LiveSettings, state_sinks
+from magfusion.jobs.rates import RateSettings
 from magfusion.jobs.settings import (
     Command,
     EarthSettings,
@@ -48,6 +49,7 @@ class NavigateSettings(
     EstimateSettings,
     RiskSettings,
     LiveSettings,
+    RateSettings,
 ):
     """How to navigate as data come, along a log or by records on standard input."""
 
@@ -64,12 +66,34 @@ class NavigateSettings(
         most=10.0,
         note="so much later are states",
     )
+    horizon: float = option(
+        0.0,
+        "So far ahead of the inertial samples are states between epochs",
+        unit="s",
+        least=0.0,
+        most=1.0,
+    )
+    blend: float = option(
+        0.0,
+        "So long a correction takes to enter states between epochs",
+        unit="s",
+        least=0.0,
+        most=10.0,
+        note="0: at once",
+    )
     checkpoint: Path | None = option(
         None, "Checkpoint file", note="default: in the output while the job runs"
     )
     every: float = option(30.0, "Between checkpoints", unit="s", least=0.1, most=86400.0)
     resume: bool = option(False, "Continue from the checkpoint, if there is one")
     keep_going: bool = option(False, "Count bad records, and skip them")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.rate == "field" and (self.horizon or self.blend):
+            raise InputError(
+                "--horizon and --blend are of states between epochs; give --rate imu, or --rate HZ"
+            )
 
     def navigator(self, job: Job) -> NavigatorSettings:
         """Return the settings of the estimator."""
@@ -83,6 +107,9 @@ class NavigateSettings(
             earth=self.earth,
             lockin=self.lockin(job),
             risk=self.risks,
+            rate=self.rates,
+            horizon=self.horizon,
+            blend=self.blend,
         )
 
 
@@ -274,11 +301,11 @@ def _open_run(
 
 def _advance(run: NavigateRun, settings: NavigateSettings, report: Report) -> None:
     """Take in the pieces that are left, and leave a checkpoint from time to time."""
-    from magfusion.jobs.navigate_results import state_row
+    from magfusion.jobs.navigate_results import CARRIED, CURRENT, LAGGED, state_row
     from magfusion.jobs.replay import PIECE, feed, paced
 
     began = time.perf_counter() - run.elapsed
-    every = max(1, round(settings.every / PIECE))
+    every, told = max(1, round(settings.every / PIECE)), -np.inf
     for k, piece in paced(run.replay, run.position, settings.realtime):
         if k % every == 0 and k > run.position:
             _save(run, k, time.perf_counter() - began)
@@ -287,13 +314,22 @@ def _advance(run: NavigateRun, settings: NavigateSettings, report: Report) -> No
         feed(run.navigator, piece)
         states = run.navigator.take()
         spent = (time.perf_counter() - before) / max(len(states), 1)
+        for carried in run.navigator.take_carried():
+            run.rows.append(state_row(run.navigator, carried, np.nan, CARRIED))
+            _tell(run, carried)
+            told = carried.time
         for state in states:
             # The first state is the result of a whole smoother.
             latency = spent if running else np.nan
-            run.rows.append(state_row(run.navigator, state, latency, lagged=False))
-            _tell(run, state)
+            run.rows.append(state_row(run.navigator, state, latency, CURRENT))
+            if settings.rate == "field":
+                _tell(run, state)
+            elif state.time > told:  # the inertial stream is silent
+                run.rows.append(state_row(run.navigator, state, np.nan, CARRIED))
+                _tell(run, state)
+                told = state.time
         for state in run.navigator.take_lagged():
-            run.rows.append(state_row(run.navigator, state, np.nan, lagged=True))
+            run.rows.append(state_row(run.navigator, state, np.nan, LAGGED))
         if k % every == 0:
             report("navigating", k, len(run.replay))
     run.elapsed = time.perf_counter() - began

@@ -42,7 +42,8 @@ from magfusion.results.report import (
 from magfusion.results.verdict import level_figures, trust_figures
 from magfusion.units import Array, BoolArray
 
-# Of each state: when it was made of all that had come, or when it left the smoother's window.
+# What a row is: an epoch's state as it was made, as it left the smoother's window, or carried.
+CURRENT, LAGGED, CARRIED = 0.0, 1.0, 2.0
 _STATE = {
     "time": 1,
     "world_from_body": 9,
@@ -57,17 +58,25 @@ _VERDICTS = tuple(Verdict)
 def row_columns(site: Site) -> dict[str, int]:
     """Return what is kept of each state as it is made, with the number of values."""
     beacons = len(site.beacons)
-    told = {"lagged": 1, "latency": 1, "verdict": 1, "levels": 2, "pose_cov": 36}
+    told = {
+        "lagged": 1,
+        "reset_counter": 1,
+        "latency": 1,
+        "verdict": 1,
+        "levels": 2,
+        "pose_cov": 36,
+    }
     return told | _STATE | {"distortion": beacons, "excluded": beacons}
 
 
 def state_row(
-    navigator: Navigator, state: JudgedState, latency: float, *, lagged: bool
+    navigator: Navigator, state: JudgedState, latency: float, kind: float
 ) -> dict[str, Array | float]:
     """Return a state as a row of `row_columns`; the latency (s) is NaN where it is none."""
     level, names = navigator.distortion, [b.name for b in navigator.site.beacons]
     return {name: getattr(state, name) for name in _STATE} | {
-        "lagged": float(lagged),
+        "lagged": kind,
+        "reset_counter": float(state.reset_counter),
         "latency": latency,
         "verdict": float(state.verdict.rank),
         "levels": np.array([np.nan if x is None else x for x in _levels(state)]),
@@ -98,11 +107,14 @@ class NavigateResults:
     current, lagged : Part
         States as they were made, and as they left the smoother's window, where there is one.
         Those that were lost have no pose and are not among them, unless all have failed.
+    carried : Part, optional
+        States between the epochs, where they were asked for.
     """
 
     trust: Trust
     current: Part
     lagged: Part | None
+    carried: Part | None
     errors: TrajectoryErrors | None
     innovations: dict[str, tuple[Array, Array]]
     refined: Site
@@ -129,8 +141,8 @@ def _subject(finding: Finding) -> tuple[str, str]:
     return finding.code, finding.text.partition(":")[0]
 
 
-def _chosen(rows: dict[str, Array], trust: Trust, *, lagged: bool) -> BoolArray:
-    own: BoolArray = rows["lagged"][:, 0] == lagged
+def _chosen(rows: dict[str, Array], trust: Trust, kind: float) -> BoolArray:
+    own: BoolArray = rows["lagged"][:, 0] == kind
     if trust.verdict is Verdict.FAILED:
         return own
     return own & (rows["verdict"][:, 0] < Verdict.FAILED.rank)
@@ -167,12 +179,12 @@ def navigated(
         (s)
     """
     site, settings = navigator.site, navigator.settings
-    trusted = _part(rows, _chosen(rows, navigator.summary.trust, lagged=False), site)
+    trusted = _part(rows, _chosen(rows, navigator.summary.trust, CURRENT), site)
     poses = None if trusted is None or settings.earth else trusted.states
     heard = recorded(log, site, BRIDGED, estimated=poses, beacons=True)
     said = _not_said_again(navigator.summary.trust, heard)
     trust = with_cause(said | Trust(heard), log, site, settings.lockin)
-    own = _chosen(rows, trust, lagged=False)
+    own = _chosen(rows, trust, CURRENT)
     current, lagged = _part(rows, own, site), None
     assert current is not None
     states = current.states
@@ -181,18 +193,22 @@ def navigated(
     figures = heading("navigate", log.name) | trust_figures(trust)
     figures |= _settings_figures(navigator.settings) | _run_figures(navigator, states) | compared
     figures |= level_figures(current.trust)
-    lagged = _part(rows, _chosen(rows, trust, lagged=True), site)
+    lagged = _part(rows, _chosen(rows, trust, LAGGED), site)
     if lagged is not None:
         figures |= Figures(Figure("lagged_epochs", len(lagged.states), section=Section.REPORT))
         figures |= compared_with_truth(lagged.states, log, Column.LAGGED, "lagged_")[1]
-    latency = rows["latency"][rows["lagged"][:, 0] == 0.0, 0]
+    carried = _part(rows, _chosen(rows, trust, CARRIED), site)
+    if carried is not None:
+        figures |= Figures(Figure("carried_states", len(carried.states), section=Section.REPORT))
+        figures |= compared_with_truth(carried.states, log, Column.CARRIED, "carried_")[1]
+    latency = rows["latency"][rows["lagged"][:, 0] == CURRENT, 0]
     figures |= _update_figures(latency, elapsed)
     figures |= Figures(*estimates) | determined_figures(estimates)
     innovations = {
         beacon.name: (states.time, np.sqrt(rows["distortion"][own, i]))
         for i, beacon in enumerate(site.beacons)
     }
-    return figures, NavigateResults(trust, current, lagged, errors, innovations, refined)
+    return figures, NavigateResults(trust, current, lagged, carried, errors, innovations, refined)
 
 
 def _calibration(navigator: Navigator, name: str) -> tuple[list[Estimate], Site]:
@@ -279,10 +295,11 @@ def motion_of(log: Log, results: NavigateResults) -> Motion:
 
 def write_navigated(directory: Path, log: Log, results: NavigateResults) -> None:
     """Write all but the report."""
-    current, lagged = results.current, results.lagged
-    write_tum(current.states, directory / "trajectory.tum", log.epoch_ns)
+    current, lagged, carried = results.current, results.lagged, results.carried
+    written = current if carried is None else carried
+    write_tum(written.states, directory / "trajectory.tum", log.epoch_ns)
     path = directory / "trajectory.parquet"
-    write_trajectory(current.states, path, log.epoch_ns, current.trust)
+    write_trajectory(written.states, path, log.epoch_ns, written.trust)
     if lagged is not None:
         path = directory / "lagged.parquet"
         write_trajectory(lagged.states, path, log.epoch_ns, lagged.trust)
@@ -296,4 +313,5 @@ def write_navigated(directory: Path, log: Log, results: NavigateResults) -> None
         innovations=results.innovations,
         trust=results.trust,
         states=current.trust,
+        carried=None if carried is None else carried.states,
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.jobs.rates import RateSettings
 from magfusion.jobs.settings import (
     Command,
     EarthSettings,
@@ -26,13 +27,16 @@ if TYPE_CHECKING:
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
     from magfusion.model.trust import Risk
+    from magfusion.units import Rate
 
 
 CONTRADICTION = "fields and inertial data contradict each other so much that nothing can be solved"
 
 
 @dataclass(frozen=True, kw_only=True)
-class SmoothSettings(LogsSettings, WindowSettings, EarthSettings, EstimateSettings, RiskSettings):
+class SmoothSettings(
+    LogsSettings, WindowSettings, EarthSettings, EstimateSettings, RiskSettings, RateSettings
+):
     """How a log is smoothed."""
 
     coupling: Literal["tight", "loose"] = option("tight", "Phasors or fixes in the graph")
@@ -43,12 +47,6 @@ class SmoothSettings(LogsSettings, WindowSettings, EarthSettings, EstimateSettin
     )
     tune: bool = option(
         True, "Find noise and model error from the residuals; what is declared is a prior"
-    )
-    imu_rate: bool = option(
-        False,
-        "Epochs of the written trajectory",
-        name="rate",
-        words={"field": False, "imu": True},
     )
 
     def __post_init__(self) -> None:
@@ -78,15 +76,15 @@ def run(settings: SmoothSettings, output: Path, report: Report = quiet) -> Figur
         from magfusion.jobs.joint_result import run_joint
 
         parts = settings, smoother, output, report
-        return run_joint("smooth", *parts, imu_rate=settings.imu_rate, risk=settings.risks)
-    return run_smooth(job, smoother, imu_rate=settings.imu_rate, risk=settings.risks, report=report)
+        return run_joint("smooth", *parts, rate=settings.rates, risk=settings.risks)
+    return run_smooth(job, smoother, rate=settings.rates, risk=settings.risks, report=report)
 
 
 def run_smooth(
     job: Job,
     settings: SmootherSettings,
     *,
-    imu_rate: bool = False,
+    rate: Rate = "field",
     risk: Risk | None = None,
     report: Report = quiet,
 ) -> Figures:
@@ -94,8 +92,9 @@ def run_smooth(
 
     Parameters
     ----------
-    imu_rate : bool
-        Write the trajectory at every IMU sample rather than at the field epochs.
+    rate : 'field', 'imu' or float
+        Where the states of the written trajectory are: at the field epochs, at every inertial
+        sample, or so many a second (Hz).
     risk : Risk, optional
         What the protection levels promise.
 
@@ -130,7 +129,7 @@ def run_smooth(
     done = replace(done, figures=done.figures | elapsed)
     done = with_errors(done, log, placed, (site, settings))
     with claimed as whole:
-        write_finished(whole, log, done, imu_rate=imu_rate)
+        write_finished(whole, log, done, rate=rate)
     refuse_failed(job.log_path, output=job.output, trust=done.trust)
     return done.figures
 

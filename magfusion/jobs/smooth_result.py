@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.between_epochs import at_imu_rate
+from magfusion.estimation.between_epochs import at_rate
 from magfusion.estimation.integrity.diagnosis import with_cause
 from magfusion.estimation.integrity.judge import judged
 from magfusion.estimation.integrity.smoothed_exclusion import (
@@ -39,7 +39,7 @@ from magfusion.results.report import (
     write_report,
 )
 from magfusion.results.verdict import level_figures, trust_figures
-from magfusion.units import Array
+from magfusion.units import Array, Rate
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,11 +118,11 @@ def with_errors(
     return replace(done, figures=figures, errors=errors)
 
 
-def write_finished(whole: Path, log: Log, done: Finished, *, imu_rate: bool) -> None:
+def write_finished(whole: Path, log: Log, done: Finished, *, rate: Rate) -> None:
     """Write all files of a smoothed log: below `FAILED` where its verdict is that."""
     result, by_state = done.result, done.states
     refined, innovations = result_site(result, log.name), _innovations(result)
-    written = at_imu_rate(result, log) if imu_rate else result.states
+    written = result.states if rate == "field" else at_rate(result, log, rate)
     directory = found_in(whole, done.trust)
     write_tum(written, directory / "trajectory.tum", log.epoch_ns)
     rows = states_between(by_state, result.states, written)

@@ -1,4 +1,4 @@
-"""Navigation in a pipe: records in, a state out at every epoch; and a log as such records."""
+"""Navigation in a pipe: records in, a state out at every epoch, or of now at any rate."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -13,6 +13,7 @@ from magfusion.estimation.integrity.judgement import JudgedState
 from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
+from magfusion.estimation.state_of_now import CarriedState
 from magfusion.files.checkpoint import run_key
 from magfusion.files.site import load_site
 from magfusion.files.stream import (
@@ -101,9 +102,10 @@ def _navigate(
     navigator = begin(place, key, site, settings.navigator, None, resume=settings.resume).navigator
     refused, saved, reached = 0, -np.inf, -np.inf
     missing: Counter[str] = Counter()
+    told = _Told(navigator, sink, others)
     for numbered in read_records(source, settings.form):
         try:
-            newest = _take_in(navigator, site, numbered, missing)
+            newest = _take_in(navigator, site, numbered, missing, told)
         except InputError as error:
             sentence = f"standard input, {_PLACE[settings.form]} {numbered.number}: {error}"
             if not settings.keep_going:
@@ -111,11 +113,9 @@ def _navigate(
             refused += 1
             messages.write(f"magfusion: {sentence} (passed over)\n")
             continue
-        for state in navigator.take():
-            _tell(sink, others, state, state_content(navigator, state))
-        navigator.take_lagged()
+        told.epochs()
         if not navigator.started and -np.inf < newest >= reached + WAITING:
-            _tell(sink, others, None, _waiting(navigator, newest))
+            told.tell(None, _waiting(navigator, newest))
             reached = newest
         sink.flush()
         if place is not None and newest >= saved + settings.every:
@@ -128,15 +128,47 @@ def _navigate(
     return refused
 
 
-def _tell(
-    sink: BinaryIO, others: tuple[StateSink, ...], state: JudgedState | None, told: dict[str, Any]
-) -> None:
-    sink.write(json_line(told))
-    for other in others:
-        other.take(state, told)
+class _Told:
+    """Writes states as they are made, and hands them to whoever else listens.
+
+    Parameters
+    ----------
+    sink : file
+        Binary.
+    """
+
+    def __init__(self, navigator: Navigator, sink: BinaryIO, others: tuple[StateSink, ...]) -> None:
+        self._navigator, self._sink, self._others = navigator, sink, others
+        self._newest = -np.inf
+
+    def tell(self, state: JudgedState | None, told: dict[str, Any]) -> None:
+        """Write what is told of a state, None before the first."""
+        self._sink.write(json_line(told))
+        for other in self._others:
+            other.take(state, told)
+
+    def now(self) -> None:
+        """Write the states of now, before anything else is worked out."""
+        for state in self._navigator.take_carried():
+            self.tell(state, state_content(self._navigator, state))
+            self._newest = state.time
+        self._sink.flush()
+
+    def epochs(self) -> None:
+        """Write the states of the epochs, but for those that are older than one of now."""
+        for state in self._navigator.take():
+            if state.time > self._newest:
+                self.tell(state, state_content(self._navigator, state))
+        self._navigator.take_lagged()
 
 
-def _take_in(navigator: Navigator, site: Site, numbered: Numbered, missing: Counter[str]) -> float:
+def _take_in(
+    navigator: Navigator,
+    site: Site,
+    numbered: Numbered,
+    missing: Counter[str],
+    told: _Told,
+) -> float:
     """Give a record to the navigator, and count what it lacks; return the newest time in it (s)."""
     if numbered.record is None:
         raise InputError(numbered.refusal)
@@ -144,7 +176,9 @@ def _take_in(navigator: Navigator, site: Site, numbered: Numbered, missing: Coun
     if record.imu is not None:
         time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
         if len(time):
-            navigator.add_imu(time, gyro, accel)
+            navigator.hear_imu(time, gyro, accel)
+            told.now()
+            navigator.advance()
         missing += Counter(imu=len(record.imu.time) - len(time))
         newest = max(newest, _last(time))
     if record.magnetometer is not None:
@@ -180,6 +214,7 @@ def state_content(navigator: Navigator, state: JudgedState) -> dict[str, Any]:
     """
     told = {
         "time": state.time,
+        "carried_s": state.time - state.epoch if isinstance(state, CarriedState) else 0.0,
         "started": True,
         "lost": state.lost,
         "reset_counter": state.reset_counter,

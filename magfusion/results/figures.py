@@ -41,6 +41,7 @@ class Column(StrEnum):
     FIXED = "survey fixed"  # with the declared calibration
     CALIBRATED = "calibrated"
     LAGGED = "lagged"
+    CARRIED = "carried"
     SIGMA = "sigma per axis"
     NONE = ""
 

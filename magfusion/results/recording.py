@@ -58,10 +58,12 @@ from magfusion.results.shapes import (
 from magfusion.units import Array
 
 ELLIPSOIDS = 30  # along the path
+MOST_POSES = 200_000  # of the body
 COVERAGE = 1e-6  # T, RMS, on the shell drawn around a beacon
 
 _ESTIMATE = (70, 170, 255)
 _TRUTH = (110, 220, 120)
+_CARRIED = (250, 200, 90)
 
 
 def write_recording(
@@ -74,6 +76,7 @@ def write_recording(
     innovations: Mapping[str, tuple[Array, Array]] | None = None,
     trust: Trust | None = None,
     states: StateTrust | None = None,
+    carried: Trajectory | None = None,
 ) -> None:
     """Write a recording with its layout, complete or not at all.
 
@@ -94,12 +97,16 @@ def write_recording(
         The verdict and its reasons, shown above all.
     states : StateTrust, optional
         Of the states of the trajectory: protection levels and where it is in doubt.
+    carried : Trajectory, optional
+        The states between those of the trajectory: the body moves along them.
     """
     scale = scene_scale(site, trajectory)
     with whole_recording(path, real(path).parent.name) as recording:
         log_beacons(recording, site, scale)
         _log_path(recording, "world/estimate", trajectory, _ESTIMATE, 1.2)
-        _log_body(recording, trajectory, scale)
+        _log_body(recording, trajectory if carried is None else carried, scale)
+        if carried is not None:
+            _log_path(recording, "world/carried", carried, _CARRIED, 0.6)
         _log_sigmas(recording, trajectory, scale)
         if truth is not None:
             _log_path(recording, "world/truth", truth, _TRUTH, 0.8)
@@ -116,7 +123,7 @@ def write_recording(
         if states is not None:
             log_doubtful(recording, trajectory, states, 0.008 * scale.size)
             log_levels(recording, trajectory, states, errors)
-        _log_legend(recording, trajectory, truth is not None, scale)
+        _log_legend(recording, trajectory, truth is not None, carried is not None, scale)
         drawn = _Drawn(trajectory, errors, innovations or {}, states)
         recording.send_blueprint(_blueprint(site, drawn, scale, banner))
 
@@ -214,7 +221,7 @@ def _log_beads(recording: rr.RecordingStream, truth: Trajectory, scale: Scale) -
 
 
 def _log_body(recording: rr.RecordingStream, trajectory: Trajectory, scale: Scale) -> None:
-    rows = rows_of(len(trajectory))
+    rows = rows_of(len(trajectory), MOST_POSES)
     turn = Rotation.from_matrix(trajectory.world_from_body[rows]).as_quat()
     recording.send_columns(
         "world/estimate/body",
@@ -247,6 +254,7 @@ def _log_legend(
     recording: rr.RecordingStream,
     trajectory: Trajectory,
     has_truth: bool,
+    has_carried: bool,
     scale: Scale,
 ) -> None:
     lines = [
@@ -254,6 +262,8 @@ def _log_legend(
         "|---|---|",
         "| **blue line, box** | estimate; body axes x red, y green, z blue |",
     ]
+    if has_carried:
+        lines.append("| **yellow line** | states of now, carried between field epochs |")
     if has_truth:
         lines.append("| **green beads** | true path, with its gaps |")
     if trajectory.pose_cov is not None:

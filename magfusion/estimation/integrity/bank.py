@@ -12,7 +12,7 @@ import numpy as np
 
 from magfusion.estimation.ekf import measured_rows
 from magfusion.estimation.integrity.judgement import Judgement
-from magfusion.estimation.integrity.separation import Separation, protection_levels
+from magfusion.estimation.integrity.separation import LEAST, Separation, protection_levels, radii
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.propagation import Propagated
@@ -209,6 +209,35 @@ class SubsetBank:
             np.zeros(count),
             np.full(count, 6),
         )
+
+    def grown(self, transition: Array, noise: Array) -> Array:
+        """Return factors by which levels are larger where the inertial stream has led to, (n, 2).
+
+        Attitude, then position.  No norm that a level is made of grows by more than that, neither
+        of the estimate nor of a filter without a beacon nor of their distance.
+
+        Parameters
+        ----------
+        transition : ndarray, shape (n, 15, 15 or 15 + calibration)
+            From the state of the last epoch.
+        noise : ndarray, shape (n, 15, 15)
+            Since then.
+        """
+        if self._cov is None or self._joint is None:
+            return np.ones((len(transition), 2))
+        size = transition.shape[2]
+        cov, joint = self._cov[:, :size, :size], self._joint[:, :size, :size]
+        apart = cov[1:] + cov[:1] - joint - np.swapaxes(joint, 1, 2)
+        pose = transition[:, None, :6]
+        back = np.swapaxes(pose, 2, 3)
+        later = pose @ np.concatenate([cov, apart]) @ back
+        later[:, : len(cov)] += noise[:, None, :6, :6]
+        before, after = radii(np.concatenate([cov, apart])[:, :6, :6]), radii(later)
+        # What is known exactly, or separates nothing, has no share in a level.
+        shares = [
+            after[i] / np.where(before[i] > LEAST, before[i], np.inf) for i in range(len(before))
+        ]
+        return np.asarray(np.maximum(np.max(shares, axis=(0, 2)), 1.0))
 
     def levels(self, found: Separation) -> tuple[float | None, float | None]:
         """Return the protection levels of position (m) and attitude (deg), if there are any."""

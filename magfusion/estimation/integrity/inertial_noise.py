@@ -65,3 +65,12 @@ def measured_noise(samples: ImuSamples, declared: ImuModel) -> tuple[ImuModel, l
         )
         findings.append(Finding("imu_noise", text, Verdict.DOUBTFUL, 50.0 + density / usual))
     return model, findings
+
+
+def with_white_noise(site: Site, gyro: float, accel: float) -> Site:
+    """Return a site with other densities of its inertial sensor (rad/s, m/s^2, per root of Hz)."""
+    imu = site.platform.imu
+    if (gyro, accel) == (imu.gyro_noise, imu.accel_noise):
+        return site
+    own = replace(imu, gyro_noise=gyro, accel_noise=accel)
+    return replace(site, platform=replace(site.platform, imu=own))

@@ -1,0 +1,63 @@
+"""Steps of dead reckoning in closed form, on arrays: rate and specific force constant in each."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.model.field import skew
+from magfusion.units import Array
+
+SMALL = 0.03  # rad; below it the series are as exact as the closed forms
+
+
+class Turned(NamedTuple):
+    """What steps do, in body axes at the beginning of each.
+
+    Parameters
+    ----------
+    rotation : ndarray, shape (n, 3, 3)
+        ``before_from_after``.
+    velocity, position : ndarray, shape (n, 3)
+        What the specific force alone gains (m/s, m).
+    """
+
+    rotation: Array
+    velocity: Array
+    position: Array
+
+
+def steps_of(gyro_body: Array, accel_body: Array, dt: Array) -> Turned:
+    """Return what steps do whose rate and specific force stay as they are in body axes.
+
+    Parameters
+    ----------
+    gyro_body, accel_body : ndarray, shape (n, 3)
+        (rad/s, m/s^2)
+    dt : ndarray, shape (n,)
+        (s)
+    """
+    turn, length = gyro_body * dt[:, None], dt[:, None]
+    square = np.sum(turn**2, axis=1)
+    angle = np.sqrt(square)
+    near = angle < SMALL
+    safe = np.where(near, 1.0, angle)
+    half = np.sin(0.5 * safe)
+    sine, cosine = np.sin(safe), 2.0 * half**2
+    # Of the turn, its integral and the integral of that, with powers of the angle taken out.
+    first = np.where(near, 1.0 - square / 6.0 * (1.0 - square / 20.0), sine / safe)
+    second = np.where(near, 0.5 - square / 24.0 * (1.0 - square / 30.0), cosine / safe**2)
+    third = np.where(
+        near, (1.0 - square / 20.0 * (1.0 - square / 42.0)) / 6.0, (safe - sine) / safe**3
+    )
+    fourth = np.where(
+        near,
+        (1.0 - square / 30.0 * (1.0 - square / 56.0)) / 24.0,
+        (0.5 * safe**2 - cosine) / safe**4,
+    )
+    across = skew(turn)
+    twice = across @ across
+    once_on, twice_on = ((matrix @ accel_body[..., None])[..., 0] for matrix in (across, twice))
+    rotation = np.eye(3) + first[:, None, None] * across + second[:, None, None] * twice
+    velocity = accel_body + second[:, None] * once_on + third[:, None] * twice_on
+    position = 0.5 * accel_body + third[:, None] * once_on + fourth[:, None] * twice_on
+    return Turned(rotation, velocity * length, position * length**2)
