@@ -1,5 +1,6 @@
 """Noise that tunes itself: what was declared wrongly is found, and the sigmas are honest."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import chi2
 
+from magfusion.estimation import noise_tuning
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.integrity.tuned_noise import tuned_noise
 from magfusion.estimation.noise_tuning import NORMAL, STUDENT, Tuned, _likeliest, tuned_site
@@ -33,6 +35,10 @@ def declared(imu: float = 1.0, model: float = 1.0) -> Site:
     noisy = replace(own, gyro_noise=imu * own.gyro_noise, accel_noise=imu * own.accel_noise)
     platform = replace(site.platform, imu=noisy)
     return replace(site, model_error=model * site.model_error, platform=platform)
+
+
+Cost = Callable[[np.ndarray], float]
+Slope = Callable[[np.ndarray], np.ndarray]
 
 
 def found(result: Smoothed, key: str) -> np.ndarray:
@@ -146,6 +152,25 @@ def test_of_a_strong_beacon_nothing_is_found_that_was_not_declared() -> None:
     log = _likeliest(square, parts, np.zeros(400), np.full(400, 0.5), 6, slice(2, None))
     noise, _, white = np.exp(2.0 * log)[:, None] * parts
     assert np.mean(noise + white) == pytest.approx(1.0, abs=0.2)
+
+
+def test_the_slope_of_the_likelihood_is_its_derivative(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def compare(
+        cost: Cost, start: np.ndarray, *_: object, gradient: Slope, **__: object
+    ) -> np.ndarray:
+        at, step = start + 0.3, 1e-6 * np.eye(len(start))
+        slope = [(cost(at + one) - cost(at - one)) / 2e-6 for one in step]
+        asked.append((gradient(at), np.array(slope)))
+        return start
+
+    monkeypatch.setattr(noise_tuning, "minimise_bounded", compare)
+    rng = np.random.default_rng(0)
+    parts, square = rng.uniform(0.1, 2.0, (3, 50)), rng.chisquare(6, 50)
+    _likeliest(square, parts, np.full(50, 0.1), np.full(50, 0.5), 6, slice(2, None))
+    ((given, expected),) = asked
+    assert given == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.slow

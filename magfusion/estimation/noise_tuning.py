@@ -301,5 +301,12 @@ def _likeliest(
         likelihood = 0.5 * np.sum(weight * (components * np.log(variance) + bounded))
         return float(likelihood + 0.5 * np.sum(declared * (log / PRIOR) ** 2))
 
+    def gradient(log: Array) -> Array:
+        by = 2.0 * np.exp(2.0 * log)[:, None] * parts
+        variance = 0.5 * np.sum(by, axis=0) + fixed
+        bounded = width * gain * square / (STUDENT * variance + gain * square)
+        by_variance = 0.5 * weight * (components - bounded) / variance
+        return np.asarray(by @ by_variance + declared * log / PRIOR**2)
+
     limits = np.log(np.stack([least, np.full(len(parts), MOST)], axis=1))
-    return minimise_bounded(cost, start, limits, steps=100, decrease=1e-9)
+    return minimise_bounded(cost, start, limits, steps=100, decrease=1e-9, gradient=gradient)
