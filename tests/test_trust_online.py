@@ -18,7 +18,8 @@ from magfusion.estimation.integrity.judgement import JudgedState, Judgement
 from magfusion.estimation.integrity.recovery import LONGEST_WAIT, Attempts
 from magfusion.estimation.integrity.running import nothing
 from magfusion.estimation.integrity.summary import Summary
-from magfusion.estimation.navigator import Navigator, NavigatorSettings, restored
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.restored import restored
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.jobs.stream import StreamSettings
