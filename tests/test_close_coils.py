@@ -61,10 +61,11 @@ def test_fixes_without_a_guess_are_as_good_as_they_claim(radius: float) -> None:
 
 
 @pytest.mark.slow
-def test_a_log_that_passes_a_coil() -> None:
+@pytest.mark.parametrize(("radius", "nearer"), [(0.1, 0.0), (0.3, 0.1)])
+def test_a_log_that_passes_a_coil(radius: float, nearer: float) -> None:
     """Motion within the windows and all: from 0.35 m, a calibration drawn from its prior."""
-    site = replace(demo_site(coil_radius=0.1), model_error=1e-4)
-    box = np.array([[0.3, 0.1, 0.25], [0.7, 0.6, 0.7]])  # m; beacon A is at its corner
+    site = replace(demo_site(coil_radius=radius), model_error=1e-4)
+    box = np.array([[0.3, 0.1, 0.25], [0.7, 0.6, 0.7]]) - nearer  # m; beacon A is at its corner
     config = SimulationConfig(box, duration=20.0, speed=0.2)
     nees = []
     for seed in range(2):

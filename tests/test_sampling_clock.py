@@ -43,6 +43,16 @@ def test_samples_get_their_ticks_back(scatter: float, share_lost: float, drift_p
     assert np.all(np.diff(clock.time) > 0.0)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_scatter_of_stamps_does_not_bend_an_even_clock(seed: int) -> None:
+    taken, stamps = _stamped(0.1, seed=seed)
+    clock = sampling_clock(stamps)
+    assert clock is not None
+    assert np.ptp(np.diff(clock.time)) < 1e-12  # s
+    rate = np.polyfit(taken, clock.time - taken, 1)[0]
+    assert abs(rate) < 4.0 * np.sqrt(12.0 / len(taken)) * 0.1 * STEP / taken[-1]
+
+
 def test_lost_samples_are_counted() -> None:
     _, stamps = _stamped(0.1, 0.05)
     clock = sampling_clock(stamps)

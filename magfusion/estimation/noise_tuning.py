@@ -171,7 +171,10 @@ def tune(
             of_model = (parts[1] if tuned else fixed) / (np.sum(parts, axis=0) + fixed)
             weight = (1.0 - of_model + of_model * near) / lag
         # What is white but goes with the field, as of a jitter among gradients, is noise all told.
-        white = float(np.sqrt(np.sum(parts[::2]) / np.sum(known[0])))
+        white = float(np.sum(parts[::2]) / np.sum(known[0]))
+        # Of a strong beacon less noise than declared is not to be told from a little model error.
+        unsure = LEAST**2 * float(np.sum(known[2:]) / np.sum(known[0]))
+        white = float(np.sqrt(max(white, min(white + unsure, 1.0))))
         found.append(
             Tuned(beacon.name, "noise_factor", prior.noise_factor, white * prior.noise_factor)
         )

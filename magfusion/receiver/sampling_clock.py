@@ -22,7 +22,7 @@ LOSS = 8.0  # log-likelihood ratio that a lost sample costs
 MEMORY = 2000  # samples that tell where the next ticks are
 MOST_PIECES = 40  # that tell the usual step
 SEARCHED = 0.08  # of the median step, either way
-KNOT = 10.0  # s; a clock drifts more slowly
+KNOT = 10.0  # s; a clock's rate changes more slowly
 FEWEST = 50  # samples
 
 
@@ -173,19 +173,37 @@ def _slips(late: Array, sigma: float) -> IntArray:
 
 
 def _smooth_clock(tick: IntArray, stamps: Array) -> Array:
-    """Return the time of each tick (s): straight lines that bend every `KNOT` at most."""
+    """Return the time of each tick (s): straight lines that bend no oftener than stamps demand.
+
+    A bend that they do not tell of (Schwarz's criterion) only hands their scatter on to the clock,
+    and with it to the phases of all beacons.
+    """
     if len(stamps) < FEWEST:
         return stamps
-    span = stamps[-1] - stamps[0]
-    inner = np.linspace(tick[0], tick[-1], max(int(span / KNOT), 1) + 1)[1:-1]
+    most = max(int((stamps[-1] - stamps[0]) / KNOT), 1)
+    lines, sigma, least = most, 0.0, np.inf
+    best = stamps
+    while lines >= 1:
+        found, off = _bent_lines(tick, stamps, lines)
+        sigma = sigma or max(float(np.median(np.abs(off))) / 0.6745, 1e-12)
+        square = np.minimum(np.abs(off) / sigma, 3.0) ** 2
+        cost = float(np.sum(square)) + (lines + 1) * np.log(len(stamps))
+        if cost < least:
+            best, least = found, cost
+        lines //= 2
+    return best
+
+
+def _bent_lines(tick: IntArray, stamps: Array, lines: int) -> tuple[Array, Array]:
+    """Return so many connected straight lines at the ticks (s), and what stamps are off by (s)."""
+    inner = np.linspace(tick[0], tick[-1], lines + 1)[1:-1]
     ends = (float(tick[0]), float(tick[-1]))
     knots = np.concatenate([[ends[0]] * 2, inner, [ends[1]] * 2])
-    weight = np.ones(len(stamps))
-    found = stamps
+    weight, found = np.ones(len(stamps)), stamps
     for _ in range(4):
         spline = make_lsq_spline(tick.astype(float), stamps, knots, k=1, w=weight)
         found = np.asarray(spline(tick.astype(float)))
         off = np.abs(stamps - found)
         sigma = np.median(off) / 0.6745
         weight = 1.0 / np.maximum(1.0, off / max(3.0 * sigma, 1e-12))
-    return found
+    return found, stamps - found
