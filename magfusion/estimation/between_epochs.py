@@ -21,7 +21,7 @@ from magfusion.estimation.state import MOTION
 from magfusion.model.parameters import corrected_imu
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import ImuModel
-from magfusion.model.trajectory import Trajectory
+from magfusion.model.trajectory import Trajectory, interpolated
 from magfusion.units import Array, BoolArray
 
 CHUNK = 16_384  # samples at a time: their covariances fit the memory
@@ -54,7 +54,7 @@ def at_rate(result: Smoothed, log: Log, rate: Literal["imu"] | float) -> Traject
 
     def line(known: Array, values: Array | None) -> Array:
         assert values is not None
-        return np.stack([np.interp(passed, known, axis) for axis in values.T], axis=1)
+        return interpolated(passed, known, values)
 
     # A random walk between two of its values: the mean is on the straight line.
     gyro_bias = line(states.time, states.gyro_bias_body)

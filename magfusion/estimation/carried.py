@@ -23,6 +23,7 @@ from magfusion.model.parameters import Block, corrected_imu, inertial_blocks, re
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.model.strapdown_steps import steps_of
+from magfusion.model.trajectory import interpolated
 from magfusion.units import Array, BoolArray
 
 
@@ -144,7 +145,7 @@ def _along(
     state, stamps = departure.state, imu.time + departure.time_offset
     samples = corrected_imu(state.calibration, departure.blocks, imu)
     bias = np.concatenate([state.gyro_bias_body, state.accel_bias_body])
-    read = _at(stamps, np.hstack([samples.gyro_body, samples.accel_body]) - bias, grid)
+    read = interpolated(grid, stamps, np.hstack([samples.gyro_body, samples.accel_body]) - bias)
     dt = np.diff(grid)
     mean = 0.5 * (read[1:] + read[:-1])
     turned = steps_of(mean[:, :3], mean[:, 3:], dt)
@@ -180,10 +181,6 @@ def _along(
     return Passage(grid, rotation, position, velocity, read[:, :3], read[:, 3:], transition, noise)
 
 
-def _at(stamps: Array, values: Array, grid: Array) -> Array:
-    return np.stack([np.interp(grid, stamps, column) for column in values.T], axis=1)
-
-
 def _by_calibration(departure: Departure, imu: ImuSamples, grid: Array) -> Array | None:
     """Return specific force and rate of each step by the calibration, shape (n, 6, dimension)."""
     acting, calibration = inertial_blocks(departure.blocks), departure.state.calibration
@@ -203,7 +200,7 @@ def _by_calibration(departure: Departure, imu: ImuSamples, grid: Array) -> Array
             by_sample[:, 3:, column] = ahead.gyro_body - behind.gyro_body
             by_sample[:, :, column] /= 2.0 * step[column]
     stamps = imu.time + departure.time_offset
-    read = _at(stamps, by_sample.reshape(len(imu), -1), grid).reshape(len(grid), 6, size)
+    read = interpolated(grid, stamps, by_sample.reshape(len(imu), -1)).reshape(len(grid), 6, size)
     return np.asarray(0.5 * (read[1:] + read[:-1]))
 
 

@@ -6,6 +6,7 @@ Measured along the inertial stream itself, as the same look ahead from its past 
 import numpy as np
 
 from magfusion.model.samples import ImuSamples
+from magfusion.model.trajectory import interpolated
 from magfusion.units import Array, IntArray
 
 REFERENCE = 0.05  # s; the look ahead that is measured where none is asked for
@@ -76,15 +77,11 @@ def _missed(imu: ImuSamples, at: IntArray, horizon: float) -> Array:
     gyro, force = imu.gyro_body[at], imu.accel_body[at]
     for k in range(count):
         since = (k + 0.5) * dt
-        rate = _read(now + since, time, imu.gyro_body)
-        later = _read(now + since, time, imu.accel_body)
+        rate = interpolated(now + since, time, imu.gyro_body)
+        later = interpolated(now + since, time, imu.accel_body)
         # Held is the force in world axes: it turns against the body.
         change = (later + since * np.cross(gyro, later) - force) * dt
         turn += (rate - gyro) * dt
         moved += gained * dt + 0.5 * change * dt
         gained += change
     return np.hstack([turn, moved, gained])
-
-
-def _read(wanted: Array, time: Array, values: Array) -> Array:
-    return np.stack([np.interp(wanted, time, column) for column in values.T], axis=1)

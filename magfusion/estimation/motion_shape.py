@@ -19,7 +19,7 @@ from magfusion.model.quaternion import (
 )
 from magfusion.model.samples import ImuSamples
 from magfusion.model.strapdown import turn_at, turn_from_gyro
-from magfusion.model.trajectory import Trajectory
+from magfusion.model.trajectory import Trajectory, interpolated
 from magfusion.units import Array
 
 
@@ -76,8 +76,8 @@ class MotionShape:
             raise ValueError("states must have velocity and biases")
         assert states.accel_bias_body is not None
         time = imu.time + time_offset
-        gyro = imu.gyro_body - _interpolated(time, states.time, states.gyro_bias_body)
-        accel = imu.accel_body - _interpolated(time, states.time, states.accel_bias_body)
+        gyro = imu.gyro_body - interpolated(time, states.time, states.gyro_bias_body)
+        accel = imu.accel_body - interpolated(time, states.time, states.accel_bias_body)
         chain = turn_from_gyro(time, gyro)
         at_states = turn_at(chain, time, gyro, states.time)
         known = components(Rotation.from_matrix(states.world_from_body))
@@ -151,10 +151,10 @@ class MotionShape:
         known = self.states.time
         slow_body = self._averaged(self.gyro_body)
         rate = turned(self.world_from_body, slow_body.T).T
-        at_states = _interpolated(known, self.time, rate)
+        at_states = interpolated(known, self.time, rate)
         # What the states hold back of the turn tilts the specific force.
         force = self.accel_world + np.array([0.0, 0.0, self.gravity])
-        held = _interpolated(self.time, known, at_states)
+        held = interpolated(self.time, known, at_states)
         speed, moved = _integrated(self.time, cross(held.T, force.T).T)
         change = (
             self.time,
@@ -165,9 +165,7 @@ class MotionShape:
         held_back, slope = _hermite(known, *_hermite(*change, known), inside)
         by_position = _hermite(*change, wanted)[0] - held_back
         by_position -= slope * (wanted - inside)[:, None]
-        by_rotation = _interpolated(wanted, known, at_states) - _interpolated(
-            wanted, self.time, rate
-        )
+        by_rotation = interpolated(wanted, known, at_states) - interpolated(wanted, self.time, rate)
         return by_rotation, by_position
 
     def _averaged(self, values: Array) -> Array:
@@ -218,10 +216,6 @@ def _hermite(known: Array, value: Array, slope: Array, wanted: Array) -> tuple[A
         value[index] + share * (begin + share * (square + share * cube)),
         (begin + share * (2.0 * square + 3.0 * share * cube)) / step,
     )
-
-
-def _interpolated(time: Array, known: Array, values: Array) -> Array:
-    return np.stack([np.interp(time, known, axis) for axis in values.T], axis=1)
 
 
 def _turn_at(known: Array, turn: Array, wanted: Array) -> Array:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class StateSink(Protocol):
     """Takes states one by one, and never makes the estimator wait."""
 
-    def take(self, state: JudgedState | None, told: Mapping[str, Any]) -> None:
+    def take(self, state: JudgedState | None, told: Mapping[str, Any], /) -> None:
         """Take a state, None before the first, with what the pipe tells of it."""
 
     def close(self) -> str | None:

@@ -93,6 +93,11 @@ def interpolate(
     return Trajectory(wanted, turn, moved), exists
 
 
+def interpolated(wanted: Array, time: Array, values: Array) -> Array:
+    """Return columns, shape (n, k), on straight lines between their values at times (n,) (s)."""
+    return np.stack([np.interp(wanted, time, column) for column in values.T], axis=1)
+
+
 def _slerp(known: Array, world_from_body: Array, wanted: Array) -> Array:
     if len(wanted) == 0:
         return np.empty((0, 3, 3))

@@ -94,7 +94,7 @@ class RosPublisher:
         self._refusal, self._epoch_ns, self._frames = DDSException, epoch_ns, (frame, child)
         self._unsent, self._why = 0, ""
 
-    def take(self, state: JudgedState | None, told: Mapping[str, Any]) -> None:  # noqa: ARG002
+    def take(self, state: JudgedState | None, _told: Mapping[str, Any]) -> None:
         """Publish a state that is not lost."""
         if state is None or state.lost:
             return
