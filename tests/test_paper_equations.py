@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.files.attitude_table import AttitudeDatabase
 from magfusion.model.antenna import Antenna
 from magfusion.model.physics.disturbance import sphere_polarizability
+from magfusion.model.physics.winding import Winding
 from magfusion.papers.p000_tracker import equations as p000
 from magfusion.papers.p001_magnetometer import equations as p001
 from magfusion.papers.p001_magnetometer.matching import predict_field
@@ -166,15 +167,16 @@ def test_001_eq_18_does_not_see_a_turn_about_the_field() -> None:
 
 def test_002_eq_2_and_3_are_a_coil_of_turns() -> None:
     """Against the exact field on the axis of a current sheet."""
-    current, turns, radius, length = 8.0, 120.0, 0.075, 0.35
-    moment = p002.eq_03_moment(current, turns, radius)
+    winding = Winding(8.0, 1, 120, 0.074, 0.002, 0.35 / 120)
+    moment, radius, length = p002.eq_03_equivalent_coil(winding)
+    assert length == pytest.approx(0.35, rel=1e-4)
     axis = np.linspace(1.0, 4.0, 5)
     offset = axis[:, None] * [0.0, 0.0, 1.0]
     field = p002.eq_02_field(offset, np.array([0.0, 0.0, moment]), radius, length)[:, 2]
-    ends = axis[:, None] + 0.5 * length * np.array([1.0, -1.0])
-    cosine = ends / np.hypot(ends, radius)
-    exact = 2.0 * np.pi * MU0_OVER_4PI * current * turns / length * (cosine[:, 0] - cosine[:, 1])
-    np.testing.assert_allclose(field, exact, rtol=1e-5)
+    ends = axis[:, None] + 0.5 * 0.35 * np.array([1.0, -1.0])
+    cosine = ends / np.hypot(ends, 0.075)
+    exact = 2.0 * np.pi * MU0_OVER_4PI * 8.0 * 120 / 0.35 * (cosine[:, 0] - cosine[:, 1])
+    np.testing.assert_allclose(field, exact, rtol=2e-5)
 
 
 def test_002_the_law_of_cosines_and_the_misfit_vanish_at_the_true_centre() -> None:

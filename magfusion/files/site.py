@@ -189,7 +189,7 @@ def _beacon(entry: BeaconEntry) -> Beacon:
         else _matrix(entry.rpy_deg),
         unknown=entry.unknown,
         frequency_hz=entry.frequency_hz,
-        coils=tuple(_model(Coil, c) for c in entry.coils),
+        coils=tuple(coil.coil() for coil in entry.coils),
         synchronised=entry.synchronised,
         slots=None if entry.slots is None else _model(Slots, entry.slots),
         model_error=entry.model_error,

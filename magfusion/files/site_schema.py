@@ -18,10 +18,13 @@ from magfusion.files.site_values import (
     LARGEST_ANGLE,
     LARGEST_DISTANCE,
     LARGEST_EARTH_FIELD,
+    LARGEST_MOMENT,
     LARGEST_NOISE_DENSITY,
     LARGEST_OFFSET,
     LARGEST_SCALE,
     LOWEST_FREQUENCY,
+    SMALLEST_MOMENT,
+    a_direction,
     a_moment,
     array,
     at_least_one,
@@ -36,7 +39,16 @@ from magfusion.files.site_values import (
     tesla,
 )
 from magfusion.files.yaml_files import StrictModel
-from magfusion.model.site import Beacon, ClockModel, EarthModel, Magnetometer, MotionModel, Site
+from magfusion.model.physics.winding import Winding, WoundCoil, wound_coil
+from magfusion.model.site import (
+    Beacon,
+    ClockModel,
+    Coil,
+    EarthModel,
+    Magnetometer,
+    MotionModel,
+    Site,
+)
 from magfusion.units import DEGREE, Array
 
 
@@ -50,6 +62,7 @@ _Share = Annotated[float, Field(ge=0.0, le=1.0)]
 _Positive = Annotated[_AboveZero, between(1e-12, 1e6)]
 _NotNegative = Annotated[_FromZero, between(0.0, 1e6)]
 _Length = Annotated[_AboveZero, between(1e-5, 1e3)]
+_Count = Annotated[int, Field(ge=1, le=100_000)]
 _Frequency = Annotated[_AboveZero, between(LOWEST_FREQUENCY, HIGHEST_FREQUENCY)]
 _Angle = Annotated[float, between(-LARGEST_ANGLE, LARGEST_ANGLE)]
 _Position = Annotated[Array, array(3, largest=LARGEST_DISTANCE, unit="m")]
@@ -122,16 +135,79 @@ class WorldEntry(StrictModel):
         return self
 
 
+class WindingEntry(StrictModel):
+    """`magfusion.model.physics.winding.Winding`, and the direction of its axis."""
+
+    axis: Annotated[Array, array(3), AfterValidator(a_direction)]
+    current_a: Annotated[_AboveZero, between(1e-12, 1e6)]
+    layers: _Count
+    rows: _Count
+    inner_radius_m: _Length
+    wire_m: _Length
+    pitch_m: _Length | None = None
+
+    @model_validator(mode="after")
+    def _turns_beside_each_other(self) -> Self:
+        if self.pitch_m is not None and self.pitch_m < self.wire_m:
+            remedy = "give at least wire_m, or remove it: turns lie beside each other"
+            raise refusal_at(("pitch_m",), self.pitch_m, remedy)
+        return self
+
+    def coil(self) -> WoundCoil:
+        """Return the coil that stands for it."""
+        pitch = self.wire_m if self.pitch_m is None else self.pitch_m
+        size = (self.inner_radius_m, self.wire_m, pitch)
+        return wound_coil(Winding(self.current_a, self.layers, self.rows, *size))
+
+
 class CoilEntry(StrictModel):
     """One coil in beacon axes; its size, offset, own frequency and slot are optional."""
 
-    moment_a_m2: Annotated[Array, array(3), AfterValidator(a_moment)]
+    moment_a_m2: Annotated[Array, array(3), AfterValidator(a_moment)] | None = None
+    winding: WindingEntry | None = None
     phase_deg: _Angle = 0.0
     centre_m: _Position = Field(default_factory=_zeros)
     radius_m: _Length | None = None
     length_m: _Length | None = None
     frequency_hz: _Frequency | None = None
     slot: Annotated[int, Field(ge=0)] | None = None
+
+    @model_validator(mode="after")
+    def _moment_or_winding(self) -> Self:
+        if self.winding is None:
+            if self.moment_a_m2 is None:
+                detail = InitErrorDetails(type="missing", loc=("moment_a_m2",), input=None)
+                raise ValidationError.from_exception_data("site", [detail])
+            return self
+        for key in ("moment_a_m2", "radius_m", "length_m"):
+            if getattr(self, key) is not None:
+                remedy = "remove it or winding, of which it follows"
+                raise refusal_at((key,), np.asarray(getattr(self, key)).tolist(), remedy)
+        moment = self.winding.coil().moment
+        if not SMALLEST_MOMENT <= moment <= LARGEST_MOMENT:
+            remedy = (
+                f"these turns have {moment:.3g} A m^2, and a beacon from {SMALLEST_MOMENT:g} to"
+                f" {LARGEST_MOMENT:g}; give current and lengths in A and m"
+            )
+            raise refusal_at(("winding",), self.winding.model_dump(), remedy)
+        return self
+
+    def coil(self) -> Coil:
+        """Return the coil; of windings that which stands for them."""
+        moment, radius, length = self.moment_a_m2, self.radius_m, self.length_m
+        if moment is None:
+            assert self.winding is not None
+            size, radius, length = self.winding.coil()
+            moment = size * self.winding.axis / np.linalg.norm(self.winding.axis)
+        return Coil(
+            moment_beacon=moment,
+            phase=self.phase_deg * DEGREE,
+            centre_beacon=self.centre_m,
+            radius=radius,
+            length=length,
+            frequency_hz=self.frequency_hz,
+            slot=self.slot,
+        )
 
 
 class SlotsEntry(StrictModel):

@@ -101,6 +101,13 @@ def a_moment(value: Array) -> Array:
     return value
 
 
+def a_direction(value: Array) -> Array:
+    """Refuse what points nowhere."""
+    if not 1e-6 <= math.hypot(*value) <= 1e6:
+        raise refusal("give the direction of the coil's axis, of any length near one")
+    return value
+
+
 def not_singular(value: Array) -> Array:
     """Refuse a matrix that cannot be undone."""
     if not np.linalg.cond(value) <= LARGEST_CONDITION:

@@ -11,6 +11,7 @@ import numpy as np
 
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.physics.solenoid import solenoid_field
+from magfusion.model.physics.winding import wound_coil
 from magfusion.papers.p004_fingerprints import equations as p004
 from magfusion.units import Array, IntArray
 
@@ -38,13 +39,8 @@ eq_01_field = dipole_field
 eq_02_field = solenoid_field
 """Unclear: a coil that stands for rows and columns of turns; here that of Biot and Savart."""
 
-
-def eq_03_moment(current: float, turns: float, radius: Array) -> Array:
-    """Return the moment ``I N pi R^2`` (A m^2) of turns of a radius (m).
-
-    Unclear: how the paper parts it among the rows and columns of Eq 2.
-    """
-    return current * turns * np.pi * radius**2
+eq_03_equivalent_coil = wound_coil
+"""Unclear; here the coil that has the dipole of all rows and columns, and the next term."""
 
 
 eq_04_direction = p004.eq_07_direction
