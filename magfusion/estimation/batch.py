@@ -21,6 +21,7 @@ from magfusion.estimation.measurements.zero_velocity import may_stand, quiet_bef
 from magfusion.estimation.noise_tuning import Tuned, as_declared, noise_of, plausible, with_noise
 from magfusion.estimation.noise_tuning import settled as same_noise
 from magfusion.estimation.prepared import prepared
+from magfusion.estimation.relaxation import Step, part_of_the_way
 from magfusion.estimation.settings import SmootherSettings as SmootherSettings
 from magfusion.estimation.solve.bordered import Optimised, eliminate, marginal, optimise
 from magfusion.model.parameters import Block, Calibration, placed
@@ -169,6 +170,7 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
     by_waveform = log.fixes is None and log.demodulation.log.waveform is not None
     iterations, done, settled = 0, 0, False
     tuned: tuple[Tuned, ...] = ()
+    step: Step | None = None
     while done < settings.passes and not settled:
         report(f"pass {done + 1}", done + 2, settings.passes + 3)
         if done > 0 and by_waveform:
@@ -188,7 +190,8 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
             and settled_at(states, after, calibration, found.estimate.calibration)
         )
         before, states = states, after
-        calibration, standing = found.estimate.calibration, standing | stood
+        old, calibration = calibration, found.estimate.calibration
+        standing = standing | stood
         segments = found.estimate.segments
         if tuning and (wave is not None or not by_waveform):
             latest = noise_of(log, graph, found.estimate, states, wave, declared)
@@ -198,6 +201,10 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
             calibration = with_noise(calibration, tuned)
             segments = tuple(with_noise(segment, tuned) for segment in segments)
         iterations, done = iterations + found.iterations, done + 1
+        if not settled and done < settings.passes:
+            step = Step.of(step, before, states, old, calibration)
+            moved = before, states, old, calibration
+            states, calibration = part_of_the_way(*moved, graph.blocks, step.share)
     report("posterior", settings.passes + 2, settings.passes + 3)
     fields = log.samples if wave is None else wave.fields
     result = posterior(log, graph, found, fields, gaps)

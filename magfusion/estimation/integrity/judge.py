@@ -38,7 +38,8 @@ def judged(result: Smoothed, log: Log) -> tuple[Smoothed, Trust]:
     """
     alone = result.earth_residual is None
     states = result.states if alone else None  # else the Earth field has had its say in them
-    heard = recorded(log, result.declared.site, BRIDGED, estimated=states, beacons=alone)
+    streams = log, result.declared.site, BRIDGED
+    heard = recorded(*streams, estimated=states, beacons=alone, freed=result.fields)
     trust = Trust((*tuned_noise(result.noise), *heard))
     pose_cov = result.states.pose_cov
     if pose_cov is None:

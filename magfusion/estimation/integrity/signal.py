@@ -1,7 +1,7 @@
 """How well each beacon is heard along a log: never, not for a while, or hardly."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -88,6 +88,22 @@ def heard_in(log: Log, site: Site, lockin: LockinSettings | None = None) -> Hear
         return heard(received(log.waveform, log.imu, site, lockin)[0], site)
     except InputError:
         return None
+
+
+def heard_with_motion(raw: Heard, freed: FieldSamples, site: Site) -> Heard:
+    """Return how well the beacons are heard once the motion inside the windows is taken off.
+
+    Parameters
+    ----------
+    raw : Heard
+        With that motion in the noise.
+    freed : FieldSamples
+        The phasors of a solution; those of its windows that are among ``raw``'s count.
+    """
+    _, among, of = np.intersect1d(raw.time, freed.time, return_indices=True)
+    loud = raw.loud.copy()
+    loud[among] |= heard(freed, site).loud[of]
+    return replace(raw, loud=loud)
 
 
 def unheard(found: Heard, site: Site) -> Iterator[Finding]:

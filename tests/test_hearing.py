@@ -1,0 +1,46 @@
+"""How well beacons are heard, before and after the motion inside the windows is taken off."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.integrity.signal import heard, heard_with_motion, unheard
+from magfusion.model.samples import FieldSamples
+from magfusion.model.trust import Verdict
+from magfusion.simulation.demo_site import demo_site
+
+SITE = demo_site()
+TIME = np.arange(50) * 0.2
+SIGNAL, NOISE = 30e-9, 1e-9  # T
+
+
+def phasors(noise: float, time: np.ndarray = TIME) -> FieldSamples:
+    shape = (len(time), len(SITE.channels), 3)
+    cov = np.broadcast_to(noise**2 * np.eye(3), (*shape, 3)).copy()
+    window = np.full(len(time), 0.4)
+    return FieldSamples(time, window, SITE.channels, np.full(shape, SIGNAL + 0j), cov)
+
+
+def doubts(found) -> list[str]:
+    return [f.code for f in unheard(found, SITE) if f.verdict is not Verdict.TRUSTWORTHY]
+
+
+def test_what_only_motion_hides_is_no_lack_of_signal() -> None:
+    moving = phasors(NOISE)
+    moving.phasor_cov[10:40] *= 1e4  # the motion of a strong beacon, taken for noise
+    raw = heard(moving, SITE)
+    assert "low_signal" in doubts(raw)
+    freed = phasors(NOISE, TIME[5:])
+    assert doubts(heard_with_motion(raw, freed, SITE)) == []
+
+
+def test_what_is_far_away_stays_so() -> None:
+    raw = heard(phasors(100.0 * SIGNAL), SITE)
+    assert doubts(heard_with_motion(raw, phasors(50.0 * SIGNAL), SITE)) == ["low_signal"]
+
+
+def test_windows_of_another_length_tell_nothing() -> None:
+    raw = heard(phasors(100.0 * SIGNAL), SITE)
+    elsewhere = phasors(NOISE, TIME + 0.07)
+    assert not np.any(heard_with_motion(raw, elsewhere, SITE).loud)
+    assert np.all(heard_with_motion(raw, replace(elsewhere, time=TIME), SITE).loud)
