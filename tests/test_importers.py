@@ -116,6 +116,19 @@ def test_a_euroc_folder_may_hold_inertial_samples_alone(tmp_path: Path) -> None:
     np.testing.assert_array_equal(log.imu.gyro_body, GYRO[20:])
 
 
+def test_samples_that_were_not_taken_are_left_out_of_a_euroc_folder_and_said(
+    tmp_path: Path,
+) -> None:
+    table = _euroc(tmp_path) / "mav0" / "imu0" / "data.csv"
+    head, *rows = table.read_text().splitlines()
+    stamp, _, *others = rows[7].split(",")
+    rows[7] = ",".join([stamp, "nan", *others])
+    table.write_text("\n".join([head, *rows[:12], rows[11], *rows[12:]]) + "\n")
+    log = open_log(tmp_path)
+    np.testing.assert_array_equal(log.imu.gyro_body, np.delete(GYRO, 7, axis=0))
+    assert [f.code for f in log.noticed] == ["repeated_stamps", "missing_samples"]
+
+
 def test_a_poses_only_ground_truth_is_read(tmp_path: Path) -> None:
     path = _euroc(tmp_path / "euroc")
     truth = path / "mav0" / "state_groundtruth_estimate0" / "data.csv"
@@ -259,17 +272,17 @@ def _spoil(part: str, name: str, value: float) -> Callable[[Any], object]:
         ({}, "holds no messages of sensor_msgs/msg/Imu"),
         ({"/mag": (FIELD, field_message)}, "holds no messages of sensor_msgs/msg/Imu"),
         (
-            {"/imu": (IMU, _changed(imu_message, _spoil("angular_velocity", "y", float("nan"))))},
+            {"/imu": (IMU, _changed(imu_message, _spoil("angular_velocity", "y", float("inf"))))},
             f"topic /imu: the message stamped {STAMPS[7]} ns holds a number that is not finite",
         ),
         (
-            {
-                "/imu": (
-                    IMU,
-                    _changed(imu_message, _spoil("header", "stamp", header(START_NS).stamp)),
-                )
-            },
-            f"topic /imu: the message stamped {START_NS} ns has the stamp of another",
+            {"/imu": (IMU, lambda k: _stamped(imu_message(k), k // 5))},
+            "topic /imu: 32 of 40 messages have the stamp of another; .*first is stamped"
+            f" {START_NS} ns",
+        ),
+        (
+            SENSORS | {"/imu/mag": (FIELD, lambda k: _scaled_field(k, np.nan if k % 3 else 1.0))},
+            "topic /imu/mag: 26 of 40 messages hold NaN",
         ),
         (
             {"/imu": (IMU, lambda k: imu_message(k, absent=-1.0))},
@@ -296,6 +309,32 @@ def test_a_bag_that_no_instrument_gives_is_refused(
     with pytest.raises(InputError, match=rf"run.* ?{sentence}") as caught:
         open_log(bag)
     assert str(caught.value).count("\n") == 0
+
+
+def test_samples_that_were_not_taken_are_left_out_of_a_bag_and_said(tmp_path: Path) -> None:
+    lost = _changed(imu_message, _spoil("linear_acceleration", "y", float("nan")))
+    again = _changed(field_message, lambda m: _stamped(m, 20), row=21)
+    unseen = _changed(pose_message, _spoil("pose", "position", xyz("Point", np.full(3, np.nan))))
+    topics = {"/imu": (IMU, lost), "/mag": (FIELD, again), "/mocap": (POSE, unseen)}
+    bag = write_bag(tmp_path / "run", topics)
+    log = open_log(bag)
+    assert log.waveform is not None
+    assert log.truth is not None
+    np.testing.assert_array_equal(log.imu.gyro_body, np.delete(GYRO, 7, axis=0))
+    np.testing.assert_array_equal(log.waveform.measured_sensor, np.delete(MEASURED, 21, axis=0))
+    np.testing.assert_array_equal(log.truth.position_world, np.delete(POSITION, 7, axis=0))
+    assert [f"{f.code}: {f.text}" for f in log.noticed] == [
+        "missing_samples: IMU: 1 samples are NaN. They are left out.",
+        "repeated_stamps: magnetometer: 1 samples have the stamp of the one before. They are left"
+        " out.",
+        "missing_samples: truth: 1 samples are NaN. They are left out.",
+    ]
+    assert not open_log(bag, 0.11).noticed
+
+
+def _stamped(message: Any, k: int) -> Any:
+    message.header = header(int(STAMPS[k]))
+    return message
 
 
 def _no_turn(pose: Any) -> None:

@@ -11,12 +11,14 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.files.lost_rows import LostRows
 from magfusion.files.messages import IMU, ROWS, USUAL, refuse_absent, stamp_ns
 from magfusion.files.plausible import check_field, check_imu
-from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, Span
+from magfusion.files.table import LARGEST_NUMBER, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding
 from magfusion.units import Array, IntArray
 
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
@@ -68,7 +70,8 @@ def read_bag(
     Returns
     -------
     Log
-        Without the streams for which the bag has no topic.
+        Without the streams for which the bag has no topic, and without messages that hold NaN or
+        the stamp of another; ``noticed`` says how many these are.
 
     Raises
     ------
@@ -90,13 +93,20 @@ def read_bag(
     if imu is None:
         raise InputError(f"{path}: holds no messages of {IMU}; record the inertial sensor.")
     span = Span(int(imu.time_ns[0]), start, end)
+    told: list[Finding] = []
+    imu = _measured(imu.within(span), "IMU", told)
+    field, truth = (
+        None if one is None else _measured(one.within(span), role, told)
+        for one, role in ((field, "magnetometer"), (truth, "truth"))
+    )
     return Log(
         name=path.resolve().stem,
         epoch_ns=span.epoch_ns,
         source="bag: " + ", ".join(s.place for s in (imu, field, truth) if s is not None),
-        imu=_imu(imu.within(span), span),
-        waveform=None if field is None else _waveform(field.within(span), span),
-        truth=None if truth is None else _trajectory(truth.within(span), span),
+        imu=_imu(imu, span),
+        waveform=None if field is None else _waveform(field, span),
+        truth=None if truth is None else _trajectory(truth, span),
+        noticed=tuple(told),
     )
 
 
@@ -147,16 +157,36 @@ def _sorted(place: str, msgtype: str, stamps: IntArray, values: Array) -> _Strea
     # A bag keeps the order of arrival, which the network may have changed.
     order = np.argsort(stamps, kind="stable")
     stamps, values = stamps[order], values[order]
-    bad = ~(np.abs(values) < LARGEST_NUMBER).all(axis=1)
-    repeated = np.diff(stamps, prepend=-LARGEST_TIME_NS) == 0
-    for wrong, remedy in (
-        (bad, "holds a number that is not finite; remove the message"),
-        (repeated, "has the stamp of another; stamp each message with its own time"),
-    ):
-        if wrong.any():
-            stamp = stamps[np.argmax(wrong)]
-            raise InputError(f"{place}: the message stamped {stamp} ns {remedy}.")
+    bad = ~(np.abs(values) < LARGEST_NUMBER).all(axis=1) & ~np.isnan(values).any(axis=1)
+    if bad.any():
+        stamp = stamps[np.argmax(bad)]
+        raise InputError(
+            f"{place}: the message stamped {stamp} ns holds a number that is not finite; remove the"
+            " message."
+        )
     return _Stream(place, msgtype, stamps, values)
+
+
+def _measured(stream: _Stream, role: str, told: list[Finding]) -> _Stream:
+    """Return the messages that hold a sample, and tell of the others."""
+    lost = LostRows.of(stream.time_ns, stream.values)
+    for too_many, rows, remedy in zip(
+        lost.too_many,
+        (lost.twice, lost.absent),
+        (
+            "have the stamp of another; stamp each message with its own time",
+            "hold NaN; record the topic again",
+        ),
+        strict=True,
+    ):
+        if too_many:
+            raise InputError(
+                f"{stream.place}: {np.sum(rows)} of {len(rows)} messages {remedy} (the first is"
+                f" stamped {stream.time_ns[np.argmax(rows)]} ns)."
+            )
+    told += lost.told(role)
+    kept = lost.kept
+    return _Stream(stream.place, stream.msgtype, stream.time_ns[kept], stream.values[kept])
 
 
 def _imu(stream: _Stream, span: Span) -> ImuSamples:

@@ -7,11 +7,12 @@ from typing import TypeVar
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.files.lost_rows import LostRows
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.table import TIME, Layout, Span, Table, read_table, write_table
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Finding, Verdict
+from magfusion.model.trust import Finding
 from magfusion.units import Array
 
 Stream = TypeVar("Stream", FieldSamples, Trajectory)
@@ -21,7 +22,6 @@ _ACCEL = ("accel_x", "accel_y", "accel_z")
 _FIELD = ("field_x", "field_y", "field_z")
 IMU_LAYOUT = Layout(numbers=(*_GYRO, *_ACCEL), repeats=True)
 FIELD_LAYOUT = Layout(numbers=_FIELD, repeats=True)
-MOST_MISSING, MOST_TWICE = 0.5, 0.1  # of the rows; more is a mistake of the recording
 
 
 def read_imu(
@@ -86,24 +86,15 @@ def _measured(
 ) -> tuple[Array, Array, tuple[Finding, ...]]:
     """Return times (s) and columns of the rows that hold a sample, and what the others are."""
     values = table.numbers(names, nan=True)
-    twice = np.asarray(np.diff(table.time_ns, prepend=table.time_ns[:1] - 1) == 0)
-    absent = np.asarray(np.any(np.isnan(values), axis=1))
-    if np.mean(twice) > MOST_TWICE:
+    lost = LostRows.of(table.time_ns, values)
+    too_often, too_many = lost.too_many
+    if too_often:
         remedy = "the time of the row above: remove one of the two"
-        table.refuse(twice, TIME, table.time_ns, remedy)
-    if np.mean(absent) > MOST_MISSING:
+        table.refuse(lost.twice, TIME, table.time_ns, remedy)
+    if too_many:
         name = next(n for n, v in zip(names, values.T, strict=True) if np.isnan(v).any())
-        table.refuse(absent, name, np.full(len(table), np.nan), "write a finite number")
-    noticed = [
-        Finding(code, f"{stream}: {text} They are left out.", Verdict.TRUSTWORTHY)
-        for code, text in (
-            ("repeated_stamps", f"{np.sum(twice)} samples have the stamp of the one before."),
-            ("missing_samples", f"{np.sum(absent)} samples are NaN."),
-        )
-        if (twice if code == "repeated_stamps" else absent).any()
-    ]
-    kept = ~(twice | absent)
-    return table.time[kept], values[kept], tuple(noticed)
+        table.refuse(lost.absent, name, np.full(len(table), np.nan), "write a finite number")
+    return table.time[lost.kept], values[lost.kept], lost.told(stream)
 
 
 def write_waveform(waveform: Waveform, path: Path, epoch_ns: int) -> None:

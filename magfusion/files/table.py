@@ -148,11 +148,11 @@ class Table:
         Parameters
         ----------
         nan : bool
-            Whether a number may be missing.
+            Whether a number may be missing: NaN or null in the table, NaN of what is returned.
         """
         values = np.empty((len(self), len(names)))
         for k, name in enumerate(names):
-            column = self._present(name)
+            column = self.data[name] if nan else self._present(name)
             if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
                 raise InputError(f"{self.path}: column {name} holds {column.type}; write numbers.")
             values[:, k] = column.to_numpy()

@@ -13,7 +13,7 @@ from magfusion.files.foreign.columns import EULER, QUATERNION, TIME, Term
 from magfusion.files.foreign.plan import Plan
 from magfusion.files.foreign.source import Part
 from magfusion.files.foreign.units import NO_STAMP, Raw, to_nanoseconds
-from magfusion.files.inertial_tables import MOST_MISSING, MOST_TWICE
+from magfusion.files.lost_rows import MOST_MISSING, MOST_TWICE
 from magfusion.files.plausible import SHORTEST_STEP
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, LONGEST_GAP, ROWS_PER_GROUP
 from magfusion.files.table import TIME as TIME_NS

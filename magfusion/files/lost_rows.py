@@ -1,0 +1,51 @@
+"""Rows of a recording that hold no sample: NaN, or the stamp of the row above."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import Array, BoolArray, IntArray
+
+MOST_MISSING, MOST_TWICE = 0.5, 0.1  # of the rows; more is a mistake of the recording
+
+
+@dataclass(frozen=True, eq=False)
+class LostRows:
+    """Which rows hold no sample, shape (n,): of a stamp that stands twice, the later ones."""
+
+    twice: BoolArray
+    absent: BoolArray
+
+    @classmethod
+    def of(cls, time_ns: IntArray, values: Array) -> "LostRows":
+        """Judge rows, sorted by their stamps (ns), of values of shape (n, columns)."""
+        twice = np.diff(time_ns, prepend=time_ns[:1] - 1) == 0
+        return cls(np.asarray(twice), np.asarray(np.isnan(values).any(axis=1)))
+
+    @property
+    def kept(self) -> BoolArray:
+        """Which rows hold a sample, shape (n,)."""
+        return np.asarray(~(self.twice | self.absent))
+
+    @property
+    def too_many(self) -> tuple[bool, bool]:
+        """Whether stamps that stand twice, and rows of NaN, are no accident any more."""
+        if not len(self.twice):
+            return False, False
+        return bool(np.mean(self.twice) > MOST_TWICE), bool(np.mean(self.absent) > MOST_MISSING)
+
+    def told(self, stream: str) -> tuple[Finding, ...]:
+        """Return how many rows are left out of a stream, and why."""
+        return tuple(
+            Finding(code, f"{stream}: {text} They are left out.", Verdict.TRUSTWORTHY)
+            for code, rows, text in (
+                (
+                    "repeated_stamps",
+                    self.twice,
+                    f"{np.sum(self.twice)} samples have the stamp of the one before.",
+                ),
+                ("missing_samples", self.absent, f"{np.sum(self.absent)} samples are NaN."),
+            )
+            if rows.any()
+        )
