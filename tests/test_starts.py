@@ -1,76 +1,20 @@
 """Starts that are found where single epochs and their links lead astray."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+import random_starts
+from random_starts import Case, lone, recorded
 from scipy.stats import binom, chi2
 
 from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.demodulation import first_fixes, phasors
+from magfusion.estimation.demodulation import first_fixes
 from magfusion.estimation.initialization.chain import choose_chains
-from magfusion.estimation.initialization.offline import OfflineStart, begin
 from magfusion.estimation.initialization.search import differ, search, thinned
-from magfusion.estimation.integrity.judge import judged
 from magfusion.model.parameters import initial_calibration
-from magfusion.model.samples import FieldSamples
-from magfusion.model.site import Site
-from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Verdict
 from magfusion.results.errors import trajectory_errors
-from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
-from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
-from magfusion.simulation.motion import Rests
-
-FAR_M, FAR_RAD = 0.3, 0.4  # further off, an epoch is at another hypothesis
-
-
-@dataclass(frozen=True, eq=False)
-class Case:
-    """A simulated log and its phasors."""
-
-    site: Site
-    made: SimulatedLog
-    samples: FieldSamples
-
-    def starts(self) -> list[OfflineStart]:
-        calibration = initial_calibration(self.site, float(np.mean(self.samples.time)))
-        return begin(self.samples, None, self.made.log, calibration)
-
-    def wrong(self, states: Trajectory) -> float:
-        """Return the share of epochs that are at another hypothesis than the truth's."""
-        truth = self.made.motion.trajectory(states.time)
-        away = np.linalg.norm(states.position_world - truth.position_world, axis=1)
-        between = np.swapaxes(truth.world_from_body, 1, 2) @ states.world_from_body
-        angle = Rotation.from_matrix(between).magnitude()
-        return float(np.mean((away > FAR_M) | (angle > FAR_RAD)))
-
-
-def lone(
-    seed: int,
-    duration: float,
-    *,
-    synchronised: bool = True,
-    rpy_deg: tuple[float, ...] = (2, -3, 10),
-) -> Case:
-    """Return a walk about one rotating beacon."""
-    site = replace(demo_site(coil_radius=None), model_error=1e-3)
-    beacon = replace(
-        site.beacons[0],
-        synchronised=synchronised,
-        world_from_beacon=Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix(),
-    )
-    return recorded(replace(site, beacons=(beacon,)), seed, duration)
-
-
-def recorded(site: Site, seed: int, duration: float, speed: float = 0.5) -> Case:
-    config = SimulationConfig(
-        DEMO_BOX_WORLD, duration, speed=speed, rests=Rests(start=3.0, move=20.0, pause=3.0)
-    )
-    made = simulate_log(site, config, np.random.default_rng([7, seed]))
-    samples, _ = phasors(made.log, site)
-    return Case(site, made, samples)
+from magfusion.simulation.demo_site import demo_site
 
 
 @pytest.fixture(scope="module")
@@ -148,17 +92,9 @@ def test_a_swap_of_a_stretch_is_undone() -> None:
 @pytest.mark.slow
 def test_lone_rotating_beacons_are_found_and_honest() -> None:
     """What a survey errs by is the same for a whole log: its NEES is one draw, not many."""
-    nees = []
-    for seed in range(8):
-        case = lone(seed, 30.0)
-        result, trust = judged(smooth(case.made.log, case.site), case.made.log)
-        truth = case.made.log.truth
-        assert truth is not None
-        errors = trajectory_errors(result.states, truth)
-        assert errors.nees is not None
-        assert case.wrong(result.states) == 0.0
-        if trust.verdict is Verdict.TRUSTWORTHY:
-            nees.append(float(np.mean(errors.nees)))
+    rows = [random_starts.run_one(seed, alone=True) for seed in range(8)]
+    assert all(row.wrong_smoothed == 0.0 for row in rows)
+    nees = [row.nees for row in rows if row.verdict == "trustworthy"]
     assert len(nees) >= 6
     assert np.sum(np.array(nees) > 12.0) <= binom.isf(1e-3, len(nees), chi2.sf(12.0, 6))
     assert 3.0 < np.mean(nees) < 8.0
@@ -167,19 +103,5 @@ def test_lone_rotating_beacons_are_found_and_honest() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(40))
 def test_whatever_beacons_there_are_some_start_is_right(seed: int) -> None:
-    rng = np.random.default_rng([11, seed])
-    site = replace(demo_site(coil_radius=None), model_error=1e-3)
-    sync = bool(rng.random() < 0.5)
-    beacons = tuple(
-        replace(
-            site.beacons[i % 4],
-            name="ABCDEFGH"[i],
-            position_world=rng.uniform([-1.0, -1.0, -0.5], [0.5, 6.0, 2.5]),
-            world_from_beacon=Rotation.random(rng=rng).as_matrix(),
-            frequency_hz=20.0 + 5.0 * i,
-            synchronised=sync,
-        )
-        for i in range(int(rng.integers(1, 9)))
-    )
-    case = recorded(replace(site, beacons=beacons), seed, 15.0, float(rng.uniform(0.2, 1.5)))
-    assert min(case.wrong(start.states) for start in case.starts()) < 0.05
+    row = random_starts.run_one(seed, alone=False)
+    assert row.found

@@ -1,0 +1,197 @@
+"""Is the first trajectory found wherever there is one?  Random logs, and what is said of each.
+
+Of every log a site of one to eight beacons, synchronised or not, and the speed of a walk are drawn.
+At least 99 % should have a start that is right at 95 % of the epochs.  Where none is, the log is
+smoothed, and the result should be right all the same or not be trusted::
+
+    python scenarios/random_starts.py --runs 200
+
+``--lone`` walks about one rotating beacon that everything depends on, and smooths every log: no
+mean NEES above 12 should be trusted, but by the chance that a survey's error is one draw a log::
+
+    python scenarios/random_starts.py --lone --runs 20
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from harness import conclude, scenario_parser
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import EstimationError
+from magfusion.estimation.batch import smooth
+from magfusion.estimation.demodulation import phasors
+from magfusion.estimation.initialization.offline import OfflineStart, begin
+from magfusion.estimation.integrity.judge import judged
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Verdict
+from magfusion.results.errors import trajectory_errors
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
+from magfusion.simulation.motion import Rests
+
+FAR_M, FAR_RAD = 0.3, 0.4  # further off, an epoch is at another hypothesis
+MOST_WRONG = 0.05  # of the epochs
+MOST_NEES = 12.0
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A simulated log and its phasors."""
+
+    site: Site
+    made: SimulatedLog
+    samples: FieldSamples
+
+    def starts(self) -> list[OfflineStart]:
+        """Return the starts that are offered."""
+        calibration = initial_calibration(self.site, float(np.mean(self.samples.time)))
+        return begin(self.samples, None, self.made.log, calibration)
+
+    def wrong(self, states: Trajectory) -> float:
+        """Return the share of epochs that are at another hypothesis than the truth's."""
+        truth = self.made.motion.trajectory(states.time)
+        away = np.linalg.norm(states.position_world - truth.position_world, axis=1)
+        between = np.swapaxes(truth.world_from_body, 1, 2) @ states.world_from_body
+        angle = Rotation.from_matrix(between).magnitude()
+        return float(np.mean((away > FAR_M) | (angle > FAR_RAD)))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One log: share of wrong epochs of the best start, and what the smoother made of it."""
+
+    seed: int
+    beacons: int
+    synchronised: bool
+    wrong: float
+    verdict: str | None = None
+    codes: tuple[str, ...] = ()
+    wrong_smoothed: float | None = None
+    nees: float | None = None
+
+    @property
+    def found(self) -> bool:
+        """Whether some start is right."""
+        return self.wrong < MOST_WRONG
+
+    @property
+    def silent(self) -> bool:
+        """Whether a wrong result is trusted."""
+        trusted = self.verdict == str(Verdict.TRUSTWORTHY)
+        return trusted and ((self.wrong_smoothed or 0.0) > 0.0 or (self.nees or 0.0) > MOST_NEES)
+
+
+def recorded(site: Site, seed: int, duration: float, speed: float = 0.5) -> Case:
+    """Return a walk with rests."""
+    config = SimulationConfig(
+        DEMO_BOX_WORLD, duration, speed=speed, rests=Rests(start=3.0, move=20.0, pause=3.0)
+    )
+    made = simulate_log(site, config, np.random.default_rng([7, seed]))
+    samples, _ = phasors(made.log, site)
+    return Case(site, made, samples)
+
+
+def lone(
+    seed: int,
+    duration: float,
+    *,
+    synchronised: bool = True,
+    rpy_deg: tuple[float, ...] = (2, -3, 10),
+) -> Case:
+    """Return a walk about one rotating beacon."""
+    site = replace(demo_site(coil_radius=None), model_error=1e-3)
+    beacon = replace(
+        site.beacons[0],
+        synchronised=synchronised,
+        world_from_beacon=Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix(),
+    )
+    return recorded(replace(site, beacons=(beacon,)), seed, duration)
+
+
+def drawn(seed: int, duration: float) -> Case:
+    """Return a walk among beacons of any number, place and attitude."""
+    rng = np.random.default_rng([11, seed])
+    site = replace(demo_site(coil_radius=None), model_error=1e-3)
+    sync = bool(rng.random() < 0.5)
+    beacons = tuple(
+        replace(
+            site.beacons[i % 4],
+            name="ABCDEFGH"[i],
+            position_world=rng.uniform([-1.0, -1.0, -0.5], [0.5, 6.0, 2.5]),
+            world_from_beacon=Rotation.random(rng=rng).as_matrix(),
+            frequency_hz=20.0 + 5.0 * i,
+            synchronised=sync,
+        )
+        for i in range(int(rng.integers(1, 9)))
+    )
+    return recorded(replace(site, beacons=beacons), seed, duration, float(rng.uniform(0.2, 1.5)))
+
+
+def run_one(seed: int, *, alone: bool) -> Row:
+    """Simulate a log and look for its starts; smooth it where that decides something."""
+    case = lone(seed, 30.0) if alone else drawn(seed, 15.0)
+    beacons = case.site.beacons
+    row = Row(seed, len(beacons), beacons[0].synchronised, _least_wrong(case))
+    if row.found and not alone:
+        return row
+    try:
+        result, trust = judged(smooth(case.made.log, case.site), case.made.log)
+    except EstimationError:
+        return replace(row, verdict=str(Verdict.FAILED))
+    truth = case.made.log.truth
+    assert truth is not None
+    errors = trajectory_errors(result.states, truth)
+    return replace(
+        row,
+        verdict=str(trust.verdict),
+        codes=tuple(reason.code for reason in trust.reasons),
+        wrong_smoothed=case.wrong(result.states),
+        nees=None if errors.nees is None else float(np.mean(errors.nees)),
+    )
+
+
+def _least_wrong(case: Case) -> float:
+    try:
+        return min(case.wrong(start.states) for start in case.starts())
+    except EstimationError:
+        return 1.0
+
+
+def report(rows: Sequence[Row]) -> str:
+    """Return the table of the logs that were smoothed, and the shares."""
+    lines = ["seed beacons  wrong  smoothed   NEES"]
+    for row in rows:
+        if row.verdict is not None:
+            smoothed = "-" if row.wrong_smoothed is None else f"{100 * row.wrong_smoothed:.0f} %"
+            nees = "-" if row.nees is None else f"{row.nees:.2f}"
+            lines.append(
+                f"{row.seed:4d} {row.beacons:7d} {100 * row.wrong:4.0f} % {smoothed:>9} {nees:>6}"
+                f"  {row.verdict} {', '.join(row.codes)}"
+            )
+    found, silent = sum(row.found for row in rows), [row.seed for row in rows if row.silent]
+    lines.append(f"a right start in {found} of {len(rows)} ({100 * found / len(rows):.1f} %)")
+    lines.append(f"trusted and wrong: {silent or 'none'}")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Print the table and one JSON line."""
+    parser = scenario_parser(__doc__, 0, output=None)
+    parser.add_argument("--runs", type=int, default=40)
+    parser.add_argument("--lone", action="store_true", help="one rotating beacon, smoothed")
+    given = parser.parse_args()
+    rows: list[Row] = []
+    for seed in range(given.seed, given.seed + given.runs):
+        rows.append(run_one(seed, alone=given.lone))
+        print(rows[-1], file=sys.stderr, flush=True)
+    conclude(report(rows), {"rows": rows})
+
+
+if __name__ == "__main__":
+    main()
