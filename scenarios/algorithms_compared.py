@@ -394,26 +394,27 @@ def _table(
 
 
 def draw(directory: Path, found: Mapping[str, Sequence[Outcome]]) -> None:
-    """Write the paper's figures 7 and 8 as PNGs."""
+    """Write the paper's figures 7 and 8 as PNGs, and bars of all rooms."""
     shown = "F1" if "F1" in found else next(iter(found))
     colours = {name: f"C{i}" for i, name in enumerate(METHODS)}
-    figure = blank_figure(12.0, 5.0)
-    axes = figure.subplots(1, 2)
-    for name, colour in colours.items():
-        for axis, quantity in zip(axes, ("position", "euler"), strict=True):
+    for number, quantity, paper, label in (
+        (7, "position", PAPER_POSITION, "position error (m)"),
+        (8, "euler", PAPER_ATTITUDE_DEG, "attitude error of a level sensor, mean |Euler| (deg)"),
+    ):
+        figure = blank_figure(7.0, 5.0)
+        axes = figure.subplots()
+        for name, colour in colours.items():
             every = np.concatenate([getattr(o, quantity)[name] for o in found[shown]])
             share = np.arange(1, len(every) + 1) / len(every)
-            axis.step(np.sort(every), share, where="post", c=colour, label=name)
-    for axis, paper in zip(axes, (PAPER_POSITION, PAPER_ATTITUDE_DEG), strict=True):
+            axes.step(np.sort(every), share, where="post", c=colour, label=name)
         for name, value in paper.items():
-            axis.axvline(value, c=colours[name], ls=":", lw=1.0)
-        axis.set(xscale="log", ylabel="share of targets", ylim=(0.0, 1.0))
-        axis.grid(visible=True, alpha=0.3)
-    axes[0].set(title=f"{shown}; dotted: means of the paper", xlabel="position error (m)")
-    axes[1].set(title="level sensor", xlabel="attitude error, mean |Euler| (deg)")
-    axes[0].legend(fontsize=8)
-    save_picture(figure, directory / "figure_7.png")
-    _draw_bars(directory / "figure_8.png", found, colours)
+            axes.axvline(value, c=colours[name], ls=":", lw=1.0)
+        axes.set(xscale="log", xlabel=label, ylabel="share of targets", ylim=(0.0, 1.0))
+        axes.set_title(f"{shown}; dotted: means of the paper's figure {number}")
+        axes.grid(visible=True, alpha=0.3)
+        axes.legend(fontsize=8)
+        save_picture(figure, directory / f"figure_{number}.png")
+    _draw_bars(directory / "rooms.png", found, colours)
 
 
 def _draw_bars(

@@ -26,6 +26,7 @@ from magfusion.simulation.disturbance import (
     DayNight,
     FieldDrift,
     Spheres,
+    draw_bending,
     draw_smooth,
     draw_spheres,
 )
@@ -366,3 +367,46 @@ def test_a_room_adds_its_background_to_the_waveform_turned_into_the_sensor() -> 
     turn = still().world_from_body(np.zeros(1))[0].as_matrix()
     turn = turn @ site.platform.magnetometer.body_from_sensor
     np.testing.assert_allclose(wave.measured_sensor / 1e-8, world @ turn / 1e-8, atol=1e-9)
+
+
+def test_a_bent_field_is_off_by_its_share_and_alike_nearby() -> None:
+    rng = np.random.default_rng(3)
+    start = rng.uniform(0.0, 3.0, (4500, 3))
+    phasor = rng.standard_normal((4500, 2, 3)) + 1j * rng.standard_normal((4500, 2, 3))
+    error: list[list[Array]] = [[], []]
+    for seed in range(6):
+        bending = draw_bending(np.random.default_rng(seed), 0.04, 0.5, 2)
+        for kept, place in zip(error, (start, start + np.array([0.5, 0.0, 0.0])), strict=True):
+            kept.append(bending.bent_world(1, phasor, place) - phasor)
+    size = np.linalg.norm(np.array(error[0])) / np.linalg.norm(phasor) / np.sqrt(6.0)
+    assert size == pytest.approx(0.04, rel=0.1)
+    alike = np.vdot(error[0], error[1]).real / np.vdot(error[0], error[0]).real
+    assert alike == pytest.approx(np.exp(-0.5), abs=0.05)  # a correlation length apart
+    other = draw_bending(np.random.default_rng(0), 0.04, 0.5, 2).bent_world(0, phasor, start)
+    between = np.vdot(error[0][0], other - phasor) / np.linalg.norm(error[0][0]) ** 2
+    assert abs(between) < 0.2
+
+
+def test_simulate_disturbs_what_it_is_asked_to_and_nothing_else(tmp_path: Path) -> None:
+    asked = {
+        "free": [],
+        "noisy": ["--ambient", "day-night"],
+        "drifting": ["--drift", "1e-7"],
+        "bent": ["--random-field", "0.1"],
+    }
+    for name, options in asked.items():
+        run_command("simulate", "-o", tmp_path / name, "--duration", 4, "--no-perturb", *options)
+    logs = {name: read_log(tmp_path / name) for name in asked}
+    waves = {name: log.waveform.measured_sensor for name, log in logs.items() if log.waveform}
+    for log in logs.values():
+        np.testing.assert_array_equal(log.imu.gyro_body, logs["free"].imu.gyro_body)
+    bent = waves["bent"] - waves["free"]  # the same noise: the difference is the field's
+    spectrum = np.abs(np.fft.rfft(bent * np.hanning(len(bent))[:, None], axis=0)).sum(axis=1)
+    tones = np.fft.rfftfreq(len(bent), logs["bent"].waveform.time[1])[
+        spectrum > 0.1 * spectrum.max()
+    ]
+    assert np.all((tones > 15.0) & (tones < 50.0))
+    loud = np.diff(waves["noisy"] - waves["free"], axis=0)
+    assert np.std(loud) / np.sqrt(2.0) > 2e-10 * np.sqrt(200.0)
+    slow = np.linalg.norm(np.mean(waves["drifting"] - waves["free"], axis=0))
+    assert 1e-9 < slow < 5e-7

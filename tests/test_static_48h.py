@@ -132,6 +132,26 @@ def test_a_clock_turns_the_phasors_and_nothing_else() -> None:
     np.testing.assert_allclose(np.abs(fast), np.abs(still), rtol=1e-9)
 
 
+def test_a_drift_across_a_larger_constant_error_shows_in_its_component_alone() -> None:
+    days, rng = COARSE.time / 86_400.0, np.random.default_rng(4)
+    worlds = []
+    for _ in range(8):
+        off = 0.05 * rng.standard_normal((len(days), 3)) * [0.01, 0.01, 0.01] + [0.1, 0.0, 0.0]
+        off[:, 2] += 0.005 * days
+        turn = 0.2 * rng.standard_normal((len(days), 3))
+        worlds.append({("case", "method"): Errors(off, turn)})
+    (row,) = static_48h.summarise(COARSE, worlds)
+    assert row.position_components is not None
+    assert row.attitude_components is not None
+    assert row.position_components.per_day[2] == pytest.approx(0.005, rel=0.1)
+    assert row.position_slope < 0.1 * row.position_components.per_day[2]
+    assert row.position_components.drifts(2)
+    assert not row.attitude_components.drifts(2)
+    assert "position DRIFTS" in static_48h.report(COARSE, (row,))
+    few = static_48h.summarise(COARSE, worlds[:2])
+    assert "no verdict" in static_48h.report(COARSE, few)
+
+
 def test_slopes_are_those_of_the_settled_part() -> None:
     days = COARSE.time / 86_400.0
     error = np.where(SETTLED, 0.3 + np.array([[0.02], [-0.5]]) * days, 99.0)

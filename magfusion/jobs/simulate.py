@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 
 LARGEST_BOX, SMALLEST_BOX = 1e5, 1e-3  # m
+DRIFT_TIME = 600.0  # s
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,6 +30,25 @@ class SimulateSettings(RandomSettings):
     box: str | None = option(None, "Room to move in, m: xmin,xmax,ymin,ymax,zmin,zmax")
     perturb: bool = option(True, "Draw the true calibration from the site's sigmas")
     iron: int = option(0, "Steel spheres about the room, 0.5 m from it or more", least=0, most=200)
+    ambient: Literal["quiet", "day-night"] = option(
+        "quiet",
+        "White noise of the surroundings",
+        note="day-night: 0.2 nT/sqrt(Hz) at night, 0.4 at 14:00 UTC",
+    )
+    drift: float = option(
+        0.0,
+        "Random change of the steady field within ten minutes, rms",
+        unit="T",
+        least=0,
+        most=1e-4,
+    )
+    random_field: float = option(
+        0.0,
+        "Smooth random error of each beacon's field, rms share of it",
+        least=0.0,
+        most=1.0,
+        note="alike within the site's model_error_correlation_m",
+    )
 
 
 def box_option(text: str | None) -> Array | None:
@@ -62,7 +82,8 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
     """Simulate a log as the settings ask; see `run_simulate`."""
     from magfusion.files.site import load_site
     from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
-    from magfusion.simulation.log import SimulationConfig
+    from magfusion.simulation.disturbance import Ambient, FieldDrift, office_noise
+    from magfusion.simulation.log import EPOCH_NS, SimulationConfig
 
     site = demo_site() if settings.site is None else load_site(settings.site)
     box = box_option(settings.box)
@@ -72,6 +93,11 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
         motion=settings.motion,
         perturb=settings.perturb,
         iron=settings.iron,
+        random_field=settings.random_field,
+        ambient=Ambient(
+            day_night=office_noise(EPOCH_NS) if settings.ambient == "day-night" else None,
+            drift=FieldDrift(settings.drift, DRIFT_TIME) if settings.drift else None,
+        ),
     )
     return run_simulate(site, config, output, settings.seed)
 
@@ -115,6 +141,7 @@ def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) 
             Figure("imu_samples", len(simulated.log.imu), label="IMU samples"),
             Figure("time_offset_s", simulated.time_offset, "s", section=Section.REPORT),
             Figure("iron_spheres", config.iron),
+            Figure("random_field", config.random_field, section=Section.REPORT),
         )
     )
     with claimed as directory:

@@ -7,15 +7,17 @@ from scipy.interpolate import CubicSpline
 
 from magfusion.errors import InputError
 from magfusion.model.physics.disturbance import induced_field, sphere_polarizability
-from magfusion.units import Array, ComplexArray
+from magfusion.units import AnyArray, Array, ComplexArray
 
 DAY = 86_400.0  # s
+LOUDEST = 14.0 * 3600.0  # s of a day
 CLEARANCE = 0.5  # m from the surface of drawn iron to where the body moves, and to every beacon
 REACH = 0.5  # m beyond that clearance within which iron is drawn where nothing is said
 STEEL_PERMEABILITY = 100.0
 STEEL_CONDUCTIVITY = 5e6  # S/m
 _ATTEMPTS = 200  # to place one sphere
 _FEATURES = 512
+_POINTS = 4096  # of which that many features are held at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,6 +184,43 @@ def draw_smooth(
     return SmoothField(wave, amplitude[0], amplitude[1])
 
 
+@dataclass(frozen=True, eq=False)
+class Bending:
+    """A smooth random 3 x 3 matrix of place for each beacon, added to unity.
+
+    Parameters
+    ----------
+    matrix : SmoothField
+        Of place (m), world axes; nine functions a beacon, the matrix's rows one after the other.
+    """
+
+    matrix: SmoothField
+
+    def bent_world(self, beacon: int, phasors_world: ComplexArray, point_world: Array) -> AnyArray:
+        """Return the phasors (n, tones, 3) of a beacon, by its number, at points (n, 3)."""
+        own = slice(9 * beacon, 9 * beacon + 9)
+        one = SmoothField(self.matrix.wave, self.matrix.cosine[:, own], self.matrix.sine[:, own])
+        bent = np.array(phasors_world)
+        for first in range(0, len(point_world), _POINTS):
+            few = slice(first, first + _POINTS)
+            matrix = one(point_world[few]).reshape(-1, 3, 3)
+            bent[few] += np.einsum("nij,ntj->nti", matrix, phasors_world[few])
+        return bent
+
+
+def draw_bending(rng: np.random.Generator, rms: float, length: float, beacons: int) -> Bending:
+    """Return a random bending.
+
+    Parameters
+    ----------
+    rms : float
+        What it adds to a field, as a share of the field's size.
+    length : float
+        Over which it stays much the same (m).
+    """
+    return Bending(draw_smooth(rng, rms / np.sqrt(3.0), length, 9 * beacons))
+
+
 @dataclass(frozen=True)
 class DayNight:
     """White noise of the surroundings, quiet at night and loud by day, along a cosine.
@@ -202,6 +241,15 @@ class DayNight:
         """Return the one-sided density (T/sqrt(Hz)) at the times, shape (n,)."""
         share = 0.5 + 0.5 * np.cos(2.0 * np.pi * (time - self.loudest_time) / DAY)
         return self.night + (self.day - self.night) * share
+
+
+def office_noise(epoch_ns: int) -> DayNight:
+    """Return 2 nT rms of 200 samples a second at night and 4 nT at two in the afternoon (UTC).
+
+    Paper 004 has 3 nT.
+    """
+    midnight = epoch_ns / 1e9 % DAY
+    return DayNight(2e-10, 4e-10, (LOUDEST - midnight) % DAY)
 
 
 @dataclass(frozen=True)
@@ -225,6 +273,7 @@ class Ambient:
     """Everything in the room beside beacons, Earth and mains; what is None is not there."""
 
     spheres: Spheres | None = None
+    bending: Bending | None = None
     day_night: DayNight | None = None
     drift: FieldDrift | None = None
 

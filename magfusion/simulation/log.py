@@ -14,7 +14,7 @@ from magfusion.model.physics.earth import earth_field_world
 from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Beacon, Magnetometer, Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.simulation.disturbance import Ambient, Spheres, draw_spheres
+from magfusion.simulation.disturbance import Ambient, Spheres, draw_bending, draw_spheres
 from magfusion.simulation.field import Drives, phasors_world, synchronised_drives
 from magfusion.simulation.inertial import BiasInstability, simulate_imu
 from magfusion.simulation.motion import (
@@ -65,6 +65,9 @@ class SimulationConfig:
     iron : int
         Steel spheres drawn around the box, by `magfusion.simulation.disturbance.draw_spheres`;
         where there are any they take the place of the ambient's.
+    random_field : float
+        Smooth random error of each beacon's field, as a share of it, alike within the site's
+        ``model_error_length``; where there is one it takes the place of the ambient's bending.
     """
 
     box_world: Array
@@ -83,6 +86,7 @@ class SimulationConfig:
     instability: BiasInstability | None = None
     ambient: Ambient | None = None
     iron: int = 0
+    random_field: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,21 +122,21 @@ class SimulatedLog:
 def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator) -> SimulatedLog:
     """Return a simulated log of a body moving among the beacons of a site.
 
-    Calibration, motion, IMU, magnetometer and iron have generators of their own, spawned from it:
-    a change to one leaves the draws of the others as they were.
+    Calibration, motion, IMU, magnetometer, iron and random field have generators of their own,
+    spawned from it: a change to one leaves the draws of the others as they were.
 
     Raises
     ------
     InputError
         If the configuration or the site cannot be simulated.
     """
-    calibration_rng, motion_rng, imu_rng, magnetometer_rng, iron_rng = rng.spawn(5)
+    calibration_rng, motion_rng, imu_rng, magnetometer_rng, iron_rng, field_rng = rng.spawn(6)
     declared = _with_earth_field(site)
     true_site = perturb_site(declared, calibration_rng) if config.perturb else declared
     true_site = _with_instruments(true_site, config)
     drives = draw_drives(true_site, calibration_rng)
     motion = _motion(config, motion_rng)
-    ambient = _with_iron(true_site, config, iron_rng)
+    ambient = _with_bending(true_site, config, field_rng, _with_iron(true_site, config, iron_rng))
     imu = simulate_imu(
         motion,
         true_site.platform.imu,
@@ -326,6 +330,21 @@ def _with_iron(site: Site, config: SimulationConfig, rng: np.random.Generator) -
     beacons_world = np.array([beacon.position_world for beacon in site.beacons]).reshape(-1, 3)
     spheres = draw_spheres(rng, config.iron, config.box_world, beacons_world)
     return replace(config.ambient or Ambient(), spheres=spheres)
+
+
+def _with_bending(
+    site: Site, config: SimulationConfig, rng: np.random.Generator, ambient: Ambient | None
+) -> Ambient | None:
+    if config.random_field == 0.0:
+        return ambient
+    length = site.model_error_length
+    if length == 0.0:
+        raise InputError(
+            "model_error_correlation_m: found 0; give the site a length over which the random"
+            " field stays alike"
+        )
+    bending = draw_bending(rng, config.random_field, length, len(site.beacons))
+    return replace(ambient or Ambient(), bending=bending)
 
 
 def _motion(config: SimulationConfig, rng: np.random.Generator) -> Motion:

@@ -7,7 +7,7 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.model.samples import Waveform
 from magfusion.model.site import Site
-from magfusion.simulation.disturbance import Ambient, Spheres
+from magfusion.simulation.disturbance import Ambient
 from magfusion.simulation.field import Drives, phasors_world
 from magfusion.simulation.motion import Motion
 from magfusion.simulation.slots import check_slots, slot_gates
@@ -66,7 +66,7 @@ def simulate_waveform(
     quantisation : float, optional
         Step of the instrument (T).
     ambient : Ambient, optional
-        Iron, noise and drift of the room.
+        Iron, bending, noise and drift of the room.
 
     Raises
     ------
@@ -85,8 +85,7 @@ def simulate_waveform(
     world_from_body = motion.world_from_body(time)
     lever_world = world_from_body.apply(magnetometer.position_body)
     point_world = motion.position_world(time) + lever_world
-    spheres = None if ambient is None else ambient.spheres
-    field_world = _beacons_world(site, drives, time, point_world, spheres)
+    field_world = _beacons_world(site, drives, time, point_world, ambient or Ambient())
     if site.earth_field_world is not None:
         field_world += site.earth_field_world
     if mains is not None:
@@ -113,12 +112,14 @@ def _check_tones(site: Site, rate_hz: float) -> None:
 
 
 def _beacons_world(
-    site: Site, drives: Drives, time: Array, point_world: Array, spheres: Spheres | None
+    site: Site, drives: Drives, time: Array, point_world: Array, ambient: Ambient
 ) -> Array:
     field_world = np.zeros((len(time), 3))
     first = 0
-    for beacon, drift in zip(site.beacons, drives.drift, strict=True):
-        phasors = phasors_world(beacon, point_world, spheres)
+    for i, (beacon, drift) in enumerate(zip(site.beacons, drives.drift, strict=True)):
+        phasors = phasors_world(beacon, point_world, ambient.spheres)
+        if ambient.bending is not None:
+            phasors = ambient.bending.bent_world(i, phasors, point_world)
         gates = slot_gates(beacon, time)
         for k, frequency_hz in enumerate(beacon.tone_frequencies_hz):
             turns = 2.0 * np.pi * frequency_hz * (1.0 + drift) * time
