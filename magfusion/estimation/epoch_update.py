@@ -87,7 +87,8 @@ class EpochUpdate:
         said = Judgement(start.trust.reasons, turn=start.turn, shift=start.shift)
         self.witness.begin(start.state.time, said)
         self.score.begin(start.score, start.state.time)
-        return self._judged(start.state, None)
+        fitted = [f for f in start.trust.remarks if f.code == "fitted_line" and start.beside]
+        return self._judged(start.state, None).beside(*fitted)
 
     def take_in(
         self,

@@ -10,6 +10,7 @@ import numpy as np
 
 from magfusion.estimation.initialization.online import OnlineStart
 from magfusion.estimation.integrity.detection import DetectionFilter
+from magfusion.estimation.integrity.freeze import Freeze
 from magfusion.estimation.measurements.earth import EarthField, earth_measurement
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.model_error import alike_online
@@ -85,6 +86,8 @@ class Arrivals:
         When fields were last measured (s).
     unseen : int
         Windows in which the inertial stream is silent.
+    frozen : int
+        Inertial samples that were left out because the IMU hung.
     stand_in : StandIn
         What takes its place there.
     """
@@ -100,7 +103,10 @@ class Arrivals:
     usual: float | None
     last_epoch: float
     unseen: int
+    frozen: int
     stand_in: StandIn
+    _gyro: Freeze
+    _accel: Freeze
     _detection: DetectionFilter
     _window: int | None  # at the state that is to be predicted
     _noise: list[Array]
@@ -119,6 +125,7 @@ class Arrivals:
         self.last_epoch = -np.inf
         self._detection = DetectionFilter()
         self.unseen, self.stand_in = 0, StandIn()
+        self.frozen, self._gyro, self._accel = 0, Freeze(), Freeze()
         self._noise, self._noise_unseen = [], False
 
     # What goes in
@@ -127,7 +134,11 @@ class Arrivals:
         """Take inertial samples, as `Navigator.add_imu`."""
         stamps = np.atleast_1d(time)
         check_clock("imu", stamps, self._newest)
-        self.imu.add(stamps, np.hstack([np.atleast_2d(gyro_body), np.atleast_2d(accel_body)]))
+        rows = np.hstack([np.atleast_2d(gyro_body), np.atleast_2d(accel_body)])
+        self.imu.add(stamps, rows)
+        for instrument, own in ((self._gyro, rows[:, :3]), (self._accel, rows[:, 3:])):
+            for after, until in instrument.stretches(stamps, own):
+                self.frozen += self.imu.leave_out(after, until)
 
     def add_magnetometer(self, time: Array, measured_sensor: Array) -> None:
         """Take raw samples of the magnetometer, as `Navigator.add_magnetometer`."""
@@ -200,6 +211,12 @@ class Arrivals:
         return self.imu.newest + self.applied_offset
 
     @property
+    def hung_since(self) -> float | None:
+        """Stamp since which the IMU hangs (s), on the log's clock; None where it does not."""
+        since = [one.since for one in (self._gyro, self._accel) if one.found]
+        return min(since) + self.applied_offset if since else None
+
+    @property
     def reached(self) -> float:
         """Until when everything has come (s)."""
         return min(self.inertial, self._newest_field)
@@ -212,9 +229,15 @@ class Arrivals:
     @property
     def losses(self) -> dict[str, int]:
         """What was of no use, with the reason: windows, samples."""
+        frozen = {"imu sample of a sensor that hung": self.frozen} if self.frozen else {}
         late = {f"{b.name} sample too late": b.late for b in (self.imu, self.waveform) if b.late}
         unseen = {"window without inertial samples": self.unseen} if self.unseen else {}
-        return {**{f"window: {k}": v for k, v in self.receiver.dropped.items()}, **unseen, **late}
+        return {
+            **{f"window: {k}": v for k, v in self.receiver.dropped.items()},
+            **unseen,
+            **frozen,
+            **late,
+        }
 
     # How it goes on
 
@@ -235,6 +258,8 @@ class Arrivals:
         self.others = [other for other in self.others if other[0] > time]
         self.last_epoch = time
         if start.waveform is not None:
+            if isinstance(self.receiver, LockinReceiver):
+                self.receiver.beside = start.beside
             self.receiver.begin(start.waveform, self.inertial_samples())
             self.receive(start.state, delay)
         self.forget(time)

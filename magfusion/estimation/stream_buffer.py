@@ -80,6 +80,13 @@ class Buffer:
         self._waiting.append((time[fresh], rows[fresh]))
         self.newest = max(self.newest, float(np.max(time)))
 
+    def leave_out(self, after: float, until: float) -> int:
+        """Drop what was heard after a time and up to another (s); return how many samples."""
+        time, rows = self.rows()
+        kept = (time <= after) | (time > until)
+        self._time, self._rows = time[kept], rows[kept]
+        return int(np.sum(~kept))
+
     def rows(self) -> tuple[Array, Array]:
         """Return all that is kept, in order of time; of equal stamps the first."""
         if self._waiting:

@@ -220,6 +220,7 @@ def state_content(navigator: Navigator, state: JudgedState) -> dict[str, Any]:
         "reset_counter": state.reset_counter,
         "verdict": str(state.verdict),
         "reasons": _said(state.judgement.reasons),
+        "remarks": _said(state.judgement.remarks),
         "excluded": list(state.judgement.excluded),
         "protection_level_m": state.judgement.protection_level_m,
         "protection_level_deg": state.judgement.protection_level_deg,

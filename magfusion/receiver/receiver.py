@@ -298,15 +298,21 @@ class LockinReceiver(Receiver):
     """Of tones that are sent at once: windows that overlap, long against the motion."""
 
     remembered = 0
+    # With the lines that were found beside the tones; of a checkpoint, as the others are.
+    beside: LockinSettings | None
 
     def __init__(self, site: Site, settings: LockinSettings | None = None) -> None:
         super().__init__(site)
-        self._given = settings
+        self._given, self.beside = settings, None
         self._designs: Designs | None = None
 
-    @cached_property
+    @property
     def settings(self) -> LockinSettings:
         """Window and step, chosen by the tones where they were not given."""
+        return self._chosen if self.beside is None else self.beside
+
+    @cached_property
+    def _chosen(self) -> LockinSettings:
         return default_settings(self.site) if self._given is None else self._given
 
     def check(self) -> None:

@@ -10,6 +10,7 @@ from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.initialization.handover import last_state
 from magfusion.estimation.integrity.judge import judged
 from magfusion.estimation.integrity.score import Score, score_of
+from magfusion.estimation.integrity.spectrum import beside_lines
 from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.settings import EstimatorSettings
 from magfusion.estimation.state import POSITION, ROTATION, State
@@ -18,6 +19,7 @@ from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields,
 from magfusion.model.site import Site
 from magfusion.model.trust import Trust, Verdict
 from magfusion.receiver.receiver import Receiver
+from magfusion.receiver.windows import LockinSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +36,8 @@ class OnlineStart:
         What the witnesses say of the smoothed beginning.
     score : Score, optional
         Of what the smoothed beginning holds.
+    beside : LockinSettings, optional
+        How the receiver goes on where lines are to be fitted that the site does not declare.
     turn, shift : float
         By how much more attitude (rad) and position (m) may be off for it, one sigma an axis.
     """
@@ -45,6 +49,7 @@ class OnlineStart:
     score: Score | None = None
     turn: float = 0.0
     shift: float = 0.0
+    beside: LockinSettings | None = None
 
     @property
     def ambiguous(self) -> bool:
@@ -117,8 +122,17 @@ def find_online_start(
         return NoStart("The measurements leave a direction of the motion open.")
     if trust.verdict is Verdict.FAILED:
         return NoStart(trust.reasons[0].text, trust)
+    given = settings.lockin
+    lined = given is not None and len(given.lines_hz) > 0
+    beside = given if lined else beside_lines(log, site, given)
     return OnlineStart(
-        state, log.waveform, result.rival_chi_square, trust, score, *_wider(result, honest)
+        state,
+        log.waveform,
+        result.rival_chi_square,
+        trust,
+        score,
+        *_wider(result, honest),
+        None if beside is given else beside,
     )
 
 

@@ -1,6 +1,6 @@
 """What is said of one state online, and the state with a covariance that it allows."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -44,6 +44,15 @@ class Judgement:
     def reasons(self) -> tuple[Finding, ...]:
         """The findings that cast doubt, the most important first."""
         return Trust(self.findings).reasons
+
+    @property
+    def remarks(self) -> tuple[Finding, ...]:
+        """What is said without doubt: the estimator copes with it."""
+        return Trust(self.findings).remarks
+
+    def beside(self, *findings: Finding) -> "Judgement":
+        """Return it with more to be said."""
+        return replace(self, findings=(*self.findings, *findings))
 
     def honest(self, cov: Array) -> Array:
         """Return the covariance of a state as its witnesses allow it; the same where they agree."""

@@ -1,0 +1,68 @@
+"""An instrument that hangs, noticed as its samples come: it repeats its last one for too long."""
+
+import numpy as np
+
+from magfusion.estimation.integrity.samples import CHANCE, SHORTEST_FREEZE
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import Array
+
+SAMPLES = 1e7  # of a stream, among which the chance of a false alarm is `CHANCE`
+FEWEST = 6  # samples alike in a row, at least
+
+
+class Freeze:
+    """Of one instrument, by its samples in the order in which they come.
+
+    Attributes
+    ----------
+    since : float
+        Stamp of the first sample that is as the newest is (s).
+    found : bool
+        Whether the newest sample is of an instrument that hangs.
+    """
+
+    since: float
+    found: bool
+    _sample: Array
+    _repeats: int
+    _alike: int
+    _seen: int
+
+    def __init__(self) -> None:
+        self.since, self.found = -np.inf, False
+        self._sample = np.full(3, np.nan)
+        self._repeats, self._alike, self._seen = 0, 0, 0
+
+    def stretches(self, time: Array, samples: Array) -> list[tuple[float, float]]:
+        """Return after which sample and up to which (s) samples (k, 3) only repeat it."""
+        out: dict[float, float] = {}
+        same = np.all(samples == np.vstack([self._sample, samples])[:-1], axis=1)
+        for k in range(len(time)):
+            if same[k]:
+                self._repeats += 1
+                self.found = self.found or self._too_long(float(time[k]))
+            else:
+                self._seen += 1 if self.found else 1 + self._repeats
+                self._alike += 0 if self.found else self._repeats
+                self.since, self.found, self._repeats = float(time[k]), False, 0
+            if self.found:
+                out[self.since] = float(time[k])
+        if len(time):
+            self._sample = samples[-1].copy()
+        return list(out.items())
+
+    def _too_long(self, time: float) -> bool:
+        # Instruments have steps, and may be read faster than they measure.
+        usual = min(max(self._alike / max(self._seen, 1), 1e-3), 0.97)
+        by_chance = np.log(CHANCE / SAMPLES) / np.log(usual)
+        return self._repeats >= max(by_chance, FEWEST) and time - self.since >= SHORTEST_FREEZE
+
+
+def hangs(since: float) -> Finding:
+    """Return what is to be said of an IMU that hangs since a stamp (s)."""
+    return Finding(
+        "frozen_imu",
+        f"IMU: all axes stand still since {since:.2f} s: the sensor or its driver hung. What it"
+        " repeats is left out, and bridged by the fields.",
+        Verdict.TRUSTWORTHY,
+    )
