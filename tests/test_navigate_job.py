@@ -129,7 +129,7 @@ def test_pieces_are_all_of_the_log_in_the_order_of_arrival(worked: Worked) -> No
     assert log.waveform is not None
     assert phasors is not None
     replayed = Replay(replace(log, fields=phasors))
-    pieces = [piece for _, piece in paced(replayed, 0, False)]
+    pieces = [piece for _, piece in paced(replayed.pieces(), False)]
     imu = np.concatenate([p.imu.time for p in pieces])
     waves = np.concatenate([p.waveform.time for p in pieces if p.waveform is not None])
     assert np.array_equal(imu, log.imu.time)
@@ -148,7 +148,7 @@ def test_realtime_is_paced_by_the_logs_clock(phasors: Path) -> None:
     log = read_log(phasors, 0.0, 0.6)
     began = time.monotonic()
     arrivals = [
-        (piece.arrival, time.monotonic() - began) for _, piece in paced(Replay(log), 0, True)
+        (piece.arrival, time.monotonic() - began) for _, piece in paced(Replay(log).pieces(), True)
     ]
     first = arrivals[0][0]
     for arrival, elapsed in arrivals:

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rosbags.highlevel import AnyReader
@@ -11,11 +10,13 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.files.bag_rows import Messages, Wanted, read_parts
 from magfusion.files.lost_rows import LostRows
-from magfusion.files.messages import IMU, ROWS, USUAL, refuse_absent, stamp_ns
+from magfusion.files.messages import IMU, ROWS, USUAL
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.table import LARGEST_NUMBER, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
+from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
@@ -53,7 +54,11 @@ def is_bag(path: Path) -> bool:
 
 
 def read_bag(
-    path: Path, start: float | None = None, end: float | None = None, topics: Topics | None = None
+    path: Path,
+    start: float | None = None,
+    end: float | None = None,
+    topics: Topics | None = None,
+    report: Report = quiet,
 ) -> Log:
     """Read inertial samples, magnetometer and truth of a bag.
 
@@ -66,6 +71,8 @@ def read_bag(
         Directory of a bag, or its file (``.mcap``, ``.db3``, ``.bag`` of ROS 1).
     start, end : float, optional
         Seconds since the first inertial sample.
+    report : callable
+        Told how many messages have been read.
 
     Returns
     -------
@@ -82,14 +89,13 @@ def read_bag(
     chosen = topics or Topics()
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            imu = _read(reader, path, chosen.imu, "imu")
-            field = _read(reader, path, chosen.magnetometer, "magnetometer")
-            truth = _read(reader, path, chosen.truth, "truth")
+            found = _read(reader, path, chosen, report)
     except InputError:
         raise
     except Exception as error:  # a damaged bag makes the library fail in any way whatever
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{path}: cannot be read ({reason}); record the bag again.") from error
+    imu, field, truth = (found.get(role) for role in ("imu", "magnetometer", "truth"))
     if imu is None:
         raise InputError(f"{path}: holds no messages of {IMU}; record the inertial sensor.")
     span = Span(int(imu.time_ns[0]), start, end)
@@ -110,22 +116,24 @@ def read_bag(
     )
 
 
-def _read(reader: AnyReader, path: Path, topic: str | None, role: str) -> _Stream | None:
-    rows = ROWS[role]
-    connections = _chosen(reader, path, topic, role, tuple(rows))
-    if not connections:
-        return None
-    name, msgtype = connections[0].topic, connections[0].msgtype
-    place, row = f"{path} topic {name}", rows[msgtype]
-    stamps, values = [], []
-    for _, _, raw in reader.messages(connections):
-        message: Any = reader.deserialize(raw, msgtype)
-        refuse_absent(message, place)
-        stamps.append(stamp_ns(message.header))
-        values.append(row(message))
-    if not stamps:
-        raise InputError(f"{place}: holds no messages; record it, or leave it out.")
-    return _sorted(place, msgtype, np.array(stamps), np.array(values, dtype=np.float64))
+def _read(reader: AnyReader, path: Path, topics: Topics, report: Report) -> dict[str, _Stream]:
+    """Return the streams by their roles, of one pass over the bag."""
+    wanted: dict[str, Wanted] = {}
+    for role, rows in ROWS.items():
+        connections = _chosen(reader, path, getattr(topics, role), role, tuple(rows))
+        if connections:
+            row, place = rows[connections[0].msgtype], f"{path} topic {connections[0].topic}"
+            wanted[role] = Wanted(place, connections, row)
+    parts: dict[str, list[Messages]] = {role: [] for role in wanted}
+    for role, part in read_parts(reader, wanted, report):
+        parts[role].append(part)
+    found = {}
+    for role, one in wanted.items():
+        if not parts[role]:
+            raise InputError(f"{one.place}: holds no messages; record it, or leave it out.")
+        stamps, values = (np.concatenate(column) for column in zip(*parts.pop(role), strict=True))
+        found[role] = _sorted(one.place, one.connections[0].msgtype, stamps, values)
+    return found
 
 
 def _chosen(
@@ -154,9 +162,10 @@ def _chosen(
 
 
 def _sorted(place: str, msgtype: str, stamps: IntArray, values: Array) -> _Stream:
-    # A bag keeps the order of arrival, which the network may have changed.
-    order = np.argsort(stamps, kind="stable")
-    stamps, values = stamps[order], values[order]
+    if np.any(np.diff(stamps) < 0):
+        # A bag keeps the order of arrival, which the network may have changed.
+        order = np.argsort(stamps, kind="stable")
+        stamps, values = stamps[order], values[order]
     bad = ~(np.abs(values) < LARGEST_NUMBER).all(axis=1) & ~np.isnan(values).any(axis=1)
     if bad.any():
         stamp = stamps[np.argmax(bad)]

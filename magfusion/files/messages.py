@@ -9,6 +9,8 @@ IMU = "sensor_msgs/msg/Imu"
 FIELD = "sensor_msgs/msg/MagneticField"
 ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseStamped"
+SURE_POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
 USUAL = (IMU, FIELD, ODOMETRY, POSE)  # taken before others that play the same role
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 # ROS 1 had it in a package of its own before.
@@ -59,8 +61,8 @@ ROWS: dict[str, dict[str, Row]] = {
     "truth": {
         ODOMETRY: _odometry_row,
         POSE: _pose_row,
-        "geometry_msgs/msg/PoseWithCovarianceStamped": _sure_pose_row,
-        "geometry_msgs/msg/TransformStamped": transform_row,
+        SURE_POSE: _sure_pose_row,
+        TRANSFORM: transform_row,
     },
 }
 

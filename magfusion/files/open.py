@@ -6,6 +6,7 @@ from magfusion.errors import InputError
 from magfusion.files.bag import Topics, is_bag, read_bag
 from magfusion.files.euroc import is_euroc, read_euroc
 from magfusion.files.log import HEADER, is_log, read_log
+from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import Log
 
 
@@ -14,6 +15,7 @@ def open_log(
     start: float | None = None,
     end: float | None = None,
     topics: Topics | None = None,
+    report: Report = quiet,
 ) -> Log:
     """Read a log, an EuRoC folder or a bag, whichever the path is.
 
@@ -23,6 +25,8 @@ def open_log(
         The part with start <= time < end, in seconds since the log's epoch.
     topics : Topics, optional
         Of a bag that has several of one type.
+    report : callable
+        Told how much of a bag has been read.
 
     Raises
     ------
@@ -37,7 +41,7 @@ def open_log(
     if is_euroc(path):
         return read_euroc(path, start, end)
     if is_bag(path):
-        return read_bag(path, start, end, topics)
+        return read_bag(path, start, end, topics, report)
     raise InputError(
         f"{path}: is no log: found neither {HEADER}, nor mav0/imu0/data.csv (EuRoC), nor"
         " metadata.yaml, .mcap, .db3 or .bag (bags of ROS); give the path of one of them, or bring"

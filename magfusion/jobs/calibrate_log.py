@@ -117,7 +117,7 @@ def run_calibrate_log(
             raise InputError("--cross-validate divides one log; several were given")
         return run_joint(JOB, settings, smoother, output, report)
     claimed = claim(output, JOB)
-    log, site = read_job(job, unknown=True)
+    log, site = read_job(job, unknown=True, report=report)
     cuts = _cuts(job, log, site, settings.cross_validate)
     with named(job.log_path):
         result, placed = smooth_and_place(log, site, smoother, report)

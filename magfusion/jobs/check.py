@@ -46,7 +46,7 @@ def run_check(
     job = settings.job(Path() if output is None else output)
     began = time.perf_counter()
     report("reading", 0, 3)
-    log, site = read_recording(job)
+    log, site = read_recording(job, report)
     report("checking", 1, 3)
     lockin = None if site is None or not site.beacons else settings.lockin(job)
     look = first_look(log, site, lockin)

@@ -36,7 +36,7 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
 
     claimed, job = claim(output, "demodulate"), settings.job(output)
     lockin = settings.lockin(job)
-    log, site = read_job(job)
+    log, site = read_job(job, report=report)
     if log.waveform is None:
         raise InputError(
             f"{job.log_path}: holds no magnetometer.parquet to demodulate; give the raw log"

@@ -125,7 +125,7 @@ def run_fix(
 
     risk = Risk() if risk is None else risk
     claimed = claim(job.output, "smooth", "fix")
-    log, site = read_job(job)
+    log, site = read_job(job, report=report)
     began = time.perf_counter()
     report("demodulating", 0, 3)
     with named(job.log_path):

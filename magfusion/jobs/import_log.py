@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -127,11 +128,13 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
     _refuse(told)
     with claimed as directory:
         counts: dict[str, Counts] = {}
-        for k, (stream, plan) in enumerate(found.plans.items()):
-            report(f"importing {stream}", k, len(found.plans) + 1)
+        for stream, plan in found.plans.items():
+            told_of = partial(_tell, report, stream, plan)
+            told_of(0)
             try:
                 shared = sum(p.source is plan.source for p in found.plans.values()) > 1
-                counts[stream] = write_stream(plan, directory / f"{stream}.parquet", shared)
+                path = directory / f"{stream}.parquet"
+                counts[stream] = write_stream(plan, path, shared, told_of)
             except InputError as error:
                 told.problems.append(str(error))
         note = ""
@@ -142,12 +145,16 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
         _refuse(told)
         epoch_ns = counts["imu"].first if epoch == FIRST else int(epoch)
         _write_header(directory, output, found, epoch_ns)
-        report("checking", len(found.plans), len(found.plans) + 1)
+        report("checking", 0, 1)
         figures = _checked(directory, output, found, settings.site)
         figures = heading("import", output.resolve().name) | figures
         figures |= _figures(found, counts, epoch_ns, epoch == FIRST, note)
         write_report(directory, figures)
     return figures
+
+
+def _tell(report: Report, stream: str, plan: Plan, rows: int) -> None:
+    report(f"importing {stream}", rows, max(plan.source.count, rows + 1))
 
 
 def _refuse(told: Findings) -> None:

@@ -22,6 +22,7 @@ from magfusion.files.open import open_log
 from magfusion.files.site import load_site
 from magfusion.files.trajectory_table import read_trajectory
 from magfusion.files.tum import read_tum
+from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -221,7 +222,7 @@ def read_site(job: Job, *, unknown: bool = False) -> Site:
     return load_site(job.declared_path, unknown=unknown)
 
 
-def read_job(job: Job, *, unknown: bool = False) -> tuple[Log, Site]:
+def read_job(job: Job, *, unknown: bool = False, report: Report = quiet) -> tuple[Log, Site]:
     """Read the log and the site of a job, and see that they belong together.
 
     Parameters
@@ -235,7 +236,7 @@ def read_job(job: Job, *, unknown: bool = False) -> tuple[Log, Site]:
         For anything in either file that a user must correct.
     """
     site = read_site(job, unknown=unknown)
-    log = _open(job)
+    log = _open(job, report)
     if log.waveform is not None:
         with named(job.declared_path):
             Receiver.of(site).check()
@@ -246,7 +247,7 @@ def read_job(job: Job, *, unknown: bool = False) -> tuple[Log, Site]:
     return log, site
 
 
-def read_recording(job: Job) -> tuple[Log, Site | None]:
+def read_recording(job: Job, report: Report = quiet) -> tuple[Log, Site | None]:
     """Read a log, and its site where there is one: a log alone can be judged too.
 
     Raises
@@ -256,13 +257,13 @@ def read_recording(job: Job) -> tuple[Log, Site | None]:
     if job.site_path is not None or job.declared_path.is_file():
         site = load_site(job.declared_path, unknown=True, without=True)
         if site.beacons:
-            return read_job(job, unknown=True)
-        return _open(job), site
-    return open_log(job.log_path, job.start, job.end, job.topics), None
+            return read_job(job, unknown=True, report=report)
+        return _open(job, report), site
+    return open_log(job.log_path, job.start, job.end, job.topics, report), None
 
 
-def _open(job: Job) -> Log:
-    log = open_log(job.log_path, job.start, job.end, job.topics)
+def _open(job: Job, report: Report = quiet) -> Log:
+    log = open_log(job.log_path, job.start, job.end, job.topics, report)
     if log.waveform is None and log.fields is None:
         raise InputError(
             f"{job.log_path}: holds no magnetometer samples in the part to use; record the"

@@ -177,7 +177,7 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
         claim_rows(_rows_path(path))
         if path != place or not settings.resume:
             claim_checkpoint(path)
-    log, site = read_job(job)
+    log, site = read_job(job, report=report)
     navigator = replace(navigator, lockin=beside_lines(log, site, navigator.lockin))
     if settings.earth and log.waveform is None:
         raise InputError(
@@ -306,7 +306,7 @@ def _advance(run: NavigateRun, settings: NavigateSettings, report: Report) -> No
 
     began = time.perf_counter() - run.elapsed
     every, told = max(1, round(settings.every / PIECE)), -np.inf
-    for k, piece in paced(run.replay, run.position, settings.realtime):
+    for k, piece in paced(run.replay.pieces(run.position), settings.realtime):
         if k % every == 0 and k > run.position:
             _save(run, k, time.perf_counter() - began)
         running = run.navigator.started

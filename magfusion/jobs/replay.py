@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -14,6 +14,7 @@ from magfusion.units import Array, IntArray
 
 if TYPE_CHECKING:
     from magfusion.estimation.navigator import Navigator
+    from magfusion.files.long_log import LongLog
     from magfusion.files.stream import Format
     from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
 
@@ -83,6 +84,11 @@ class Replay:
             fields=() if fields is None else tuple(fields.rows(slice(i, i + 1)) for i in rows),
         )
 
+    def pieces(self, first: int = 0) -> Iterator[tuple[int, Piece]]:
+        """Yield the pieces from the first on with their number."""
+        for k in range(first, len(self)):
+            yield k, self.piece(k)
+
 
 def feed(navigator: Navigator, piece: Piece) -> None:
     """Give a piece to a navigator."""
@@ -94,13 +100,12 @@ def feed(navigator: Navigator, piece: Piece) -> None:
         navigator.add_fields(samples)
 
 
-def paced(replay: Replay, first: int, realtime: bool) -> Iterator[tuple[int, Piece]]:
-    """Yield the pieces from the first on with their number, by the log's clock where asked."""
-    began = 0.0
-    for k in range(first, len(replay)):
-        piece = replay.piece(k)
+def paced(pieces: Iterable[tuple[int, Piece]], realtime: bool) -> Iterator[tuple[int, Piece]]:
+    """Yield pieces with their number, by the log's clock where asked."""
+    began: float | None = None
+    for k, piece in pieces:
         now = time.monotonic()
-        if k == first:
+        if began is None:
             began = now - piece.arrival
         if realtime and piece.arrival > now - began:
             time.sleep(piece.arrival - (now - began))
@@ -117,8 +122,34 @@ def _field_arrival(fields: FieldSamples | None) -> Array:
     return np.asarray(np.maximum.accumulate(fields.time + fields.window / 2.0))
 
 
-def run_replay(log: Log, sink: BinaryIO, form: Format, realtime: bool) -> None:
+def _of_long(log: LongLog) -> Iterator[tuple[int, Piece]]:
+    """Yield the pieces of a log that is read while they are used."""
+    from magfusion.model.samples import ImuSamples, Waveform
+
+    imu, waveform = log.imu(), log.waveform()
+    arrival = _field_arrival(log.fields)
+    known = [first for first in (imu.first, waveform.first) if first is not None]
+    first, k, row = min([*known, *arrival[:1].tolist()]), 0, 0
+    while not (imu.ended and waveform.ended and row == len(arrival)):
+        edge = first + PIECE * float(k + 1)
+        due = int(np.searchsorted(arrival, edge))
+        fields = () if log.fields is None else tuple(log.fields.rows(slice(row, due)).epochs())
+        time_imu, values = imu.until(edge)
+        yield (
+            k,
+            Piece(
+                arrival=edge,
+                imu=ImuSamples(time_imu, values[:, :3], values[:, 3:]),
+                waveform=Waveform(*waveform.until(edge)),
+                fields=fields,
+            ),
+        )
+        k, row = k + 1, due
+
+
+def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool) -> None:
     """Write a log as the records of a stream, in the order of their arrival."""
+    from magfusion.files.long_log import LongLog
     from magfusion.files.stream import (
         fields_content,
         imu_content,
@@ -126,8 +157,8 @@ def run_replay(log: Log, sink: BinaryIO, form: Format, realtime: bool) -> None:
         write_record,
     )
 
-    replay = Replay(log)
-    for _, piece in paced(replay, 0, realtime):
+    pieces = _of_long(log) if isinstance(log, LongLog) else Replay(log).pieces()
+    for _, piece in paced(pieces, realtime):
         if len(piece.imu):
             write_record(imu_content(piece.imu), sink, form)
         if piece.waveform is not None and len(piece.waveform):
@@ -146,12 +177,14 @@ class ReplaySettings(PartSettings, ReplayedSettings):
 
 def run(settings: ReplaySettings) -> None:
     """Print a log as records; see `run_replay`."""
+    from magfusion.files.long_log import long_log
     from magfusion.files.open import open_log
     from magfusion.files.standard_streams import binary_output, until_closed
     from magfusion.jobs.inputs import topics_option
 
     sink = binary_output()
-    found = open_log(settings.log, settings.start, settings.end, topics_option(settings.topics))
+    part, topics = (settings.start, settings.end), topics_option(settings.topics)
+    found = long_log(settings.log, *part) or open_log(settings.log, *part, topics)
     with until_closed():
         run_replay(found, sink, settings.form, settings.realtime)
 

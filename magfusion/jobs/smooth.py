@@ -110,7 +110,7 @@ def run_smooth(
     from magfusion.results.report import FAILED
 
     claimed = claim(job.output, "smooth", "fix")
-    log, site = read_job(job, unknown=True)
+    log, site = read_job(job, unknown=True, report=report)
     began = time.perf_counter()
     try:
         with named(job.log_path):

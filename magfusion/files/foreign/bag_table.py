@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.files.bag_rows import Messages, Wanted, read_parts
 from magfusion.files.foreign.columns import STREAMS, TIME, VELOCITY, Entry, Term
 from magfusion.files.foreign.plan import Findings, Plan, Terms
 from magfusion.files.foreign.source import ROWS, Column, Part, Source
@@ -22,14 +24,13 @@ from magfusion.files.messages import (
     ODOMETRY,
     TRANSFORMS,
     USUAL,
-    refuse_absent,
     stamp_ns,
     transform_row,
 )
 from magfusion.files.messages import (
-    ROWS as MESSAGES,
+    ROWS as ROW_OF,
 )
-from magfusion.units import Array
+from magfusion.units import Array, IntArray
 
 _POSE = ("position_x", "position_y", "position_z", "qx", "qy", "qz", "qw")
 _COLUMNS = {
@@ -124,7 +125,9 @@ def plan_bag(
                         f" {accepted(STREAMS['magnetometer']['field_x'])}."
                     )
                 else:
-                    plans.append(_plan(path, role, topic, unit))
+                    own = [c for c in reader.connections if c.topic == topic.name]
+                    count = sum(connection.msgcount for connection in own)
+                    plans.append(_plan(path, role, topic, unit, count))
     return plans
 
 
@@ -143,7 +146,7 @@ def _chosen(
                 f" {role}=/topic."
             )
             return None
-    fitting = [(name, kind) for name, kind in found if kind in MESSAGES[role]]
+    fitting = [(name, kind) for name, kind in found if kind in ROW_OF[role]]
     if entries:
         return _asked(path, role, entries[0], found, reader, told)
     fitting = [one for one in fitting if one[1] in USUAL] or fitting
@@ -155,7 +158,7 @@ def _chosen(
     if not fitting:
         if role != "truth":
             names = ", ".join(f"{name} ({kind})" for name, kind in found) or "none"
-            kinds = " or ".join(MESSAGES[role])
+            kinds = " or ".join(ROW_OF[role])
             told.problems.append(f"{path}: no topic is of {kinds}, for {role} (found {names}).")
         return None
     return Topic(*fitting[0])
@@ -190,9 +193,9 @@ def _asked(
             told.proposals += [f"{role}={name}:{a}->{b}" for a, b in pairs[:5]]
             return None
         return Topic(name, kind, frames)
-    if kind not in MESSAGES[role]:
+    if kind not in ROW_OF[role]:
         told.problems.append(
-            f"{path}: topic {name} is of {kind}, which is none of {', '.join(MESSAGES[role])} for"
+            f"{path}: topic {name} is of {kind}, which is none of {', '.join(ROW_OF[role])} for"
             f" {role}; name another."
         )
         return None
@@ -219,7 +222,7 @@ def _frame(name: str) -> str:
     return name.lstrip("/")
 
 
-def _plan(path: Path, role: str, topic: Topic, field_unit: Unit) -> Plan:
+def _plan(path: Path, role: str, topic: Topic, field_unit: Unit, count: int) -> Plan:
     place = f"{path} topic {topic.name}"
     columns = _COLUMNS[role]
 
@@ -237,7 +240,8 @@ def _plan(path: Path, role: str, topic: Topic, field_unit: Unit) -> Plan:
         usual[name] = (Term(k, unit),)
     if role == "truth" and not _moves(path, place, topic):
         usual = {name: terms for name, terms in usual.items() if name not in VELOCITY}
-    source = Source(place, (Column(TIME), *map(Column, columns)), read, form=topic.msgtype)
+    known = (Column(TIME), *map(Column, columns))
+    source = Source(place, known, read, form=topic.msgtype, count=count)
     return Plan(role, source, usual)
 
 
@@ -252,32 +256,47 @@ def _moves(path: Path, place: str, topic: Topic) -> bool:
     return any(values[:, len(_POSE) :].any() for _, values in _rows(path, place, "truth", topic))
 
 
-def _rows(
-    path: Path, place: str, role: str, topic: Topic
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield stamps (ns) and values of the messages of a topic."""
-    stamps: list[int] = []
-    values: list[list[float]] = []
-    row = MESSAGES[role].get(topic.msgtype)
+def _rows(path: Path, place: str, role: str, topic: Topic) -> Iterator[tuple[IntArray, Array]]:
+    """Yield stamps (ns) and values of the messages of a topic, `ROWS` at a time."""
+    row = ROW_OF[role].get(topic.msgtype)
     with _opened(path) as reader:
         connections = [c for c in reader.connections if c.topic == topic.name]
-        for _, _, raw in reader.messages(connections):
-            message: Any = reader.deserialize(raw, topic.msgtype)
-            if row is not None:
-                refuse_absent(message, place)
-                stamps.append(stamp_ns(message.header))
-                values.append(row(message))
-            else:
-                for one in message.transforms:
-                    frames = (_frame(one.header.frame_id), _frame(one.child_frame_id))
-                    if frames == topic.frames:
-                        stamps.append(stamp_ns(one.header))
-                        values.append(transform_row(one))
-            if len(stamps) >= ROWS:
-                yield np.array(stamps), _complete(role, np.array(values))
-                stamps, values = [], []
-    if stamps:
-        yield np.array(stamps), _complete(role, np.array(values))
+        if row is None:
+            parts = _transforms(reader, connections, topic)
+        else:
+            parts = (p for _, p in read_parts(reader, {role: Wanted(place, connections, row)}))
+        for part in _joined(parts):
+            yield part.stamps, _complete(role, part.values)
+
+
+def _joined(parts: Iterator[Messages]) -> Iterator[Messages]:
+    """Yield parts of at least `ROWS`, but for the last."""
+    waiting: list[Messages] = []
+    count = 0
+    for part in parts:
+        waiting.append(part)
+        count += len(part.stamps)
+        if count >= ROWS:
+            yield Messages(*map(np.concatenate, zip(*waiting, strict=True)))
+            waiting, count = [], 0
+    if waiting:
+        yield Messages(*map(np.concatenate, zip(*waiting, strict=True)))
+
+
+def _transforms(
+    reader: AnyReader, connections: Sequence[Connection], topic: Topic
+) -> Iterator[Messages]:
+    """Yield the transforms between two frames, a message at a time."""
+    for _, _, raw in reader.messages(connections):
+        message: Any = reader.deserialize(raw, topic.msgtype)
+        own = [
+            one
+            for one in message.transforms
+            if (_frame(one.header.frame_id), _frame(one.child_frame_id)) == topic.frames
+        ]
+        if own:
+            stamps = np.array([stamp_ns(one.header) for one in own])
+            yield Messages(stamps, np.array([transform_row(one) for one in own]))
 
 
 def _complete(role: str, values: Array) -> Array:

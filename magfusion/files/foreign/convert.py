@@ -1,5 +1,6 @@
 """A mapped table becomes a table of a log, part by part, and everything left out is counted."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -57,13 +58,17 @@ class Counts:
             self.left_out[reason] = self.left_out.get(reason, 0) + count
 
 
-def write_stream(plan: Plan, path: Path, shared: bool = False) -> Counts:
+def write_stream(
+    plan: Plan, path: Path, shared: bool = False, report: Callable[[int], None] | None = None
+) -> Counts:
     """Write the table of a stream as Parquet, sorted by time.
 
     Parameters
     ----------
     shared : bool
         Whether the table holds other streams, too: rows without any number of this one are theirs.
+    report : callable, optional
+        Told after each part how many rows have been read.
 
     Raises
     ------
@@ -96,6 +101,8 @@ def write_stream(plan: Plan, path: Path, shared: bool = False) -> Counts:
                 pa.table(dict(zip(schema.names, columns, strict=True))),
                 row_group_size=ROWS_PER_GROUP,
             )
+            if report is not None:
+                report(counts.read)
     if counts.unsorted:
         _sort(path, counts)
     _check(plan, counts)

@@ -62,6 +62,8 @@ class Source:
         Rows of each column where they may differ, else empty.
     form : str
         How the table was understood, for the report.
+    count : int
+        Rows, as far as the format says how many; else 0.
     """
 
     place: str
@@ -70,3 +72,4 @@ class Source:
     rate_hz: float | None = None
     lengths: tuple[int, ...] = ()
     form: str = ""
+    count: int = 0

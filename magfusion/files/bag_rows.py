@@ -1,0 +1,168 @@
+"""Messages of a bag as columns of numbers, thousands at a time.
+
+Making an object of each message takes most of the time of reading a bag.  The messages of sensors
+end with nothing but doubles, and their stamps stand in the same place in all of them: both are cut
+out of the bytes.  One message of every part is read by the library, too; where the numbers are not
+the same to the last bit, or messages are not alike, the library reads them all.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+
+from magfusion.files.messages import (
+    FIELD,
+    IMU,
+    ODOMETRY,
+    POSE,
+    SURE_POSE,
+    TRANSFORM,
+    Row,
+    refuse_absent,
+    stamp_ns,
+)
+from magfusion.model.progress import Report, quiet
+from magfusion.units import Array, IntArray
+
+PART = 1 << 14  # messages whose bytes are kept
+_DOUBLE = 8  # bytes
+_STAMP = slice(4, 12)  # of a message, behind the encapsulation of CDR or the counter of ROS 1
+_LITTLE_ENDIAN = 1
+
+
+class Tail(NamedTuple):
+    """The doubles that a message ends with.
+
+    Parameters
+    ----------
+    numbers : int
+        How many there are.
+    taken : tuple of int
+        Which make a row.
+    absent : tuple of int
+        Which say by -1 that something was not measured.
+    """
+
+    numbers: int
+    taken: tuple[int, ...]
+    absent: tuple[int, ...] = ()
+
+
+_POSE = tuple(range(7))
+TAILS: dict[str, Tail] = {
+    # Orientation, rate and force, each with its covariance.
+    IMU: Tail(37, (13, 14, 15, 25, 26, 27), (16, 28)),
+    FIELD: Tail(12, (0, 1, 2)),
+    POSE: Tail(7, _POSE),
+    SURE_POSE: Tail(43, _POSE),
+    TRANSFORM: Tail(7, _POSE),
+    # Pose and twist, each with its covariance.
+    ODOMETRY: Tail(85, (*_POSE, 43, 44, 45)),
+}
+
+
+class Wanted(NamedTuple):
+    """Messages to read.
+
+    Parameters
+    ----------
+    place : str
+        What a refusal calls them.
+    connections : sequence of Connection
+        Of one topic and type.
+    row : callable
+        From a message to its numbers.
+    """
+
+    place: str
+    connections: Sequence[Connection]
+    row: Row
+
+
+class Messages(NamedTuple):
+    """Messages of a topic: stamps of their headers (ns), and their numbers, one row each."""
+
+    stamps: IntArray
+    values: Array
+
+
+def read_parts(
+    reader: AnyReader, wanted: Mapping[str, Wanted], report: Report = quiet
+) -> Iterator[tuple[str, Messages]]:
+    """Yield the messages of topics in the order of their arrival, `PART` of one at a time.
+
+    Parameters
+    ----------
+    wanted : mapping of str to Wanted
+        By the name that goes with their parts.
+
+    Raises
+    ------
+    InputError
+        Where a message is marked as not measured; or whatever the library raises of a bag that is
+        damaged.
+    """
+    name_of = {c.id: name for name, one in wanted.items() for c in one.connections}
+    every = [c for one in wanted.values() for c in one.connections]
+    waiting: dict[str, list[bytes]] = {name: [] for name in wanted}
+    total, done = sum(c.msgcount for c in every), 0
+    for connection, _, raw in reader.messages(every) if every else ():
+        name = name_of[connection.id]
+        waiting[name].append(raw)
+        if len(waiting[name]) == PART:
+            report("reading", done, total)
+            done += PART
+            yield name, _part(reader, wanted[name], waiting[name])
+            waiting[name] = []
+    for name, raws in waiting.items():
+        if raws:
+            yield name, _part(reader, wanted[name], raws)
+
+
+def _part(reader: AnyReader, wanted: Wanted, raws: list[bytes]) -> Messages:
+    msgtype = wanted.connections[0].msgtype
+    first = _told(reader, wanted, msgtype, raws[:1])
+    cut = _cut(reader.is2, TAILS.get(msgtype), raws)
+    if cut is None:
+        return _told(reader, wanted, msgtype, raws)
+    stamps, doubles, tail = cut
+    values = np.take(doubles, tail.taken, axis=1)
+    alike = stamps[0] == first.stamps[0]
+    if not (alike and np.array_equal(values[:1], first.values, equal_nan=True)):
+        return _told(reader, wanted, msgtype, raws)
+    absent = np.flatnonzero((doubles[:, tail.absent] == -1.0).any(axis=1))
+    if len(absent):
+        _told(reader, wanted, msgtype, [raws[absent[0]]])  # which refuses it
+    return Messages(stamps, values)
+
+
+def _cut(is2: bool, tail: Tail | None, raws: list[bytes]) -> tuple[IntArray, Array, Tail] | None:
+    """Return stamps and doubles of messages; None of such as cannot be cut."""
+    if tail is None:
+        return None
+    size = _DOUBLE * tail.numbers
+    if min(map(len, raws)) < _STAMP.stop + size:
+        return None
+    if is2 and {raw[1] for raw in raws} != {_LITTLE_ENDIAN}:
+        return None
+    second, fraction = (
+        np.frombuffer(b"".join([raw[_STAMP] for raw in raws]), "<u4").reshape(-1, 2).T
+    )
+    seconds = second.astype(np.int32) if is2 else second
+    stamps = seconds.astype(np.int64) * 1_000_000_000 + fraction
+    doubles = np.frombuffer(b"".join([raw[-size:] for raw in raws]), "<f8")
+    return stamps, doubles.reshape(-1, tail.numbers), tail
+
+
+def _told(reader: AnyReader, wanted: Wanted, msgtype: str, raws: list[bytes]) -> Messages:
+    """Return messages as the library reads them."""
+    stamps, values = [], []
+    for raw in raws:
+        message: Any = reader.deserialize(raw, msgtype)
+        refuse_absent(message, wanted.place)
+        stamps.append(stamp_ns(message.header))
+        values.append(wanted.row(message))
+    return Messages(np.array(stamps, dtype=np.int64), np.array(values, dtype=np.float64))
