@@ -19,6 +19,7 @@ from magfusion.units import Array, BoolArray, ComplexArray
 
 # By how much a motion that was found without an IMU errs within a window, one sigma.
 MISSED_SPIN, MISSED_PUSH = 1.5, 3.0  # rad/s^2, m/s^2
+AT_ONCE = 1 << 14  # samples that are predicted at once: what is made of them fits the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,14 +76,17 @@ def demodulate_about(
 
     offset, designs = calibration.time_offset, operator.designs
     shape = MotionShape.of(known, imu, offset, site.gravity)
-    carrier = carriers(designs.frequencies_hz, designs.time)
-    predicted, change = predicted_waveform(
-        shape.at(designs.time),
-        calibration,
-        earth,
-        carrier,
-        Motion(*shape.by_time_offset(designs.time)),
-    )
+    predicted, change = np.empty_like(measured_sensor), np.empty_like(measured_sensor)
+    for begin in range(0, len(designs.time), AT_ONCE):
+        rows = slice(begin, begin + AT_ONCE)
+        time = designs.time[rows]
+        predicted[rows], change[rows] = predicted_waveform(
+            shape.at(time),
+            calibration,
+            earth,
+            carriers(designs.frequencies_hz, time),
+            Motion(*shape.by_time_offset(time)),
+        )
     rest, left = operator.demodulate(measured_sensor - predicted)
     at_centre = predict_channels(
         calibration, states.time, states.world_from_body, states.position_world

@@ -1,6 +1,8 @@
 """The motion between states, of the IMU's shape; and how it changes with the IMU's time offset."""
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -21,6 +23,28 @@ from magfusion.model.samples import ImuSamples
 from magfusion.model.strapdown import turn_at, turn_from_gyro
 from magfusion.model.trajectory import Trajectory, interpolated
 from magfusion.units import Array
+
+MARGIN = 3  # inertial samples on either side of what is asked
+
+
+class _ByOffset(NamedTuple):
+    """What the IMU's time offset changes, at its samples (n, 3) and at the states.
+
+    Parameters
+    ----------
+    rate, rate_at_states : ndarray
+        (rad/s), world axes
+    position, velocity : ndarray
+        (m/s) and (m/s^2)
+    at_states : tuple of ndarray
+        Both, which the states hold back.
+    """
+
+    rate: Array
+    rate_at_states: Array
+    position: Array
+    velocity: Array
+    at_states: tuple[Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +106,8 @@ class MotionShape:
         at_states = turn_at(chain, time, gyro, states.time)
         known = components(Rotation.from_matrix(states.world_from_body))
         world_from_start = product(known, inverse(at_states))
-        world_from_body = product(_turn_at(states.time, world_from_start, time), chain)
+        spread = _between(world_from_start)
+        world_from_body = product(_turn_at(states.time, world_from_start, spread, time), chain)
         world_accel = turned(world_from_body, accel.T).T - [0.0, 0.0, gravity]
         velocity, position = _integrated(time, world_accel)
         return MotionShape(
@@ -112,21 +137,16 @@ class MotionShape:
         Trajectory
             Pose and velocity.
         """
-        states = self.states
-        assert states.velocity_world is not None
-        path = self.time, self.position_world, self.velocity_world
-        at_states, speed_at_states = _hermite(*path, states.time)
+        near = self._near(wanted)
+        own = self.time[near]
+        path = own, self.position_world[near], self.velocity_world[near]
         position, velocity = _hermite(*path, wanted)
-        inside = np.clip(wanted, states.time[0], states.time[-1])
-        lack, slope = _hermite(
-            states.time,
-            states.position_world - at_states,
-            states.velocity_world - speed_at_states,
-            inside,
-        )
+        known = self.states.time
+        inside = np.clip(wanted, known[0], known[-1])
+        lack, slope = _hermite(known, *self._lack, inside)
         attitude = product(
-            _turn_at(states.time, self.world_from_start, wanted),
-            turn_at(self.chain, self.time, self.gyro_body, wanted),
+            _turn_at(known, self.world_from_start, self._spread, wanted),
+            turn_at(self.chain[:, near], own, self.gyro_body[near], wanted),
         )
         beyond = (wanted - inside)[:, None]
         return Trajectory(
@@ -135,6 +155,25 @@ class MotionShape:
             position_world=position + lack + slope * beyond,
             velocity_world=velocity + slope,
         )
+
+    def _near(self, wanted: Array) -> slice:
+        """Return the inertial samples that tell of some times, with a few about them."""
+        first, last = np.searchsorted(self.time, wanted[[0, -1]])
+        return slice(max(min(first, len(self.time)) - MARGIN, 0), last + MARGIN)
+
+    @cached_property
+    def _lack(self) -> tuple[Array, Array]:
+        """What the integrated position and velocity lack at the states, shape (states, 3)."""
+        states = self.states
+        assert states.velocity_world is not None
+        path = self.time, self.position_world, self.velocity_world
+        position, velocity = _hermite(*path, states.time)
+        return states.position_world - position, states.velocity_world - velocity
+
+    @cached_property
+    def _spread(self) -> Array:
+        """The turn that is spread between each state and the next, shape (3, states - 1) (rad)."""
+        return _between(self.world_from_start)
 
     def by_time_offset(self, wanted: Array) -> tuple[Array, Array]:
         """Return the derivative of the motion by the IMU's time offset, the states where they are.
@@ -148,6 +187,18 @@ class MotionShape:
         tuple of ndarray, shape (m, 3)
             Rotation (rad/s) and position (m/s), world axes.
         """
+        near, known, late = self._near(wanted), self.states.time, self._by_offset
+        own = self.time[near]
+        inside = np.clip(wanted, known[0], known[-1])
+        held_back, slope = _hermite(known, *late.at_states, inside)
+        change = own, late.position[near], late.velocity[near]
+        by_position = _hermite(*change, wanted)[0] - held_back
+        by_position -= slope * (wanted - inside)[:, None]
+        by_rotation = interpolated(wanted, known, late.rate_at_states)
+        return by_rotation - interpolated(wanted, own, late.rate[near]), by_position
+
+    @cached_property
+    def _by_offset(self) -> "_ByOffset":
         known = self.states.time
         slow_body = self._averaged(self.gyro_body)
         rate = turned(self.world_from_body, slow_body.T).T
@@ -156,17 +207,10 @@ class MotionShape:
         force = self.accel_world + np.array([0.0, 0.0, self.gravity])
         held = interpolated(self.time, known, at_states)
         speed, moved = _integrated(self.time, cross(held.T, force.T).T)
-        change = (
-            self.time,
-            self._averaged(moved - self.velocity_world),
-            self._averaged(speed - self.accel_world),
-        )
-        inside = np.clip(wanted, known[0], known[-1])
-        held_back, slope = _hermite(known, *_hermite(*change, known), inside)
-        by_position = _hermite(*change, wanted)[0] - held_back
-        by_position -= slope * (wanted - inside)[:, None]
-        by_rotation = interpolated(wanted, known, at_states) - interpolated(wanted, self.time, rate)
-        return by_rotation, by_position
+        position = self._averaged(moved - self.velocity_world)
+        velocity = self._averaged(speed - self.accel_world)
+        held_back = _hermite(self.time, position, velocity, known)
+        return _ByOffset(rate, at_states, position, velocity, held_back)
 
     def _averaged(self, values: Array) -> Array:
         return uniform_filter1d(values, 2 * self.reach + 1, axis=0, mode="nearest")
@@ -218,16 +262,22 @@ def _hermite(known: Array, value: Array, slope: Array, wanted: Array) -> tuple[A
     )
 
 
-def _turn_at(known: Array, turn: Array, wanted: Array) -> Array:
+def _between(turn: Array) -> Array:
+    """Return the vectors of the turns between neighbours, (4, states) to (3, states - 1) (rad)."""
+    between = product(inverse(turn[:, :-1]), turn[:, 1:])
+    if not between.shape[1]:
+        return np.zeros((3, 0))
+    return np.asarray(Rotation.from_quat(between.T, scalar_first=True).as_rotvec().T)
+
+
+def _turn_at(known: Array, turn: Array, between: Array, wanted: Array) -> Array:
     """Interpolate slowly varying rotations along great circles, holding the ends.
 
-    Of shape (4, states) to shape (4, m), scalar first.
+    Of shape (4, states) to shape (4, m), scalar first; ``between`` as of `_between`.
     """
     if len(known) == 1:
         return np.repeat(turn, len(wanted), axis=1)
     inside = np.clip(wanted, known[0], known[-1])
     index = np.clip(np.searchsorted(known, inside, side="right") - 1, 0, len(known) - 2)
-    between = product(inverse(turn[:, :-1]), turn[:, 1:])
-    rotation = Rotation.from_quat(between.T, scalar_first=True).as_rotvec().T
     share = (inside - known[index]) / np.diff(known)[index]
-    return product(turn[:, index], of_vectors(share * rotation[:, index]))
+    return product(turn[:, index], of_vectors(share * between[:, index]))

@@ -20,6 +20,7 @@ from magfusion.model.prior import prior_sqrt_covariance, prior_sqrt_information
 from magfusion.units import Array, BoolArray, IntArray
 
 AT_ONCE = 2e8  # bytes; variants are solved in groups of so much
+PIECE = 512  # states whose rows are added at once
 # A prior that keeps what is open finite: far wider than anything that is of use.
 OPEN = np.repeat([30.0, 300.0, 300.0, 30.0, 3.0], 3)  # rad, m, m/s, m/s^2, rad/s
 _FIRST, _WIDTH = {"x": 0, "v": 6, "b": 9}, {"x": 6, "v": 3, "b": 6}  # in a state's tangent vector
@@ -38,6 +39,22 @@ class _Normal:
         self.corner = np.zeros((calibration, calibration))
         self.right = np.zeros((states, MOTION, 1 + considered))
         self.right_border = np.zeros((calibration, 1 + considered))
+
+    def variants(self, count: int) -> tuple[Chain, list["_Normal"]]:
+        """Return so many copies as one chain, and each of them to add rows of fields to."""
+        chain = Chain(
+            *(
+                np.repeat(getattr(self, name)[None], 1 if name == "following" else count, axis=0)
+                for name in ("diagonal", "following", "border", "corner", "right", "right_border")
+            )
+        )
+        own = []
+        for k in range(count):
+            one = object.__new__(_Normal)
+            for name, value in vars(chain).items():
+                setattr(one, name, value[0 if name == "following" else k])
+            own.append(one)
+        return chain, own
 
     def add(
         self, epoch: IntArray, own: Array, after: Array | None, border: Array, right: Array
@@ -77,12 +94,15 @@ class _Fields:
 
     def added_to(self, normal: _Normal, kept: BoolArray) -> None:
         """Add the rows of some channels, shape (channels,)."""
-        flat = [
-            part[:, kept].reshape(len(part), 6 * int(np.sum(kept)), part.shape[-1])
-            for part in (self.by_pose, self.by_calibration, self.right)
-        ]
-        own = np.concatenate([flat[0], np.zeros((*flat[0].shape[:2], MOTION - 6))], axis=2)
-        normal.add(self.epoch, own, None, flat[1], flat[2])
+        for begin in range(0, len(self.epoch), PIECE):
+            rows = slice(begin, begin + PIECE)
+            count = len(self.epoch[rows])
+            flat = [
+                part[rows][:, kept].reshape(count, 6 * int(np.sum(kept)), part.shape[-1])
+                for part in (self.by_pose, self.by_calibration, self.right)
+            ]
+            own = np.concatenate([flat[0], np.zeros((*flat[0].shape[:2], MOTION - 6))], axis=2)
+            normal.add(self.epoch[rows], own, None, flat[1], flat[2])
 
 
 def separate_smoothed(result: Smoothed) -> Separation | None:
@@ -131,34 +151,18 @@ def _without_each(rest: _Normal, rows: _Fields, kept: BoolArray) -> tuple[ChainS
     group = max(1, int(AT_ONCE / per_variant))
     parts, costs = [], []
     for first in range(0, len(kept), group):
-        variants = []
-        for channels in kept[first : first + group]:
-            normal = _copied(rest)
+        some = kept[first : first + group]
+        chain, variants = rest.variants(len(some))
+        for normal, channels in zip(variants, some, strict=True):
             rows.added_to(normal, channels)
-            variants.append(normal)
-        chain = Chain(
-            *(
-                np.stack([getattr(v, name) for v in variants])
-                for name in ("diagonal", "following", "border", "corner", "right", "right_border")
-            )
-        )
         found = solve_chain(chain, 6)
         gain = np.einsum("hns,hns->h", chain.right[..., 0], found.states[..., 0])
         gain += np.einsum("hc,hc->h", chain.right_border[..., 0], found.border[..., 0])
-        square = np.array(
-            [np.sum(rows.right[:, c, :, 0] ** 2) for c in kept[first : first + group]]
-        )
-        parts.append(found._replace(states=found.states[:, :, :6]))
+        square = np.array([np.sum(rows.right[:, c, :, 0] ** 2) for c in some])
+        parts.append(found._replace(states=found.states[:, :, :6].copy()))
         costs.append(square - gain)
     joined = ChainSolution(*(np.concatenate(part) for part in zip(*parts, strict=True)))
     return joined, np.concatenate(costs)
-
-
-def _copied(normal: _Normal) -> _Normal:
-    out = object.__new__(_Normal)
-    for name, value in vars(normal).items():
-        setattr(out, name, value.copy())
-    return out
 
 
 def _linear(
@@ -208,7 +212,8 @@ def _each_once(epoch: IntArray) -> Iterator[IntArray]:
     left = np.arange(len(epoch))
     while len(left):
         _, first = np.unique(epoch[left], return_index=True)
-        yield left[first]
+        for begin in range(0, len(first), PIECE):
+            yield left[first[begin : begin + PIECE]]
         left = np.delete(left, first)
 
 

@@ -55,22 +55,25 @@ def solve_chain(chain: Chain, kept: int) -> ChainSolution:
         Of each state: how many of its first numbers' covariance is asked for.
     """
     n, size = chain.diagonal.shape[1:3]
-    wide = np.concatenate([chain.right, chain.border], axis=-1)
+    # What is swept takes the place of the right sides, and what is found that of what is swept: of
+    # a log of hours they are the largest of all.
+    solved = np.concatenate([chain.right, chain.border], axis=-1)
     inverse, gain = [], []
-    pivot, swept = chain.diagonal[:, 0], [wide[:, 0]]
+    pivot = chain.diagonal[:, 0]
     for i in range(n):
         inverse.append(_inverse(pivot))
         if i + 1 < n:
             gain.append(inverse[i] @ chain.following[:, i])
             back = np.swapaxes(gain[i], 1, 2)
             pivot = chain.diagonal[:, i + 1] - back @ chain.following[:, i]
-            swept.append(wide[:, i + 1] - back @ swept[i])
-    found, cov = [inverse[-1] @ swept[-1]], [inverse[-1]]
+            solved[:, i + 1] -= back @ solved[:, i]
+    cov = inverse[-1]
+    own = np.empty((*solved.shape[:2], kept, kept))
+    solved[:, -1], own[:, -1] = cov @ solved[:, -1], cov[:, :kept, :kept]
     for i in range(n - 2, -1, -1):
-        found.append(inverse[i] @ swept[i] - gain[i] @ found[-1])
-        cov.append(inverse[i] + gain[i] @ cov[-1] @ np.swapaxes(gain[i], 1, 2))
-    solved = np.stack(found[::-1], axis=1)
-    own = np.stack(cov[::-1], axis=1)[..., :kept, :kept]
+        solved[:, i] = inverse[i] @ solved[:, i] - gain[i] @ solved[:, i + 1]
+        cov = inverse[i] + gain[i] @ cov @ np.swapaxes(gain[i], 1, 2)
+        own[:, i] = cov[:, :kept, :kept]
     count = chain.right.shape[-1]
     alone, by_border = solved[..., :count], solved[..., count:]
     if not chain.corner.shape[1]:
