@@ -82,11 +82,12 @@ def measured(goal: Goal, log: Path, site: Site, imu: ImuSamples, room: Path) -> 
     left = ImuSamples(imu.time[later], imu.gyro_body[later], imu.accel_body[later])
     loops = [bare_loop(site, left)]
     output = room / goal.name.replace(" ", "_")
+    beginning = [*PROGRAM, *goal.command, str(log), "--end", str(BEGINNING)]
+    processor([*beginning, "-o", f"{output}_first"])  # keeps byte code, as an installation has
     whole = [*PROGRAM, *goal.command, str(log), "-o", str(output)]
     seconds = processor(whole)
     loops.append(bare_loop(site, left))
-    beginning = [*PROGRAM, *goal.command, str(log), "--end", str(BEGINNING)]
-    startup = processor([*beginning, "-o", str(room / f"{output.name}_beginning")])
+    startup = processor([*beginning, "-o", f"{output}_beginning"])
     imports = processor([sys.executable, "-c", IMPORTS])
     loops.append(bare_loop(site, left))
     report = json.loads((output / "report.json").read_text())
@@ -134,6 +135,7 @@ def main() -> None:
     missed, figures = False, {}
     with tempfile.TemporaryDirectory() as directory:
         room, log = Path(directory), options.log
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         if log is None:
             log = room / "log"
             processor([*PROGRAM, "simulate", "--duration", str(options.duration), "-o", str(log)])

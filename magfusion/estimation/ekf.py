@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 
 from magfusion.errors import EstimationError
 from magfusion.estimation.measurements.measurement import Measurement
@@ -28,6 +27,8 @@ def measured_rows(
 
 
 def _step(cov: Array, error: Array, jacobian: Array) -> tuple[Array, Array]:
+    from filterpy.kalman import ExtendedKalmanFilter  # brings scipy.stats, a second of every start
+
     size = len(cov)
     kalman = ExtendedKalmanFilter(dim_x=size, dim_z=len(error))
     kalman.x = np.zeros(size)  # filterpy's own (n, 1) would broadcast to a matrix

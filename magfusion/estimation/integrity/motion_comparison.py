@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from magfusion.estimation.integrity.turning import convolved
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.estimation.snapshot.survey_error import whitened
@@ -293,8 +294,6 @@ def _forces(fixes: Fixes, stamps: Array, imu: ImuSamples, wanted: Array) -> tupl
 
     The mean under a triangle of twice `CURVE_SPAN` is what acceleration makes of positions.
     """
-    from scipy.signal import fftconvolve  # takes as long to import as all else
-
     time = fixes.time
     grid = np.linspace(time[0], time[-1], round((time[-1] - time[0]) / GRID) + 1)
     turns = Slerp(time, Rotation.from_matrix(fixes.world_from_body[:, 0]))(grid).as_matrix()
@@ -303,6 +302,6 @@ def _forces(fixes: Fixes, stamps: Array, imu: ImuSamples, wanted: Array) -> tupl
     weight = np.concatenate([np.arange(1, count + 1), np.arange(count - 1, 0, -1)]) / count**2
     outer = turns[:, :, :, None] * force[:, None, None, :]
     both = np.concatenate([outer.reshape(len(grid), 27), turns.reshape(len(grid), 9)], axis=1)
-    mean = fftconvolve(both, weight[:, None], mode="same", axes=0)
+    mean = convolved(both, weight, mode="same")
     rows = np.clip(np.round((wanted - grid[0]) / GRID).astype(np.int64), 0, len(grid) - 1)
     return mean[rows, :27].reshape(-1, 3, 3, 3), mean[rows, 27:].reshape(-1, 3, 3)

@@ -12,6 +12,7 @@ from itertools import permutations, product
 from typing import Literal
 
 import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
 
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
@@ -122,7 +123,7 @@ def turning(imu: ImuSamples, field_time: Array, field_body: Array, lag: float = 
     size = float(np.median(np.linalg.norm(field, axis=1)))
 
     def passed(value: Array, kernel: Array) -> Array:
-        return _convolved(value, kernel[:, None], mode="valid")[::every]
+        return convolved(value, kernel, mode="valid")[::every]
 
     change = passed((field - np.mean(field, axis=0)) / size, slope)
     both = passed((rate[:, :, None] * field[:, None, :] / size).reshape(-1, 9), low)
@@ -178,11 +179,25 @@ def agrees(log: Log, site: Site) -> bool:
     return found.explained(np.eye(3)) > CONTRADICTED
 
 
-def _convolved(value: Array, kernel: Array, mode: Literal["valid", "same"]) -> Array:
-    """Return each column convolved with a kernel, shape (n, 1)."""
-    from scipy.signal import oaconvolve  # takes as long to import as all else
+def convolved(value: Array, kernel: Array, mode: Literal["valid", "same"]) -> Array:
+    """Return each column of many values convolved with a kernel.
 
-    return np.asarray(oaconvolve(value, kernel, mode=mode, axes=0))
+    As `scipy.signal.fftconvolve`, which takes as long to import as all else.
+
+    Parameters
+    ----------
+    value : ndarray, shape (n, columns)
+    kernel : ndarray, shape (m,)
+        For 'valid', no longer than the values.
+    mode : 'valid' or 'same'
+        Whether only what the kernel fits into is returned, or as many as there are values.
+    """
+    whole = len(value) + len(kernel) - 1
+    size = next_fast_len(whole, real=True)
+    spectrum = rfft(value, size, axis=0) * rfft(kernel, size)[:, None]
+    first = len(kernel) - 1 if mode == "valid" else (len(kernel) - 1) // 2
+    count = len(value) - len(kernel) + 1 if mode == "valid" else len(value)
+    return np.asarray(irfft(spectrum, size, axis=0)[first : first + count])
 
 
 class Clocks:
@@ -192,11 +207,11 @@ class Clocks:
         self.time = np.arange(time[0], time[-1], LAG_STEP)
         average = max(1, round(1.0 / (CUTOFF * LAG_STEP)))
         window = max(1, round(average * LAG_STEP / float(np.median(np.diff(time)))))
-        smooth = _convolved(field, np.full((window, 1), 1.0 / window), mode="same")
+        smooth = convolved(field, np.full(window, 1.0 / window), mode="same")
         self.field = _interpolated(self.time, time, smooth)
         self.change = np.gradient(self.field, LAG_STEP, axis=0)
         rate = _interpolated(self.time, log.imu.time + offset, log.imu.gyro_body)
-        self.rate = _convolved(rate, np.full((average, 1), 1.0 / average), mode="same")
+        self.rate = convolved(rate, np.full(average, 1.0 / average), mode="same")
 
     def lag(self, part: slice = slice(None)) -> tuple[float, float]:
         """Return by which shift of the inertial stamps a part agrees best (s), and how well."""
