@@ -9,11 +9,12 @@ from scipy.spatial.transform import Rotation
 from magfusion.estimation.ekf import ErrorStateFilter, measured_rows
 from magfusion.estimation.fixed_lag import SlidingWindow
 from magfusion.estimation.measurements.earth import earth_measurement
+from magfusion.estimation.measurements.measurement import joined
 from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
 from magfusion.estimation.process_noise import ProcessNoise, calibration_process_noise
 from magfusion.estimation.propagation import propagate
-from magfusion.estimation.state import MOTION, State, between, moved
+from magfusion.estimation.state import MOTION, State, between, moved, states_of
 from magfusion.model.field import observe_earth
 from magfusion.model.parameters import (
     GROUPS,
@@ -221,3 +222,18 @@ def test_a_frequency_that_changes_now_has_not_turned_the_phase_before():
             assert by @ gained @ by == pytest.approx(expected, rel=1e-6)
             drift = own["drift"].start
             assert gained[drift, drift] == 2.0 * walk.variance[drift]
+
+
+def test_epochs_of_a_kind_are_linearised_in_one_call_with_the_rows_of_each():
+    """A window of the fixed lag holds as many as it has epochs; a call each is its whole time."""
+    start, blocks, predicted, first = one_interval(None, earth=True)
+    second = one_interval(None, seed=SEED + 1, earth=True)[3]
+    whole = joined([m.at(k) for k, epoch in enumerate((first, second)) for m in epoch])
+    assert [len(m.epoch) for m in whole] == [2, 2]
+    states = [start, predicted.state]
+    for together, alone in zip(whole, zip(first, second, strict=True), strict=True):
+        both = together.linearize(states_of(states), start.calibration, blocks)
+        for k, measurement in enumerate(alone):
+            one = measurement.linearize(states_of(states[k : k + 1]), start.calibration, blocks)
+            np.testing.assert_allclose(both.error[k], one.error[0], rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(both.by_pose[k], one.by_pose[0], rtol=1e-9, atol=1e-6)

@@ -6,7 +6,7 @@ dataclass with these methods; nothing else changes.
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import numpy as np
@@ -114,7 +114,8 @@ optional
 class Measurement(ABC):
     """What was measured at some epochs.
 
-    Fields that are arrays have one row for each of ``epoch``; other fields hold for all of them.
+    Fields that are arrays have one row for each of ``epoch``; other fields hold for all of them,
+    and those that are not compared are no part of what was measured.
 
     Parameters
     ----------
@@ -162,7 +163,8 @@ def joined(parts: Iterable[Measurement]) -> list[Measurement]:
     """Return measurements of the same kind as one, so that a call serves them all."""
     kinds: dict[str, list[Measurement]] = {}
     for part in parts:
-        shared = {k: v for k, v in vars(part).items() if not isinstance(v, np.ndarray)}
+        named = {f.name: getattr(part, f.name) for f in fields(part) if f.compare}
+        shared = {k: v for k, v in named.items() if not isinstance(v, np.ndarray)}
         kinds.setdefault(f"{type(part).__qualname__} {shared}", []).append(part)
     out = []
     for alike in kinds.values():

@@ -67,7 +67,7 @@ class FieldPhasors(Measurement):
     moving: BoolArray
     robust: str | None = None
     excess: Array | None = None
-    predicted: "Predictions" = field(default_factory=lambda: Predictions())
+    predicted: "Predictions" = field(default_factory=lambda: Predictions(), compare=False)
 
     @property
     def loss(self) -> Loss | None:
