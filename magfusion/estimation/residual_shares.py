@@ -12,7 +12,7 @@ from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.solve.bordered import eliminate
 from magfusion.estimation.state import states_in
 from magfusion.model.field import model_error_cov
-from magfusion.model.noise import sensor_positions
+from magfusion.model.noise import cholesky, sensor_positions
 from magfusion.model.parameters import Block
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.samples import FieldSamples
@@ -255,7 +255,7 @@ def _draw_noise(
     drawn = np.sum([cells[k : k + count] for k in range(shared)], axis=0)
     safe = np.where(samples.valid[..., None, None], samples.phasor_cov, np.eye(3))
     scale = np.sqrt(np.trace(safe, axis1=2, axis2=3) / 3.0)[..., None, None]
-    spread = root @ (scale * np.linalg.cholesky(safe / scale**2))
+    spread = root @ (scale * cholesky(safe / scale**2))
     return _six(np.einsum("ncij,ncpj->ncpi", spread, drawn))
 
 

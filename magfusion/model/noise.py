@@ -10,6 +10,8 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import MU0_OVER_4PI, Array, BoolArray, ComplexArray
 
+ROUNDING = 1e-12  # of a covariance's mean eigenvalue
+
 
 def calibration_error(site: Site, distance: Array) -> Array:
     """Return the relative error of each beacon's field that its survey's sigmas cause.
@@ -115,11 +117,23 @@ def measurement_cov(
     return total
 
 
+def cholesky(cov: Array) -> Array:
+    """Return lower factors of covariances (..., k, k) of trace k or so.
+
+    Where rounding leaves one indefinite, as a false sample does, all are larger by `ROUNDING`.
+    """
+    try:
+        return np.asarray(np.linalg.cholesky(cov))
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.cholesky(cov + ROUNDING * np.eye(cov.shape[-1])))
+
+
 def whitening(cov: Array, valid: BoolArray) -> Array:
     """Return ``W`` with ``W^T W = cov^-1``, shape (..., 3, 3); zero where a channel is missing."""
     safe = np.where(valid[..., None, None], cov, np.eye(3))
     scale = np.sqrt(np.trace(safe, axis1=-2, axis2=-1) / 3.0)[..., None, None]
-    sqrt_information = np.linalg.inv(np.linalg.cholesky(safe / scale**2)) / scale
+    root = cholesky(safe / scale**2)
+    sqrt_information = np.linalg.inv(root) / scale
     return np.where(valid[..., None, None], sqrt_information, 0.0)
 
 

@@ -80,7 +80,8 @@ def _planar_directions(beacon: Beacon, power: Array, axes: Array, left: Array) -
 
     Its eigenvalues are ``(K/r^3)^2 {1, 1 + 3 s^2}``, s the sine of the angle from the normal.
     """
-    sine_square = np.clip((power[:, 1] / np.maximum(power[:, 0], _TINY) - 1.0) / 3.0, 0.0, 1.0)
+    least = np.maximum(power[:, 0], np.maximum(0.25 * power[:, 1], _TINY))
+    sine_square = np.clip((power[:, 1] / least - 1.0) / 3.0, 0.0, 1.0)
     sine, cosine = np.sqrt(sine_square)[:, None, None], np.sqrt(1.0 - sine_square)[:, None, None]
     if beacon.synchronised or len(beacon.tones) > 1:
         within = np.stack([axes[:, :, 1], -axes[:, :, 1]], axis=1)
