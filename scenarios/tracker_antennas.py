@@ -1,9 +1,10 @@
 """Trackers' antennas with errors, their bench and their surveys: what `tracker_table1` draws.
 
-The couplings are made from the dipole's field alone, not from the estimators' model.
+Coils have their true size: the couplings are Neumann's double integral over the wires, the bench
+reads the field of the wire by Biot and Savart.  The estimators have dipoles, and one term beside.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,10 +12,13 @@ from scipy.spatial.transform import Rotation
 from magfusion.calibration.antenna import AntennaSurvey, prior_sigma
 from magfusion.model.antenna import Antenna
 from magfusion.model.physics.dipole import dipole_field
+from magfusion.model.physics.finite_size import disc_kappa
 from magfusion.papers.p000_tracker.bench import bench_points
 from magfusion.papers.p000_tracker.equations import eq_09_whitened
 from magfusion.papers.p000_tracker.pose import locate_by_svd, refine_poses
 from magfusion.units import DEGREE, MU0_OVER_4PI, Array
+
+NODES = 12  # of a wire; the sum converges by a power of size over distance for each
 
 
 @dataclass(frozen=True)
@@ -41,13 +45,54 @@ class Config:
     bench_distance: float = 0.3  # m
     bench_position: float = 50e-6  # m
     bench_tilt_deg: float = 0.02
+    transmitter: float = 0.0  # m, diameter of its coils; both zero for dipoles
+    receiver: float = 0.0
     seed: int = 0
 
+    @property
+    def is_sized(self) -> bool:
+        """Whether the coils have a size."""
+        return self.transmitter > 0.0
 
-def nominal(shape: tuple[int, ...] = ()) -> Antenna:
-    """Return ideal antennas: unit moments and sensitivities along the axes, one centre."""
+
+def nominal(shape: tuple[int, ...] = (), *, sized: bool = False) -> Antenna:
+    """Return ideal antennas: unit moments and sensitivities along the axes, one centre.
+
+    Of dipoles, or with the term of a size, which is not known yet.
+    """
     eye, zero = np.broadcast_to(np.eye(3), (*shape, 3, 3)), np.zeros((*shape, 3, 3))
-    return Antenna(eye, zero, eye, zero)
+    kappas = (np.zeros(shape), np.zeros(shape)) if sized else ()
+    return Antenna(eye, zero, eye, zero, *kappas)
+
+
+def with_kappas(antenna: Antenna, config: Config) -> Antenna:
+    """Return antennas with the term of the coils' true size."""
+    if not config.is_sized:
+        return antenna
+    shape = antenna.moments_beacon.shape[:-2]
+    kappas = (np.full(shape, disc_kappa(0.5 * d)) for d in (config.transmitter, config.receiver))
+    return replace(antenna, **dict(zip(("kappa_beacon", "kappa_sensor"), kappas, strict=True)))
+
+
+def wires(coil: Array, centre: Array, diameter: float) -> tuple[Array, Array]:
+    """Return points and line elements (..., nodes, 3) of circular coils, elements of unit area.
+
+    Parameters
+    ----------
+    coil, centre : ndarray, shape (..., 3)
+        Moment or sensitivity along the axis, and where it is (m).
+    """
+    size = np.linalg.norm(coil, axis=-1, keepdims=True)
+    axis = coil / size
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis), axis=-1)])
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
+    angle = (2.0 * np.pi / NODES * np.arange(NODES))[:, None]
+    first, second = across[..., None, :], np.cross(axis, across)[..., None, :]
+    outward = np.cos(angle) * first + np.sin(angle) * second
+    along = np.cos(angle) * second - np.sin(angle) * first
+    # Current over area, times the wire's length: 4 |m| / (pi d^2) pi d.
+    step = 4.0 * size[..., None, :] / (diameter * NODES)
+    return centre[..., None, :] + 0.5 * diameter * outward, step * along
 
 
 def turned(angle: Array) -> Array:
@@ -73,8 +118,28 @@ def draw_antennas(errors: Errors, number: int, rng: np.random.Generator) -> Ante
     return Antenna(*coils(), *coils())
 
 
-def couplings(antenna: Antenna, beacon_from_sensor: Array, position_beacon: Array) -> Array:
-    """Return what the coils sense, from the dipole's field alone and not the estimators' model."""
+def couplings(
+    antenna: Antenna, beacon_from_sensor: Array, position_beacon: Array, config: Config
+) -> Array:
+    """Return what coils of true size sense (T), without the estimators' model."""
+    if not config.is_sized:
+        return _of_dipoles(antenna, beacon_from_sensor, position_beacon)
+    turn = np.swapaxes(beacon_from_sensor, -1, -2)
+    place = position_beacon[..., None, :] + antenna.centres_sensor @ turn
+    sent = wires(antenna.moments_beacon, antenna.centres_beacon, config.transmitter)
+    seen = wires(antenna.sensitivities_sensor @ turn, place, config.receiver)
+    lead = np.broadcast_shapes(place.shape[:-2], antenna.moments_beacon.shape[:-2])
+    out = np.empty((*lead, 3, 3))
+    for i, j in np.ndindex(3, 3):
+        there, there_along = seen[0][..., i, :, :], seen[1][..., i, :, :]
+        here, here_along = sent[0][..., j, :, :], sent[1][..., j, :, :]
+        apart = np.linalg.norm(there[..., :, None, :] - here[..., None, :, :], axis=-1)
+        both = np.einsum("...ax,...bx->...ab", there_along, here_along)
+        out[..., i, j] = MU0_OVER_4PI * np.sum(both / apart, axis=(-1, -2))
+    return out
+
+
+def _of_dipoles(antenna: Antenna, beacon_from_sensor: Array, position_beacon: Array) -> Array:
     turn = np.swapaxes(beacon_from_sensor, -1, -2)
     place = position_beacon[..., None, :] + antenna.centres_sensor @ turn
     offset = place[..., :, None, :] - antenna.centres_beacon[..., None, :, :]
@@ -88,13 +153,21 @@ def noise_sigma(snr_db: float, distance: Array) -> Array:
     return np.asarray(10.0 ** (-snr_db / 20.0) * MU0_OVER_4PI / distance**3)
 
 
-def bench_readings(coils: Array, centres: Array, config: Config, rng: np.random.Generator) -> Array:
+def bench_readings(
+    coils: Array, centres: Array, diameter: float, config: Config, rng: np.random.Generator
+) -> Array:
     """Return the probe's readings of antennas at six points, with the errors of the bench (T)."""
     points = bench_points(config.bench_distance)
     shape = (len(coils), 3, *points.shape)
     place = points + config.bench_position * rng.standard_normal(shape)
-    offset = place - centres[:, :, None, None, :]
-    field = dipole_field(offset, coils[:, :, None, None, :])
+    if diameter:
+        wire, along = (part[:, :, None, None] for part in wires(coils, centres, diameter))
+        apart = place[..., None, :] - wire
+        cubed = np.linalg.norm(apart, axis=-1, keepdims=True) ** 3
+        field = MU0_OVER_4PI * np.sum(np.cross(along, apart) / cubed, axis=-2)
+    else:
+        offset = place - centres[:, :, None, None, :]
+        field = dipole_field(offset, coils[:, :, None, None, :])
     tilt = turned(config.bench_tilt_deg * DEGREE * rng.standard_normal(shape))
     sigma = noise_sigma(config.snr_db, np.array(config.bench_distance))
     return np.asarray((tilt @ field[..., None])[..., 0] + sigma * rng.standard_normal(shape))
@@ -115,22 +188,22 @@ def draw_survey(antenna: Antenna, config: Config, rng: np.random.Generator) -> A
     shape = (len(antenna.moments_beacon), config.poses)
     attitude, position = random_poses(shape, rng)
     sigma = noise_sigma(config.snr_db, np.linalg.norm(position, axis=-1))
-    seen = couplings(antenna.at(np.s_[:, None]), attitude, position)
+    seen = couplings(antenna.at(np.s_[:, None]), attitude, position, config)
     noise = sigma[..., None, None] * rng.standard_normal(seen.shape)
     off = turned(config.pose_deg * DEGREE * rng.standard_normal((*shape, 3)))
     moved = position + config.pose_m * rng.standard_normal((*shape, 3))
     return AntennaSurvey(attitude @ off, moved, seen + noise, sigma)
 
 
-def usual_prior(errors: Errors) -> Array:
+def usual_prior(errors: Errors, *, sized: bool = False) -> Array:
     """Return the prior of the joint fits: four times the errors that the antennas have."""
-    mount = errors.mount_deg
+    mount, start = errors.mount_deg, nominal(sized=sized)
     return prior_sigma(
-        nominal(),
+        start,
         gain=4.0 * errors.gain,
         tilt=4.0 * float(np.hypot(errors.tilt_deg, mount)) * DEGREE,
         centre=4.0 * float(np.hypot(errors.centre, errors.common_centre)),
-    )[:36]
+    )[: start.vector().shape[-1]]
 
 
 def locate(antenna: Antenna, seen: Array, guess_beacon: Array) -> tuple[Array, Array]:

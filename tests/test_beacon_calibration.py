@@ -9,6 +9,7 @@ import beacon_calibration
 import numpy as np
 import pytest
 from beacon_calibration import MOMENT, PLACES_WORLD, Block, Config, Errors, run_block
+from beacon_readings import PAPER, readings
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.beacon import BeaconMeasurements, calibrate_beacon
@@ -25,7 +26,7 @@ from magfusion.papers.p002_beacon.equations import (
 )
 from magfusion.results.consistency import average_nees_bounds
 from magfusion.simulation.field import phasors_world
-from magfusion.units import Array
+from magfusion.units import DEGREE, Array
 
 
 @pytest.fixture(scope="module")
@@ -331,6 +332,21 @@ def test_blocks_draw_from_the_generator_that_they_are_given() -> None:
     block = Block(3, 3, "axis", 0.01)
     first, second = (run_block(block, np.random.default_rng(seed))[0] for seed in (1, 2))
     assert np.all(first != second)
+
+
+def test_a_reading_is_the_papers_where_all_four_figures_round_to_its_own() -> None:
+    rng = np.random.default_rng(1)
+    right, wrong = {}, {}
+    for count, (place, turn) in PAPER.items():
+        angles = rng.standard_normal((20_000, 3)) * np.sqrt(np.pi / 2.0) * turn * DEGREE
+        position = rng.uniform(0.5, 1.5, 20_000) * place
+        right["so", count] = position, angles
+        wrong["so", count] = (1.2 if count == 4 else 1.0) * position, angles
+    mean, rms = readings(right)
+    assert mean.is_the_papers
+    assert not rms.is_the_papers  # the same angles, of which the other mean is printed
+    assert rms.ratios[2] == pytest.approx(np.sqrt(np.pi / 2.0), rel=0.03)
+    assert not readings(wrong)[0].is_the_papers
 
 
 def test_the_scenario_draws_and_ends_with_one_json_line(
