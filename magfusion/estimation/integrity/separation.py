@@ -282,10 +282,15 @@ def _levels(sigma: Radius, without: Radius, threshold: Array, prior: Array, risk
     faulted = np.where(prior > 0.0, threshold + without.beyond(tail), 0.0)
     high = np.maximum(sigma.beyond(risk / terms), np.max(faulted, axis=1))
     low = np.zeros_like(high)
+    # The estimate with all is one more, of threshold zero, whose share is one.
+    each = Radius(
+        *(np.concatenate([a[:, None], b], axis=1) for a, b in zip(sigma, without, strict=True))
+    )
+    threshold = np.concatenate([np.zeros_like(high)[:, None], threshold], axis=1)
+    prior = np.concatenate([np.ones_like(prior[:, :1]), prior], axis=1)
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
-        missed = np.sum(prior * without.tail(middle[:, None] - threshold), axis=1)
-        more = sigma.tail(middle) + missed > risk
+        more = np.sum(prior * each.tail(middle[:, None] - threshold), axis=1) > risk
         low, high = np.where(more, middle, low), np.where(more, high, middle)
     return high
 
