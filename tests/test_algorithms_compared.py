@@ -25,7 +25,7 @@ from algorithms_compared import (
     worst_ratio,
 )
 
-DISTURBED = ("S1", "F1", "F2", "P0", "P1", "P2")
+DISTURBED = ("S1", "F1", "F2", "P0", "P1", "P2", "N1", "N2")
 A1, A2, A3 = PUBLISHED
 UNMAPPED = tuple(name for name in METHODS if name != MAPPED)
 Found = Mapping[str, Sequence[Outcome]]
