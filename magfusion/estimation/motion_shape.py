@@ -25,6 +25,7 @@ from magfusion.model.trajectory import Trajectory, interpolated
 from magfusion.units import Array
 
 MARGIN = 3  # inertial samples on either side of what is asked
+AT_ONCE = 1 << 14  # samples that are turned at once: what is made of them stays in the cache
 
 
 class _ByOffset(NamedTuple):
@@ -107,8 +108,13 @@ class MotionShape:
         known = components(Rotation.from_matrix(states.world_from_body))
         world_from_start = product(known, inverse(at_states))
         spread = _between(world_from_start)
-        world_from_body = product(_turn_at(states.time, world_from_start, spread, time), chain)
-        world_accel = turned(world_from_body, accel.T).T - [0.0, 0.0, gravity]
+        world_from_body, world_accel = np.empty_like(chain), np.empty_like(accel)
+        for begin in range(0, len(time), AT_ONCE):
+            rows = slice(begin, begin + AT_ONCE)
+            start = _turn_at(states.time, world_from_start, spread, time[rows])
+            world_from_body[:, rows] = product(start, chain[:, rows])
+            world_accel[rows] = turned(world_from_body[:, rows], accel[rows].T).T
+        world_accel -= [0.0, 0.0, gravity]
         velocity, position = _integrated(time, world_accel)
         return MotionShape(
             states=states,
@@ -207,8 +213,10 @@ class MotionShape:
         force = self.accel_world + np.array([0.0, 0.0, self.gravity])
         held = interpolated(self.time, known, at_states)
         speed, moved = _integrated(self.time, cross(held.T, force.T).T)
-        position = self._averaged(moved - self.velocity_world)
-        velocity = self._averaged(speed - self.accel_world)
+        del slow_body, force, held
+        moved -= self.velocity_world
+        speed -= self.accel_world
+        position, velocity = self._averaged(moved), self._averaged(speed)
         held_back = _hermite(self.time, position, velocity, known)
         return _ByOffset(rate, at_states, position, velocity, held_back)
 

@@ -14,7 +14,7 @@ from magfusion.receiver.noise import probes_left
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray, IntArray
 
-CHUNK = 1000  # windows demodulated at once: they fit in memory
+CHUNK = 64  # windows demodulated at once: what is made of them stays in the cache
 KEPT = 256 * 2**20  # bytes of maps that are kept; what is more is made anew
 WORST_CONDITION = 1e8  # of a normal matrix; beyond, the samples do not tell its columns apart
 
