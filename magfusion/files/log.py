@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 from typing import Literal
 
+import pyarrow as pa
 from pydantic import Field
 
 from magfusion.errors import InputError
@@ -89,6 +90,8 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
     )
     if log.waveform is None and log.fields is None:
         raise InputError(f"{path}: holds no field {span}; choose a span that the log covers.")
+    # Arrow keeps what the columns were decoded into: as much as the log again.
+    pa.default_memory_pool().release_unused()
     return log
 
 
