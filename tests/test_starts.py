@@ -105,3 +105,13 @@ def test_lone_rotating_beacons_are_found_and_honest() -> None:
 def test_whatever_beacons_there_are_some_start_is_right(seed: int) -> None:
     row = random_starts.run_one(seed, alone=False)
     assert row.found
+
+
+def test_what_is_trusted_and_wrong_is_told() -> None:
+    right = random_starts.Row(1, 1, True, 0.0, "trustworthy", (), 0.0, 13.0)
+    mirrored = random_starts.Row(2, 2, True, 1.0, "trustworthy", (), 1.0, 5.0)
+    doubted = replace(mirrored, seed=3, verdict="doubtful")
+    said = random_starts.report([right, mirrored, doubted])
+    assert "a right start in 1 of 3" in said
+    assert "above 12: 1 of 2, where 0.1 are due" in said
+    assert "trusted and wrong: [2]" in said
