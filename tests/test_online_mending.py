@@ -47,6 +47,8 @@ def test_an_imu_that_hangs_is_bridged_and_said(walk: OnlineLog) -> None:
     assert len(within) >= 7
     assert all([f.code for f in s.judgement.remarks] == ["frozen_imu"] for s in within)
     assert all(s.verdict is Verdict.TRUSTWORTHY for s in states)
+    after = [s for s in states if s.time > end]
+    assert {f.code for f in after[0].judgement.remarks} == {"gap"}
     assert not any(s.judgement.remarks for s in states if s.time < begin or s.time > end + 0.5)
     assert navigator.losses["imu sample of a sensor that hung"] == 50 * 4.7 - 1
     assert max(behind) < 1.0  # s; that the IMU hangs is known, and nothing is waited for

@@ -18,7 +18,7 @@ from magfusion.estimation.fixed_lag import SlidingWindow
 from magfusion.estimation.initialization.online import NoStart, find_online_start
 from magfusion.estimation.input_queue import Arrivals
 from magfusion.estimation.integrity.bank import SubsetBank
-from magfusion.estimation.integrity.freeze import hangs
+from magfusion.estimation.integrity.freeze import imu_remarks
 from magfusion.estimation.integrity.inertial_noise import measured_noise, with_white_noise
 from magfusion.estimation.integrity.judgement import JudgedState, Judgement, Told, judged_state
 from magfusion.estimation.integrity.resets import Resets
@@ -366,11 +366,10 @@ class Navigator:
         assert self._estimator is not None
         if samples is None:
             self._arrived.fill_silence(self._estimator.state, time)
-        predicted = self._propagated(time)
+        before, predicted = self._estimator.state.time, self._propagated(time)
         judgement = self._update.take_in(self._estimator, self._arrived, predicted, samples)
-        hung_since = self._arrived.hung_since
-        if hung_since is not None and time > hung_since:
-            judgement = judgement.beside(hangs(hung_since))
+        hung_since, bridged = self._arrived.hung_since, predicted.bridged
+        judgement = judgement.beside(*imu_remarks(hung_since, before, time, bridged=bridged))
         state, counts = self._estimator.state, self.counts
         restarts = counts["found by a fix"] + counts["lost and found again"]
         self._resets.hear(predicted.state, state, self._judgement, judgement, restarts)

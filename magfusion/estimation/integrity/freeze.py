@@ -58,11 +58,23 @@ class Freeze:
         return self._repeats >= max(by_chance, FEWEST) and time - self.since >= SHORTEST_FREEZE
 
 
-def hangs(since: float) -> Finding:
-    """Return what is to be said of an IMU that hangs since a stamp (s)."""
-    return Finding(
-        "frozen_imu",
-        f"IMU: all axes stand still since {since:.2f} s: the sensor or its driver hung. What it"
-        " repeats is left out, and bridged by the fields.",
-        Verdict.TRUSTWORTHY,
-    )
+def imu_remarks(
+    since: float | None, begin: float, end: float, *, bridged: bool
+) -> tuple[Finding, ...]:
+    """Return what is to be said of the IMU between two epochs (s).
+
+    Parameters
+    ----------
+    since : float, optional
+        When it hung (s); None where it does not now.
+    bridged : bool
+        Whether samples are missing there.
+    """
+    if since is not None and end > since:
+        text = f"all axes stand still since {since:.2f} s: the sensor or its driver hung. What it"
+        text += " repeats is left out, and bridged by the fields."
+        return (Finding("frozen_imu", f"IMU: {text}", Verdict.TRUSTWORTHY),)
+    if not bridged:
+        return ()
+    text = f"samples are missing between {begin:.2f} and {end:.2f} s. They are bridged by the"
+    return (Finding("gap", f"IMU: {text} fields.", Verdict.TRUSTWORTHY),)
