@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
 import pytest
 from example_bag import (
     FIELD,
@@ -28,8 +30,10 @@ from magfusion.files.foreign import bag_table
 from magfusion.files.foreign.bag_table import plan_bag
 from magfusion.files.foreign.convert import write_stream
 from magfusion.files.foreign.plan import Findings
+from magfusion.files.inertial_tables import FIELD_LAYOUT
 from magfusion.files.log import read_log, write_log
 from magfusion.files.open import open_log
+from magfusion.files.table import Span
 from magfusion.jobs.replay import ReplaySettings, run, run_replay
 from magfusion.model.samples import ImuSamples, Log, Waveform
 
@@ -197,3 +201,20 @@ def test_a_long_log_is_refused_as_a_short_one(tmp_path: Path) -> None:
     (path / "fields.parquet").unlink()
     with pytest.raises(InputError, match=r"holds no magnetometer.parquet and no fields.parquet"):
         run(ReplaySettings(log=path))
+
+
+def test_a_table_is_read_in_the_memory_of_a_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(table_stream, "BATCH", 1 << 14)
+    count = 300_000
+    columns = {f"field_{axis}": np.random.default_rng(3).standard_normal(count) for axis in "xyz"}
+    table = pa.table({"time_ns": np.arange(count) * 10**7, **columns})
+    pyarrow.parquet.write_table(table, tmp_path / "magnetometer.parquet", row_group_size=6000)
+    whole, before = table.nbytes, pa.total_allocated_bytes()
+    most = read = 0
+    for part in table_stream.table_pieces(tmp_path / "magnetometer.parquet", FIELD_LAYOUT, Span(0)):
+        read += len(part)
+        most = max(most, pa.total_allocated_bytes() - before)
+    assert read == count
+    assert most < 0.5 * whole  # Arrow reads ahead all there is, unless it is told not to

@@ -5,7 +5,7 @@ Here a measurement is linearised in one call, and each epoch owns one JacobianFa
 rewritten in place at each iteration.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import gtsam
@@ -20,6 +20,7 @@ from magfusion.units import Array, IntArray
 CALIBRATION_KEY = gtsam.symbol("c", 0)
 CONSIDERED_KEY = gtsam.symbol("h", 0)
 NUISANCE_KEY = gtsam.symbol("n", 0)
+PIECE = 512  # epochs that are differentiated at once
 Key = Callable[[int], int]  # of an epoch's variable
 
 
@@ -102,7 +103,34 @@ class Factors:
             More parameters, as a variable of their own.
         """
         graph = gtsam.GaussianFactorGraph()
-        rows = self.rows(states, calibration, self.blocks)
+        for piece in self.pieces():
+            own = piece.rows(states, calibration, self.blocks)
+            parts = piece._beside(states, calibration, own, others, spread, nuisance)
+            for i, epoch in enumerate(piece.measurement.epoch.tolist()):
+                size = parts[0][1].shape[1]
+                factor = empty_factor([(k(epoch), p.shape[-1]) for k, p in parts], size)
+                factor.getA()[:size] = np.concatenate([p[i] for _, p in parts], axis=1)
+                if explaining:
+                    factor.getb()[:size] = -own.error[i].ravel()
+                graph.push_back(factor)
+        return graph
+
+    def pieces(self) -> Iterator["Factors"]:
+        """Yield the factors of some epochs after the other: derivatives of all take much memory."""
+        for begin in range(0, len(self.measurement.epoch), PIECE):
+            part = self.measurement.rows(slice(begin, begin + PIECE))
+            yield Factors(part, self.blocks, self.segment, self.own)
+
+    def _beside(
+        self,
+        states: States,
+        calibration: Calibration,
+        rows: Rows,
+        others: tuple[Block, ...],
+        spread: Array,
+        nuisance: tuple[Block, ...],
+    ) -> list[tuple[Key, Array]]:
+        """Return key and derivative of every variable, with other parameters and nuisances."""
         parts = self._parts(rows)
         by_other = self.rows(states, calibration, others).by_calibration
         if by_other is not None:
@@ -110,14 +138,7 @@ class Factors:
         by_nuisance = self.rows(states, calibration, nuisance).by_calibration if nuisance else None
         if by_nuisance is not None:
             parts.append((_constant(NUISANCE_KEY), _flat(by_nuisance)))
-        for i, epoch in enumerate(self.measurement.epoch.tolist()):
-            size = parts[0][1].shape[1]
-            factor = empty_factor([(k(epoch), p.shape[-1]) for k, p in parts], size)
-            factor.getA()[:size] = np.concatenate([p[i] for _, p in parts], axis=1)
-            if explaining:
-                factor.getb()[:size] = -rows.error[i].ravel()
-            graph.push_back(factor)
-        return graph
+        return parts
 
     def rows(self, states: States, calibration: Calibration, blocks: tuple[Block, ...]) -> Rows:
         """Return the rows at an estimate, weighed by the robust loss."""

@@ -260,7 +260,8 @@ def write_table(columns: dict[str, object], path: Path) -> None:
 
 
 def _read_parquet(path: Path, layout: Layout, span: Span) -> tuple[pa.Table, int]:
-    with pa.parquet.ParquetFile(path, memory_map=True, page_checksum_verification=True) as file:
+    options = {"memory_map": True, "page_checksum_verification": True, "pre_buffer": False}
+    with pa.parquet.ParquetFile(path, **options) as file:
         _refuse_empty(file.metadata.num_rows, path)
         names = layout.chosen(file.schema_arrow.names, path)
         _integer_type(file.schema_arrow.field(TIME).type, TIME, path)

@@ -130,7 +130,8 @@ def _batches(path: Path, layout: Layout) -> Iterator[pa.RecordBatch]:
                 if len(batch):
                     yield batch.select(names)
         return
-    with pa.parquet.ParquetFile(path, page_checksum_verification=True) as file:
+    options = {"page_checksum_verification": True, "pre_buffer": False}  # else all of it is read
+    with pa.parquet.ParquetFile(path, **options) as file:
         names = layout.chosen(file.schema_arrow.names, path)
         groups = [file.metadata.row_group(g) for g in range(file.num_row_groups)]
         refuse_unfolding(file, names, groups, path)

@@ -2,25 +2,26 @@
 
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
 from magfusion.estimation.batch import Smoothed
 from magfusion.estimation.convergence import OPEN_ROTATION
-from magfusion.estimation.factors import CALIBRATION_KEY, CONSIDERED_KEY
+from magfusion.estimation.factors import CALIBRATION_KEY, CONSIDERED_KEY, PIECE, Factors
 from magfusion.estimation.graph import Estimate, Graph
 from magfusion.estimation.integrity.separation import Separation
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.solve.chain import Chain, ChainSolution, solve_chain
+from magfusion.estimation.solve.chain import Chain, solve_chain
 from magfusion.estimation.state import MOTION, states_in
 from magfusion.model.parameters import Block, difference, dimension
 from magfusion.model.prior import prior_sqrt_covariance, prior_sqrt_information
 from magfusion.units import Array, BoolArray, IntArray
 
 AT_ONCE = 2e8  # bytes; variants are solved in groups of so much
-PIECE = 512  # states whose rows are added at once
 # A prior that keeps what is open finite: far wider than anything that is of use.
 OPEN = np.repeat([30.0, 300.0, 300.0, 30.0, 3.0], 3)  # rad, m, m/s, m/s^2, rad/s
 _FIRST, _WIDTH = {"x": 0, "v": 6, "b": 9}, {"x": 6, "v": 3, "b": 6}  # in a state's tangent vector
@@ -83,26 +84,65 @@ class _Normal:
             self.right[epoch + 1] += ahead @ right
 
 
-@dataclass(frozen=True, eq=False)
-class _Fields:
-    """Rows of the fields (m, channels, 6, k), weighed as they were last."""
+class _Piece(NamedTuple):
+    """Rows of some epochs, shape (m, groups, components, k), weighed as they were last."""
 
     epoch: IntArray
-    by_pose: Array
+    by_state: Array
     by_calibration: Array
     right: Array
 
-    def added_to(self, normal: _Normal, kept: BoolArray) -> None:
+    def added_to(self, normal: _Normal, kept: BoolArray | slice = slice(None)) -> None:
         """Add the rows of some channels, shape (channels,)."""
-        for begin in range(0, len(self.epoch), PIECE):
-            rows = slice(begin, begin + PIECE)
-            count = len(self.epoch[rows])
-            flat = [
-                part[rows][:, kept].reshape(count, 6 * int(np.sum(kept)), part.shape[-1])
-                for part in (self.by_pose, self.by_calibration, self.right)
-            ]
-            own = np.concatenate([flat[0], np.zeros((*flat[0].shape[:2], MOTION - 6))], axis=2)
-            normal.add(self.epoch[rows], own, None, flat[1], flat[2])
+        flat = []
+        for part in (self.by_state, self.by_calibration, self.right):
+            own = part[:, kept]
+            flat.append(own.reshape(len(own), own.shape[1] * own.shape[2], own.shape[3]))
+        # A measurement may have several rows of one state.
+        for once in _each_once(self.epoch):
+            normal.add(self.epoch[once], flat[0][once], None, flat[1][once], flat[2][once])
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """The rows of a measurement, made piece by piece: those of a log of hours take much memory.
+
+    Parameters
+    ----------
+    spread : ndarray, shape (dimension, considered)
+        What makes a step of what is considered out of unit noise.
+    """
+
+    factors: Factors
+    estimate: Estimate
+    considered: tuple[Block, ...]
+    spread: Array
+    known: list[_Piece] = field(default_factory=list)
+
+    def pieces(self) -> Iterator[_Piece]:
+        """Yield all rows; the first of them are kept for the next time."""
+        yield from self.known
+        size, states = sum(_size(one) for one in self.known), states_in(self.estimate.values)
+        calibration = self.estimate.calibration
+        for factors in islice(self.factors.pieces(), len(self.known), None):
+            found = factors.rows(states, calibration, factors.blocks)
+            jacobian = found.jacobian(dimension(factors.blocks))
+            right = np.zeros((*found.error.shape, 1 + len(self.spread)))
+            right[..., 0] = -found.error
+            if len(self.spread):
+                by_other = factors.rows(states, calibration, self.considered).by_calibration
+                if by_other is not None:
+                    right[..., 1:] = -by_other @ self.spread
+            by_state, by_calibration = jacobian[..., :MOTION], jacobian[..., MOTION:]
+            piece = _Piece(factors.measurement.epoch, by_state, by_calibration, right)
+            size += _size(piece)
+            if size < AT_ONCE:
+                self.known.append(piece)
+            yield piece
+
+
+def _size(piece: _Piece) -> int:
+    return piece.by_state.nbytes + piece.by_calibration.nbytes + piece.right.nbytes
 
 
 def separate_smoothed(result: Smoothed) -> Separation | None:
@@ -120,14 +160,15 @@ def separate_smoothed(result: Smoothed) -> Separation | None:
     every = range(len(names))
     rest, rows = _linear(graph, result.estimate, result.uncertain)
     kept = np.array([owner >= 0, *(owner != j for j in every)])
-    solved, cost = _without_each(rest, rows, kept)
-    heard = np.any(rows.by_pose != 0.0, axis=(0, 2, 3))
-    numbers = np.array([6 * np.sum(heard & (owner == j)) * len(rows.epoch) for j in every])
+    heard, square, count = np.zeros(len(owner), dtype=bool), np.zeros(len(owner)), 0
+    for piece in rows.pieces():
+        heard |= np.any(piece.by_state != 0.0, axis=(0, 2, 3))
+        square += np.sum(piece.right[..., 0] ** 2, axis=(0, 2))
+        count += len(piece.epoch)
+    solved, cost = _without_each(rest, rows, kept, square)
+    numbers = np.array([6 * np.sum(heard & (owner == j)) * count for j in every])
     others = np.array([np.any(heard & (owner != j)) for j in every])
-    step, response = solved.states[:, :, :6, 0], solved.states[:, :, :6, 1:]
-    cov = solved.cov + response @ np.swapaxes(response, -1, -2)
-    moved = response[1:] - response[:1]
-    apart = solved.cov[1:] - solved.cov[:1] + moved @ np.swapaxes(moved, -1, -2)
+    step, cov, apart = solved
     variance = np.einsum("hnii->hni", cov[1:])
     shift = step[1:] - step[:1]
     determined = np.isfinite(shift).all(axis=2) & (variance > 0.0).all(axis=2)
@@ -145,29 +186,46 @@ def separate_smoothed(result: Smoothed) -> Separation | None:
     )
 
 
-def _without_each(rest: _Normal, rows: _Fields, kept: BoolArray) -> tuple[ChainSolution, Array]:
-    """Solve variants with some of the channels, shape (h, channels); and what they leave."""
+def _without_each(
+    rest: _Normal, rows: _Rows, kept: BoolArray, square: Array
+) -> tuple[tuple[Array, Array, Array], Array]:
+    """Solve variants with some of the channels, shape (h, channels); and what they leave.
+
+    Returns
+    -------
+    tuple of ndarray
+        Steps (h, n, 6), their covariances (h, n, 6, 6), and those of the difference from the first
+        variant, (h - 1, n, 6, 6).
+    ndarray, shape (h,)
+        Sum of squares.
+    """
     per_variant = 8.0 * 4.0 * (rest.diagonal.size + rest.border.size + rest.right.size)
     group = max(1, int(AT_ONCE / per_variant))
-    parts, costs = [], []
+    steps, covs, aparts, costs = [], [], [], []
+    whole: tuple[Array, Array] | None = None
     for first in range(0, len(kept), group):
         some = kept[first : first + group]
         chain, variants = rest.variants(len(some))
-        for normal, channels in zip(variants, some, strict=True):
-            rows.added_to(normal, channels)
+        for piece in rows.pieces():
+            for normal, channels in zip(variants, some, strict=True):
+                piece.added_to(normal, channels)
         found = solve_chain(chain, 6)
-        gain = np.einsum("hns,hns->h", chain.right[..., 0], found.states[..., 0])
-        gain += np.einsum("hc,hc->h", chain.right_border[..., 0], found.border[..., 0])
-        square = np.array([np.sum(rows.right[:, c, :, 0] ** 2) for c in some])
-        parts.append(found._replace(states=found.states[:, :, :6].copy()))
-        costs.append(square - gain)
-    joined = ChainSolution(*(np.concatenate(part) for part in zip(*parts, strict=True)))
-    return joined, np.concatenate(costs)
+        costs.append(some @ square - found.explained)
+        for states, cov in zip(found.states, found.cov, strict=True):
+            response = states[..., 1:]
+            steps.append(states[..., 0].copy())
+            covs.append(cov + response @ np.swapaxes(response, -1, -2))
+            if whole is None:
+                whole = response.copy(), cov.copy()
+                continue
+            moved = response - whole[0]
+            aparts.append(cov - whole[1] + moved @ np.swapaxes(moved, -1, -2))
+    return (np.array(steps), np.array(covs), np.array(aparts)), np.concatenate(costs)
 
 
 def _linear(
     graph: Graph, estimate: Estimate, considered: tuple[Block, ...]
-) -> tuple[_Normal, _Fields]:
+) -> tuple[_Normal, _Rows]:
     """Return the normal equations of all but the fields, and the rows of the fields."""
     assert graph.declared is not None
     size, others = dimension(graph.blocks), dimension(considered)
@@ -182,27 +240,16 @@ def _linear(
         if graph.shift is not None:
             by = graph.shift.by_considered
             normal.right_border[:, 1 : 1 + by.shape[1]] += whitening.T @ (whitening @ by)
-    for rows in _native_rows(graph, estimate, spread, size):
-        normal.add(*rows)
-    states, fields = states_in(estimate.values), None
+    for own in _native_rows(graph, estimate, spread, size):
+        normal.add(*own)
+    fields: _Rows | None = None
     for factors in graph.factors:
-        found = factors.rows(states, estimate.calibration, graph.blocks)
-        jacobian = found.jacobian(size)
-        right = np.zeros((*found.error.shape, 1 + others))
-        right[..., 0] = -found.error
-        if others:
-            by_other = factors.rows(states, estimate.calibration, considered).by_calibration
-            if by_other is not None:
-                right[..., 1:] = -by_other @ spread
-        epoch = factors.measurement.epoch
+        rows = _Rows(factors, estimate, considered, spread)
         if isinstance(factors.measurement, FieldPhasors):
-            fields = _Fields(epoch, jacobian[..., :6], jacobian[..., MOTION:], right)
+            fields = rows
             continue
-        flat = [part.reshape(len(epoch), -1, part.shape[-1]) for part in (jacobian, right)]
-        # A measurement may have several rows of one state.
-        for once in _each_once(epoch):
-            own = flat[0][once]
-            normal.add(epoch[once], own[..., :MOTION], None, own[..., MOTION:], flat[1][once])
+        for piece in rows.pieces():
+            piece.added_to(normal)
     assert fields is not None
     return normal, fields
 
@@ -212,8 +259,7 @@ def _each_once(epoch: IntArray) -> Iterator[IntArray]:
     left = np.arange(len(epoch))
     while len(left):
         _, first = np.unique(epoch[left], return_index=True)
-        for begin in range(0, len(first), PIECE):
-            yield left[first[begin : begin + PIECE]]
+        yield left[first]
         left = np.delete(left, first)
 
 
@@ -233,7 +279,11 @@ def _native_rows(
         kinds[kind].append((first, factor.getA(), factor.getb()))
     apart = {chr(gtsam.Symbol(CALIBRATION_KEY).chr()): size}
     apart[chr(gtsam.Symbol(CONSIDERED_KEY).chr())] = len(spread)
-    for kind, found in kinds.items():
+    for kind, found in (
+        (kind, every[begin : begin + PIECE])
+        for kind, every in kinds.items()
+        for begin in range(0, len(every), PIECE)
+    ):
         jacobian = np.array([by for _, by, _ in found])
         rows = jacobian.shape[:2]
         own, after = np.zeros((*rows, MOTION)), np.zeros((*rows, MOTION))

@@ -40,9 +40,10 @@ class Chain:
 class ChainSolution(NamedTuple):
     """Solution of every variant."""
 
-    states: Array  # (h, n, s, r)
+    states: Array  # (h, n, k, r) of the first k of each state
     border: Array  # (h, c, r)
-    cov: Array  # (h, n, k, k) of the first k of each state
+    cov: Array  # (h, n, k, k) of the same
+    explained: Array  # (h,) of the sum of squares, by the solution for the first right side
 
 
 @np.errstate(all="ignore")
@@ -76,17 +77,21 @@ def solve_chain(chain: Chain, kept: int) -> ChainSolution:
         own[:, i] = cov[:, :kept, :kept]
     count = chain.right.shape[-1]
     alone, by_border = solved[..., :count], solved[..., count:]
+    explained = np.einsum("hns,hns->h", chain.right[..., 0], alone[..., 0])
     if not chain.corner.shape[1]:
-        return ChainSolution(alone, chain.right_border, own)
+        return ChainSolution(alone[:, :, :kept], chain.right_border, own, explained)
     # What the states leave of the border.
     flat = chain.border.reshape(len(chain.border), n * size, -1)
     left = np.swapaxes(flat, 1, 2)
     corner = _inverse(chain.corner - left @ by_border.reshape(len(flat), n * size, -1))
     rest = chain.right_border - left @ alone.reshape(len(flat), n * size, -1)
     border = corner @ rest
-    states = alone - by_border @ border[:, None]
     part = by_border[..., :kept, :]
-    return ChainSolution(states, border, own + part @ corner[:, None] @ np.swapaxes(part, -1, -2))
+    states = alone[:, :, :kept] - part @ border[:, None]
+    # The border explains what the states leave of it.
+    explained += np.einsum("hc,hc->h", rest[..., 0], border[..., 0])
+    cov = own + part @ corner[:, None] @ np.swapaxes(part, -1, -2)
+    return ChainSolution(states, border, cov, explained)
 
 
 def _inverse(matrix: Array) -> Array:

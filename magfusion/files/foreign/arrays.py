@@ -219,7 +219,7 @@ def _hdf5(path: Path, by_column: bool = False) -> Source:
 
 
 def _parquet(path: Path) -> Source:
-    file = pa.parquet.ParquetFile(path, memory_map=True)
+    file = pa.parquet.ParquetFile(path, memory_map=True, pre_buffer=False)
     schema = file.schema_arrow
 
     def read(wanted: Sequence[int], texts: Collection[int]) -> Iterator[Part]:

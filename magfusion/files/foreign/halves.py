@@ -98,7 +98,7 @@ def _rate(counts: Counts) -> float:
 
 
 def _parts(path: Path, half: str) -> Iterator[tuple[IntArray, Array]]:
-    file = pa.parquet.ParquetFile(path)
+    file = pa.parquet.ParquetFile(path, pre_buffer=False)
     for group in range(file.num_row_groups):
         yield _arrays(file.read_row_group(group), half)
 
