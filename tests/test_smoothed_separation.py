@@ -7,7 +7,10 @@ import pytest
 from scipy.stats import binom
 from small_problem import SIGMA, SmallLog
 
+from magfusion.estimation import factors
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.graph import marginals
+from magfusion.estimation.integrity import smoothed_separation
 from magfusion.estimation.integrity.separation import protection_levels
 from magfusion.estimation.integrity.smoothed_exclusion import SLACK, separated_smooth
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
@@ -72,6 +75,7 @@ def test_a_chain_is_solved_as_the_dense_system_is(border: int) -> None:
             found.states[v].reshape(n * size, r), expected[: n * size], rtol=1e-7, atol=1e-9
         )
         np.testing.assert_allclose(found.border[v], expected[n * size :], rtol=1e-7, atol=1e-9)
+        assert found.explained[v] == pytest.approx(right[:, 0] @ expected[:, 0], rel=1e-7)
         for i in range(n):
             own = slice(i * size, (i + 1) * size)
             np.testing.assert_allclose(found.cov[v, i], inverse[own, own], rtol=1e-6, atol=1e-9)
@@ -141,6 +145,22 @@ def test_the_sweep_agrees_with_the_graph_and_with_a_log_without_the_beacon() -> 
             np.einsum("nii->ni", without.states.pose_cov),
             rtol=0.05,
         )
+
+
+def test_piece_by_piece_a_log_is_separated_as_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = _smoothed(_walk(1))
+    known = separate_smoothed(result), marginals(result.graph, result.estimate, result.uncertain)
+    for module in (factors, smoothed_separation):
+        monkeypatch.setattr(module, "PIECE", 7)
+    monkeypatch.setattr(smoothed_separation, "AT_ONCE", 1.0)  # one beacon at once, nothing kept
+    found = separate_smoothed(result), marginals(result.graph, result.estimate, result.uncertain)
+    assert known[0] is not None
+    assert found[0] is not None
+    for name, value in vars(known[0]).items():
+        scale = max(float(np.max(np.abs(value))), 1e-300)
+        np.testing.assert_allclose(getattr(found[0], name), value, rtol=1e-7, atol=1e-10 * scale)
+    for one, other in zip(known[1], found[1], strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=0.0)
 
 
 @pytest.mark.parametrize("seed", [2, 3])
