@@ -124,6 +124,7 @@ def run_smooth(
         raise EstimationError(
             f"{job.log_path}: {said}; the single-epoch fixes were saved in {job.output / FAILED}"
         ) from error
+    _give_back_memory()
     done = finished(log, site, settings, result, risk)
     elapsed = Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     done = replace(done, figures=done.figures | elapsed)
@@ -132,6 +133,17 @@ def run_smooth(
         write_finished(whole, log, done, rate=rate)
     refuse_failed(job.log_path, output=job.output, trust=done.trust)
     return done.figures
+
+
+def _give_back_memory() -> None:
+    """Give what GTSAM's factors were in back to the system: glibc keeps it in small pieces."""
+    import ctypes
+
+    try:
+        trim = ctypes.CDLL(None).malloc_trim
+    except (AttributeError, OSError, TypeError):  # another system's library
+        return
+    trim(0)
 
 
 def _save_fixes_instead(
