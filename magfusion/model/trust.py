@@ -42,6 +42,7 @@ CODES = {
     "found_again": "the platform was lost, and found again by a fix",
     "frozen_imu": "gyroscope or accelerometer stands still for a while",
     "frozen_magnetometer": "the magnetometer stands still for a while",
+    "gain_spread": "the fields are larger or smaller than the site's, from place to place",
     "gap": "a stream has no samples for a while",
     "geometry": "the beacons leave a direction of the pose open",
     "gravity": "gravity, as the accelerometer has it, is not of the declared size",

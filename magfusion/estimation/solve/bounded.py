@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 
 from magfusion.units import Array
 
@@ -37,3 +37,18 @@ def minimise_bounded(
     options = {"maxiter": steps, "ftol": decrease}
     found = minimize(cost, start, jac=gradient, method="L-BFGS-B", bounds=limits, options=options)
     return np.asarray(found.x)
+
+
+def minimise_between(
+    cost: Callable[[float], float], low: float, high: float, tolerance: float
+) -> tuple[float, float]:
+    """Return where a cost of one unknown is least between two values, and that cost (Brent's).
+
+    Parameters
+    ----------
+    tolerance : float
+        Of the unknown.
+    """
+    options = {"xatol": tolerance}
+    found = minimize_scalar(cost, bounds=(low, high), method="bounded", options=options)
+    return float(found.x), float(found.fun)

@@ -1,0 +1,49 @@
+"""What gains that were found epoch by epoch say of the moments that are declared."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Verdict
+
+BEYOND = 3.0  # declared sigmas
+STEADY = 2.0  # times its own scatter, a gain that is off everywhere alike
+MAD = 1.4826  # of a normal distribution, its standard deviation over this
+
+
+def gains_of(fixes: Fixes, site: Site, spread: float) -> Iterator[Finding]:
+    """Yield that gains are free, and which moments are another everywhere.
+
+    Parameters
+    ----------
+    fixes : Fixes
+        With a gain of every beacon.
+    spread : float
+        Standard deviation of a log-gain.
+    """
+    yield Finding(
+        "gain_spread",
+        f"The fields differ from those of the site by a factor of each beacon that scatters by"
+        f" {100.0 * spread:.2g} % from place to place: it is found in each epoch beside the pose."
+        " Iron near coils or path, or drives that vary: a map of the field (magfusion calibrate"
+        " fieldmap) gives smaller errors.",
+        Verdict.TRUSTWORTHY,
+    )
+    owner = np.array([name for name, _ in site.channels])
+    for beacon in site.beacons:
+        own = fixes.log_gain[fixes.determined[:, 0], 0][:, owner == beacon.name][:, 0]
+        if len(own) == 0:
+            continue
+        middle = float(np.median(own))
+        declared = float(np.max(beacon.sigma.log_moment))
+        scatter = MAD * float(np.median(np.abs(own - middle)))
+        if abs(middle) > max(BEYOND * declared, STEADY * scatter):
+            yield Finding(
+                "moments",
+                f"The field of beacon {beacon.name} is {np.exp(middle):.3g} times what its moments"
+                " make of it, wherever it is heard. Check its current and turns.",
+                Verdict.DOUBTFUL,
+                abs(middle) / max(declared, 1e-3),
+            )
