@@ -182,3 +182,11 @@ def test_plain_likelihood_loses_to_algorithm_3_where_the_model_is_wrong(
     assert beside_algorithm_3(full[scenario], ML)[1] != "better"
     told = report({scenario: mapped[scenario]}, {}).splitlines()
     assert any(line.split()[:1] == [scenario] for line in told)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["S0", "S1", "F1", "F2", "P0", "P1", "P2"])
+def test_with_gains_as_free_as_asked_likelihood_beats_algorithm_3_without_its_survey(
+    full: Found, scenario: str
+) -> None:
+    assert beside_algorithm_3(full[scenario], "MLrel + spread")[1] == "better"
