@@ -140,8 +140,8 @@ def full() -> dict[str, list[Outcome]]:
 
 @pytest.fixture(scope="module")
 def mapped() -> dict[str, list[Outcome]]:
-    """Three rooms of each kind: a map takes five times as long to learn as all else."""
-    return run(Config(worlds=3, scenarios=DISTURBED))
+    """Two rooms of each kind: a map takes five times as long to learn as all else."""
+    return run(Config(worlds=2, scenarios=DISTURBED))
 
 
 @pytest.mark.slow
