@@ -62,7 +62,12 @@ def run_case(case: Case, inputs: Path, place: Path) -> str | None:
     status: object = None
     sys.stdin = source
     try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        # What an output's name was changed to may be relative: it is then seen, and goes with all.
+        with (
+            contextlib.chdir(place),
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+        ):
             magfusion(command)
     except SystemExit as ended:
         status = ended.code or 0
