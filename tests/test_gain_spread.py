@@ -91,3 +91,19 @@ def test_a_moment_that_is_wrong_everywhere_is_named() -> None:
     assert said[0].code == "gain_spread"
     assert [f.code for f in said if f.verdict is Verdict.DOUBTFUL] == ["moments"]
     assert f"beacon {site.beacons[1].name} is 1.3" in said[1].text
+
+
+def test_where_no_epoch_tells_a_pose_none_tells_of_a_spread() -> None:
+    site, samples, _ = room()
+    alone = replace(site, beacons=site.beacons[:1])
+    tones = len(alone.beacons[0].tones)
+    heard = FieldSamples(
+        samples.time,
+        samples.window,
+        samples.channels[:tones],
+        samples.phasor_sensor[:, :tones],
+        samples.phasor_cov[:, :tones],
+    )
+    held = fix_epochs(heard, initial_calibration(alone, 0.0), survey_error=False)
+    none = replace(held, determined=np.zeros_like(held.determined))
+    assert gain_spread(heard, initial_calibration(alone, 0.0), none) == GAIN_SIGMA

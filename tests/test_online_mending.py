@@ -98,3 +98,25 @@ def test_undeclared_beacons_are_found_in_the_beginning_of_a_stream(radiated: Sim
     assert np.mean(errors.nees) < 12.0
     again = restored(navigator.site, EKF, navigator.checkpoint())
     assert again._arrived.receiver.settings == receiver.settings
+
+
+@pytest.mark.parametrize("held", [1, 2, 3])
+@pytest.mark.parametrize("piece", [1, 7, 40])
+def test_pieces_are_counted_as_single_samples_are(held: int, piece: int) -> None:
+    """An instrument that is read faster than it measures, and hangs once."""
+    rng = np.random.default_rng(3)
+    samples = np.repeat(rng.normal(size=(400, 3)), held, axis=0)[:400]
+    samples[250:330] = samples[250]
+    time = 0.005 * np.arange(len(samples))
+    whole, single = Freeze(), Freeze()
+    found = [
+        s
+        for k in range(0, 400, piece)
+        for s in whole.stretches(time[k : k + piece], samples[k : k + piece])
+    ]
+    alone = [s for k in range(400) for s in single.stretches(time[k : k + 1], samples[k : k + 1])]
+    assert vars(whole).keys() == vars(single).keys()
+    for name, value in vars(whole).items():
+        np.testing.assert_array_equal(value, vars(single)[name], err_msg=name)
+    assert bool(found) == bool(alone)
+    assert max(until for _, until in found) == max(until for _, until in alone)

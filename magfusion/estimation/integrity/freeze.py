@@ -4,7 +4,7 @@ import numpy as np
 
 from magfusion.estimation.integrity.samples import CHANCE, SHORTEST_FREEZE
 from magfusion.model.trust import Finding, Verdict
-from magfusion.units import Array
+from magfusion.units import Array, BoolArray
 
 SAMPLES = 1e7  # of a stream, among which the chance of a false alarm is `CHANCE`
 FEWEST = 6  # samples alike in a row, at least
@@ -37,6 +37,10 @@ class Freeze:
         """Return after which sample and up to which (s) samples (k, 3) only repeat it."""
         out: dict[float, float] = {}
         same = np.all(samples == np.vstack([self._sample, samples])[:-1], axis=1)
+        if len(time):
+            self._sample = samples[-1].copy()
+        if self._passed(time, same):
+            return []
         for k in range(len(time)):
             if same[k]:
                 self._repeats += 1
@@ -47,9 +51,21 @@ class Freeze:
                 self.since, self.found, self._repeats = float(time[k]), False, 0
             if self.found:
                 out[self.since] = float(time[k])
-        if len(time):
-            self._sample = samples[-1].copy()
         return list(out.items())
+
+    def _passed(self, time: Array, same: BoolArray) -> bool:
+        """Count samples none of which is repeated for long, as nearly always; else do nothing."""
+        changed = np.flatnonzero(~same)
+        ends = np.concatenate([changed, [len(same)]])
+        repeats = np.diff(ends, prepend=-1 - self._repeats) - 1
+        if self.found or np.max(repeats) >= FEWEST:
+            return False
+        closed = int(np.sum(repeats[:-1]))
+        self._seen, self._alike = self._seen + len(changed) + closed, self._alike + closed
+        self._repeats = int(repeats[-1])
+        if len(changed):
+            self.since = float(time[changed[-1]])
+        return True
 
     def _too_long(self, time: float) -> bool:
         # Instruments have steps, and may be read faster than they measure.

@@ -55,6 +55,8 @@ def gain_spread(
         Zero where no spread is told; `GAIN_SIGMA` where too few epochs could tell of one.
     """
     rows = np.flatnonzero(fixes.determined[:, 0])
+    if len(rows) < FEWEST:
+        return GAIN_SIGMA
     rows = rows[:: max(1, -(-len(rows) // ENOUGH))]
     asked = _Asked(samples.rows(rows), calibration, _poses(fixes, rows), survey_error, free)
     own = None if gravity is None else gravity.rows(rows)
