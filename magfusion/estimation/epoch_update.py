@@ -14,6 +14,7 @@ from magfusion.estimation.integrity.bank import SubsetBank
 from magfusion.estimation.integrity.gate import Gate
 from magfusion.estimation.integrity.judgement import Judgement
 from magfusion.estimation.integrity.online import Heard, OnlineWitness
+from magfusion.estimation.integrity.place_witness import of_place
 from magfusion.estimation.integrity.recovery import (
     AgreedFix,
     Attempts,
@@ -32,6 +33,7 @@ from magfusion.estimation.state import State
 from magfusion.model.parameters import Block
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
+from magfusion.model.trust import Finding
 from magfusion.units import BoolArray
 
 WIDE_POSITION, WIDE_ROTATION = 0.3, 0.2  # m, rad; beyond, the prediction is no place to linearise
@@ -205,6 +207,7 @@ class EpochUpdate:
     def _judged(self, state: State, since: float | None) -> Judgement:
         held = self.score.said_of(state)
         said = self.witness.judgement(state, self.gate, since, held)
+        said = said.beside(*_of_place(self.site, state))
         return said if self.bank is None else self.bank.heard(said, state)
 
     def _compare(self, samples: FieldSamples, state: State) -> None:
@@ -272,6 +275,13 @@ class EpochUpdate:
         self.gate.refused_in_a_row = 0
         self._attempts.over()
         self.witness.uncertain("found_again", time)
+
+
+def _of_place(site: Site, state: State) -> tuple[Finding, ...]:
+    if site.bounds is None:
+        return ()
+    at = np.array([state.time]), state.world_from_body[None], state.position_world[None]
+    return of_place(site, *at, state.cov[None, :6, :6])
 
 
 def _apart(state: State, fix: AgreedFix) -> tuple[float, float]:

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.files.field_map import read_field_maps, write_field_maps
 from magfusion.files.site_correlation import load_correlation, save_correlation
+from magfusion.files.site_region import region_entry
 from magfusion.files.site_schema import (
     BeaconEntry,
     ClockEntry,
@@ -100,6 +101,7 @@ def load_site(path: Path | str, *, unknown: bool = False, without: bool = False)
         calibration=entry.calibration,
         clock=_model(ClockModel, entry.clock),
         earth=_model(EarthModel, entry.world.earth),
+        region=None if entry.region is None else entry.region.region(),
     )
     if entry.correlation is None:
         return site
@@ -138,6 +140,7 @@ def save_site(site: Site, path: Path | str) -> None:
             **_model_entry("motion", site.platform.motion, MotionEntry),
         },
         **_model_entry("clock", site.clock, ClockEntry),
+        **region_entry(site.region),
     }
     if site.calibration is not None:
         content["calibration"] = _plain(site.calibration)
@@ -194,6 +197,7 @@ def _beacon(entry: BeaconEntry) -> Beacon:
         slots=None if entry.slots is None else _model(Slots, entry.slots),
         model_error=entry.model_error,
         noise_factor=entry.noise_factor,
+        hemisphere_beacon=entry.hemisphere,
         sigma=BeaconSigma(
             position_world=sigma.position_m,
             rotation_beacon=sigma.rotation_deg * DEGREE,
@@ -329,6 +333,8 @@ def _noise_entry(beacon: Beacon) -> dict[str, Any]:
     entry = {} if beacon.model_error is None else {"model_error": float(beacon.model_error)}
     if beacon.noise_factor != Beacon.noise_factor:
         entry["noise_factor"] = float(beacon.noise_factor)
+    if beacon.hemisphere_beacon is not None:
+        entry["hemisphere"] = _plain(beacon.hemisphere_beacon)
     return entry
 
 

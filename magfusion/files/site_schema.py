@@ -13,6 +13,7 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticKnownError
 
+from magfusion.files.site_region import RegionEntry
 from magfusion.files.site_values import (
     HIGHEST_FREQUENCY,
     LARGEST_ANGLE,
@@ -249,6 +250,7 @@ class BeaconEntry(StrictModel):
     synchronised: bool = True
     model_error: _Share | None = None
     noise_factor: _Positive = Beacon.noise_factor
+    hemisphere: Annotated[Array, array(3), AfterValidator(a_direction)] | None = None
     sigma: BeaconSigmaEntry = Field(default_factory=BeaconSigmaEntry)
 
     @model_validator(mode="after")
@@ -358,6 +360,7 @@ class SiteEntry(StrictModel):
     beacons: list[BeaconEntry]
     platform: PlatformEntry
     clock: ClockEntry = ClockEntry()
+    region: RegionEntry | None = None
     calibration: dict[str, Any] | None = None
     correlation: Annotated[str, Field(min_length=1)] | None = None
 

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from magfusion.errors import InputError
-from magfusion.jobs.settings import Command, LogSettings, RiskSettings, WindowSettings, option
+from magfusion.jobs.region import RegionSettings
+from magfusion.jobs.settings import Command, RiskSettings, WindowSettings, option
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figure, Figures, heading
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FixSettings(LogSettings, WindowSettings, RiskSettings):
+class FixSettings(RegionSettings, WindowSettings, RiskSettings):
     """How an epoch is located.
 
     Parameters
@@ -118,6 +119,7 @@ def run_fix(
     from magfusion.estimation.integrity.fix_separation import separate_fixes, separation_trust
     from magfusion.estimation.integrity.fix_witness import judged_fixes
     from magfusion.estimation.integrity.gain_witness import gains_of
+    from magfusion.estimation.integrity.place_witness import of_place
     from magfusion.estimation.integrity.recording import BRIDGED, recorded
     from magfusion.estimation.snapshot.gain_spread import gain_spread
     from magfusion.estimation.snapshot.likelihood import fix_epochs
@@ -155,6 +157,8 @@ def run_fix(
     trust |= separation_trust(separated, tuple(beacon.name for beacon in site.beacons), risk)
     if "gain" in free:
         trust |= Trust(tuple(gains_of(fixes, site, gain_sigma)))
+    first = (fixes.world_from_body, fixes.position_world, fixes.pose_cov)
+    trust |= Trust(of_place(site, fixes.time, *(part[:, 0] for part in first)))
     trust |= Trust(recorded(log, site, BRIDGED, beacons=True))
     figures = heading("fix", log.name) | trust_figures(trust) | fix_figures(fixes, site)
     figures |= dropped_figures(dropped) | level_figures(states)

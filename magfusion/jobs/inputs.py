@@ -22,6 +22,7 @@ from magfusion.files.open import open_log
 from magfusion.files.site import load_site
 from magfusion.files.trajectory_table import read_trajectory
 from magfusion.files.tum import read_tum
+from magfusion.jobs.region import ANYWHERE, Where
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
@@ -46,6 +47,8 @@ class Job:
         Part of the log to use, seconds since its epoch.
     topics : Topics, optional
         Of a bag that has several of one type.
+    where : Where
+        The magnetometer is, beside what the site says of it.
     """
 
     log_path: Path
@@ -54,6 +57,7 @@ class Job:
     start: float | None = None
     end: float | None = None
     topics: Topics | None = None
+    where: Where = ANYWHERE
 
     @property
     def declared_path(self) -> Path:
@@ -219,7 +223,7 @@ def read_site(job: Job, *, unknown: bool = False) -> Site:
         raise InputError(
             f"{job.log_path}: holds no site.yaml; name the site's file with --site SITE.yaml"
         )
-    return load_site(job.declared_path, unknown=unknown)
+    return job.where.bounded(load_site(job.declared_path, unknown=unknown))
 
 
 def read_job(job: Job, *, unknown: bool = False, report: Report = quiet) -> tuple[Log, Site]:

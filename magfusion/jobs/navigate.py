@@ -13,11 +13,11 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.jobs.live import LiveSettings, state_sinks
 from magfusion.jobs.rates import RateSettings
+from magfusion.jobs.region import RegionSettings
 from magfusion.jobs.settings import (
     Command,
     EarthSettings,
     EstimateSettings,
-    LogSettings,
     ReplayedSettings,
     RiskSettings,
     WindowSettings,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class NavigateSettings(
-    LogSettings,
+    RegionSettings,
     WindowSettings,
     ReplayedSettings,
     EarthSettings,
@@ -130,7 +130,6 @@ def run(
 
 def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
     from magfusion.files.standard_streams import binary_input, binary_output, until_closed
-    from magfusion.jobs.inputs import Job
     from magfusion.jobs.stream import StreamSettings, run_stream
 
     if settings.site is None:
@@ -141,13 +140,14 @@ def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
             " out with -"
         )
     chosen = StreamSettings(
-        settings.navigator(Job(settings.log, settings.site, Path())),
+        settings.navigator(settings.job(Path())),
         settings.form,
         settings.keep_going,
         settings,
         settings.checkpoint,
         settings.every,
         settings.resume,
+        settings.where,
     )
     with until_closed():
         run_stream(settings.site, chosen, binary_input(), binary_output(), sys.stderr)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.jobs.rates import RateSettings
+from magfusion.jobs.region import RegionSettings
 from magfusion.jobs.settings import (
     Command,
     EarthSettings,
@@ -35,7 +36,13 @@ CONTRADICTION = "fields and inertial data contradict each other so much that not
 
 @dataclass(frozen=True, kw_only=True)
 class SmoothSettings(
-    LogsSettings, WindowSettings, EarthSettings, EstimateSettings, RiskSettings, RateSettings
+    LogsSettings,
+    RegionSettings,
+    WindowSettings,
+    EarthSettings,
+    EstimateSettings,
+    RiskSettings,
+    RateSettings,
 ):
     """How a log is smoothed."""
 

@@ -26,6 +26,7 @@ from magfusion.files.stream import (
 )
 from magfusion.jobs.checkpoint import begin, save
 from magfusion.jobs.live import LiveSettings, StateSink, state_sinks
+from magfusion.jobs.region import ANYWHERE, Where
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding
 from magfusion.units import Array
@@ -52,6 +53,8 @@ class StreamSettings:
         Between checkpoints (s of the stream).
     resume : bool
         Go on from the checkpoint, if there is one, with what comes now.
+    where : Where
+        The magnetometer is, beside what the site says of it.
     """
 
     navigator: NavigatorSettings = field(default_factory=NavigatorSettings)
@@ -61,6 +64,7 @@ class StreamSettings:
     checkpoint: Path | None = None
     every: float = 30.0
     resume: bool = False
+    where: Where = ANYWHERE
 
 
 def run_stream(
@@ -85,7 +89,7 @@ def run_stream(
     InputError
         Where the site cannot be read, or a record is none and ``keep_going`` is not set.
     """
-    site = load_site(site_path)
+    site = settings.where.bounded(load_site(site_path))
     with state_sinks(settings.live, site, 0, messages) as sinks:
         return _navigate(site, settings, source, sink, messages, sinks)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from magfusion.model.correlation import Correlation
 from magfusion.model.field_map import FieldMap
+from magfusion.model.region import Bounds, Region, bounds_of
 from magfusion.units import Array, ComplexArray, IntArray
 
 Unknown = Literal["pose", "position", "attitude"]
@@ -117,6 +118,8 @@ class Beacon:
         Of its own field; the site's where it is None.
     noise_factor : float
         Noise of its phasors in units of what the receiver measures beside its tones.
+    hemisphere_beacon : ndarray, shape (3,), optional
+        Direction, of any length, in front of which the magnetometer always is.
     """
 
     name: str
@@ -131,6 +134,7 @@ class Beacon:
     unknown: Unknown | None = None
     model_error: float | None = None
     noise_factor: float = 1.0
+    hemisphere_beacon: Array | None = None
 
     @cached_property
     def tones(self) -> tuple[tuple[float, int | None], ...]:
@@ -355,6 +359,8 @@ class Site:
         Where refined values came from: log, parameters that it determined and that it did not.
     correlation : Correlation, optional
         Of the errors that the sigmas stand for; None where all are independent.
+    region : Region, optional
+        Where the magnetometer is, whatever the fields say.
     """
 
     gravity: float
@@ -368,6 +374,12 @@ class Site:
     clock: ClockModel = ClockModel()
     earth: EarthModel = EarthModel()
     model_error_length: float = 0.5
+    region: Region | None = None
+
+    @cached_property
+    def bounds(self) -> Bounds | None:
+        """Planes that the magnetometer does not cross; None where nothing is said of its place."""
+        return bounds_of(self.region, self.beacons)
 
     @cached_property
     def channels(self) -> tuple[tuple[str, int], ...]:

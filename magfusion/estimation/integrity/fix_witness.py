@@ -90,8 +90,8 @@ def _of_epochs(rival: BoolArray, open_pose: BoolArray, odd: BoolArray) -> Iterat
         (
             "ambiguous",
             rival,
-            "are ambiguous: fixes.parquet holds every pose that explains them; add a beacon, or"
-            " smooth, so that the motion decides.",
+            "are ambiguous: fixes.parquet holds every pose that explains them; add a beacon,"
+            " declare a hemisphere or region, or smooth, so that the motion decides.",
         ),
         (
             "geometry",

@@ -13,6 +13,7 @@ from magfusion.estimation.batch import Smoothed
 from magfusion.estimation.graph import Estimate
 from magfusion.estimation.integrity.held import held
 from magfusion.estimation.integrity.outcome import convergence, geometry, rivals
+from magfusion.estimation.integrity.place_witness import of_place
 from magfusion.estimation.integrity.priors_of_log import bias_change, calibration_change
 from magfusion.estimation.integrity.recording import BRIDGED, recorded
 from magfusion.estimation.integrity.residual_blocks import fields, fixes, inertial
@@ -44,6 +45,9 @@ def judged(result: Smoothed, log: Log) -> tuple[Smoothed, Trust]:
     pose_cov = result.states.pose_cov
     if pose_cov is None:
         return result, trust
+    at = result.states
+    place = of_place(result.declared.site, at.time, at.world_from_body, at.position_world, pose_cov)
+    trust |= Trust(place)
     case = Case(result, log, score_of(result, log.imu), pose_cov)
     factor, spread = np.ones(len(pose_cov)), np.zeros_like(pose_cov)
     for said in _heard(case):

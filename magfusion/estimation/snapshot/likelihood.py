@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.snapshot.candidates import attitudes, positions
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
+from magfusion.estimation.snapshot.place import outside
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA, Epochs, Problem, State, epochs_of
 from magfusion.estimation.snapshot.refine import Solved, as_fixes, cost, joined, solved_from
 from magfusion.model.coil_field import is_sized
@@ -85,7 +86,7 @@ def _solve(epochs: Epochs) -> Fixes:
     order, ranked = _ranked(
         solved.state.rotation.reshape(-1, count, 3, 3),
         solved.state.position.reshape(-1, count, 3),
-        solved.cost.reshape(-1, count),
+        solved.cost.reshape(-1, count) + outside(problem, solved, count),
     )
     kept = (order + count * np.arange(len(order))[:, None]).ravel()
     found = Solved(solved.state.rows(kept), solved.cost[kept], solved.information[kept])

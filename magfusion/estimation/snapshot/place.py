@@ -1,0 +1,59 @@
+"""What a declared region, or the hemisphere of a beacon, makes of the hypotheses of a fix."""
+
+import numpy as np
+from scipy.special import log_ndtr
+
+from magfusion.estimation.snapshot.problem import Problem
+from magfusion.estimation.snapshot.refine import Solved
+from magfusion.estimation.solve.batched import open_inverse
+from magfusion.model.site import Site
+from magfusion.units import Array
+
+SOFT_EDGE = 0.02  # of the distance from the nearest beacon; nobody declares a plane more sharply
+DROPPED = 25.0  # chi square of being where the magnetometer is not, from which a pose is none
+
+
+def outside(problem: Problem, solved: Solved, count: int) -> Array:
+    """Return what being outside costs each hypothesis, shape (epochs, count).
+
+    Minus twice the logarithm of its probability to be inside, by its own covariance; infinite
+    beyond `DROPPED`. Of an epoch all of whose poses are outside the nearest to the inside keeps its
+    own cost: that the declaration is wrong is then to be said of it, rather than to have no pose.
+    """
+    site = problem.calibration.site
+    if site.bounds is None:
+        return np.zeros((len(problem.time), count))
+    rotation, position = solved.state.rotation, solved.state.position
+    inverse, _ = open_inverse(solved.information)
+    margin, sigma = margins(site, rotation, position, inverse[:, 3:6, 3:6])
+    added = -2.0 * np.sum(log_ndtr(margin / sigma), axis=1).reshape(-1, count)
+    added = added - np.min(added, axis=1, keepdims=True)
+    return np.where(added > DROPPED, np.inf, added)
+
+
+def margins(
+    site: Site, world_from_body: Array, position_world: Array, position_cov: Array
+) -> tuple[Array, Array]:
+    """Return how far the magnetometer is inside of each plane, and the standard deviation of that.
+
+    Parameters
+    ----------
+    world_from_body : ndarray, shape (n, 3, 3)
+    position_world : ndarray, shape (n, 3)
+        Of the body (m).
+    position_cov : ndarray, shape (n, 3, 3)
+        Body axes (m^2).
+
+    Returns
+    -------
+    margin, sigma : ndarray, shape (n, planes)
+        (m); that of how sharply a plane is declared is in it.
+    """
+    assert site.bounds is not None
+    sensor = position_world + world_from_body @ site.platform.magnetometer.position_body
+    normal_body = site.bounds.normal_world @ world_from_body
+    square = np.einsum("nki,nij,nkj->nk", normal_body, position_cov, normal_body)
+    centres = np.array([beacon.position_world for beacon in site.beacons])
+    away = np.linalg.norm(sensor[:, None] - centres, axis=2).min(axis=1)
+    sigma = np.sqrt(np.maximum(square, 0.0) + (SOFT_EDGE * away[:, None]) ** 2)
+    return site.bounds.margin(sensor), sigma

@@ -1,0 +1,111 @@
+"""Where the magnetometer may be: in a room, on one side of a plane, in front of a beacon.
+
+The field of a dipole is even in the offset, so that a lone beacon leaves the pose on its opposite
+side open; what the user knows of the place decides it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from magfusion.units import Array
+
+
+@dataclass(frozen=True, eq=False)
+class HalfSpace:
+    """One side of a plane.
+
+    Parameters
+    ----------
+    normal_world : ndarray, shape (3,)
+        Of any length, to the side where the magnetometer is.
+    through_world : ndarray, shape (3,)
+        A point of the plane (m).
+    """
+
+    normal_world: Array
+    through_world: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """Where the magnetometer is, whatever the fields say.
+
+    Parameters
+    ----------
+    box_world : ndarray, shape (2, 3), optional
+        Lower and upper corner (m); infinite where there is no limit.
+    half_space : HalfSpace, optional
+    """
+
+    box_world: Array | None = None
+    half_space: HalfSpace | None = None
+
+
+class _Source(Protocol):
+    @property
+    def name(self) -> str: ...
+    @property
+    def position_world(self) -> Array: ...
+    @property
+    def world_from_beacon(self) -> Array: ...
+    @property
+    def hemisphere_beacon(self) -> Array | None: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Planes that the magnetometer does not cross.
+
+    Parameters
+    ----------
+    normal_world : ndarray, shape (k, 3)
+        Unit vectors inwards.
+    offset : ndarray, shape (k,)
+        It is inside where ``normal_world @ position`` is larger (m).
+    names : tuple of str
+        Of the planes, in words.
+    """
+
+    normal_world: Array
+    offset: Array
+    names: tuple[str, ...]
+
+    def margin(self, position_world: Array) -> Array:
+        """Return the distance inside each plane, shape (..., k) (m); negative outside."""
+        return np.asarray(position_world @ self.normal_world.T - self.offset)
+
+
+def bounds_of(region: Region | None, sources: Sequence[_Source]) -> Bounds | None:
+    """Return the planes of a region and of the hemispheres of beacons; None where there are none.
+
+    Parameters
+    ----------
+    sources : sequence of Beacon
+        One whose place is not known yet bounds nothing.
+    """
+    found: list[tuple[Array, float, str]] = []
+    box = None if region is None else region.box_world
+    if box is not None:
+        for axis, letter in enumerate("xyz"):
+            for corner, sign, side in ((0, 1.0, "lower"), (1, -1.0, "upper")):
+                if np.isfinite(box[corner, axis]):
+                    limit = float(sign * box[corner, axis])
+                    found.append((sign * np.eye(3)[axis], limit, f"the {side} limit of {letter}"))
+    half = None if region is None else region.half_space
+    if half is not None:
+        normal = half.normal_world / np.linalg.norm(half.normal_world)
+        found.append((normal, float(normal @ half.through_world), "the plane of the region"))
+    for source in sources:
+        if source.hemisphere_beacon is not None:
+            normal = source.world_from_beacon @ source.hemisphere_beacon
+            normal = normal / np.linalg.norm(normal)
+            offset = float(normal @ source.position_world)
+            if np.isfinite(offset) and np.all(np.isfinite(normal)):
+                found.append((normal, offset, f"the plane through beacon {source.name}"))
+    if not found:
+        return None
+    normals, offsets, names = zip(*found, strict=True)
+    return Bounds(np.array(normals), np.array(offsets), tuple(names))
