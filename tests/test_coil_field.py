@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from derivatives import central_difference
 
-from magfusion.model.coil_field import coil_fields, coil_fields_and_gradients
+from magfusion.model.coil_field import alone, coil_fields, coil_fields_and_gradients
 from magfusion.model.physics.dipole import dipole_field, dipole_gradient
 from magfusion.model.physics.solenoid import solenoid_field
 from magfusion.model.site import Beacon, Coil
@@ -45,10 +45,10 @@ def test_dipoles_are_dipoles_to_the_last_bit() -> None:
     beacon = beacon_of(Coil(MOMENT), Coil(MOMENT[::-1].copy(), centre_beacon=centre))
     points = around(1.3)
     offset = points[:, None] - np.array([np.zeros(3), centre])
-    field, gradient = coil_fields_and_gradients(beacon, points)
+    field, gradient = coil_fields_and_gradients(alone(beacon), points)
     np.testing.assert_array_equal(field, dipole_field(offset, beacon.moments_beacon))
     np.testing.assert_array_equal(gradient, dipole_gradient(offset, beacon.moments_beacon))
-    np.testing.assert_array_equal(coil_fields(beacon, points), field)
+    np.testing.assert_array_equal(coil_fields(alone(beacon), points), field)
 
 
 @each_shape
@@ -57,7 +57,7 @@ def test_the_simulator_which_sums_over_the_wire_agrees(
     shape: tuple[float | None, float | None], distance: float
 ) -> None:
     coil = Coil(MOMENT, 0.0, np.zeros(3), *shape)
-    found = coil_fields(beacon_of(coil), around(distance))[:, 0]
+    found = coil_fields(alone(beacon_of(coil)), around(distance))[:, 0]
     assert relative(found, solenoid_field(around(distance), MOMENT, *shape)) < 1e-6
 
 
@@ -71,7 +71,7 @@ def test_a_sheet_is_the_magnet_of_an_independent_library() -> None:
     beacon = beacon_of(Coil(np.array([0.0, 0.0, moment]), radius=radius, length=length))
     for distance, bound in ((0.35, 1e-5), (0.6, 1e-9), (3.0, 1e-10)):
         points = around(distance)
-        assert relative(coil_fields(beacon, points)[:, 0], magnet.getB(points)) < bound
+        assert relative(coil_fields(alone(beacon), points)[:, 0], magnet.getB(points)) < bound
 
 
 @each_shape
@@ -80,10 +80,12 @@ def test_the_gradient_is_that_of_the_field(shape: tuple[float | None, float | No
     beacon = beacon_of(Coil(MOMENT, 0.0, centre, *shape), Coil(MOMENT[::-1].copy(), radius=0.1))
     for distance in (0.45, 0.8, 2.5, 1e3):
         points = around(distance)
-        field, gradient = coil_fields_and_gradients(beacon, points)
-        np.testing.assert_array_equal(field, coil_fields(beacon, points))
+        field, gradient = coil_fields_and_gradients(alone(beacon), points)
+        np.testing.assert_array_equal(field, coil_fields(alone(beacon), points))
         step = 2e-6 * distance
-        expected = central_difference(lambda d, p=points: coil_fields(beacon, p + d), 3, step)
+        expected = central_difference(
+            lambda d, p=points: coil_fields(alone(beacon), p + d), 3, step
+        )
         for coil in range(2):
             assert relative(gradient[:, coil], expected[:, coil]) < 1e-7
 
@@ -93,6 +95,6 @@ def test_moments_of_a_shape_add() -> None:
     coil = Coil(MOMENT, radius=0.2, length=0.1)
     half = replace(coil, moment_beacon=0.5 * MOMENT)
     points = around(0.5)
-    whole = coil_fields(beacon_of(coil), points)[:, 0]
-    both = coil_fields(beacon_of(half, half), points)
+    whole = coil_fields(alone(beacon_of(coil)), points)[:, 0]
+    both = coil_fields(alone(beacon_of(half, half)), points)
     np.testing.assert_allclose(both.sum(axis=1), whole, rtol=0.0, atol=1e-13 * np.abs(whole).max())

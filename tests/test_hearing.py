@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.estimation.integrity.signal import heard, heard_with_motion, unheard
+from magfusion.estimation.integrity.signal import detected_in, heard, heard_with_motion, unheard
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trust import Verdict
 from magfusion.simulation.demo_site import demo_site
@@ -31,16 +31,19 @@ def test_what_only_motion_hides_is_no_lack_of_signal() -> None:
     raw = heard(moving, SITE)
     assert "low_signal" in doubts(raw)
     freed = phasors(NOISE, TIME[5:])
-    assert doubts(heard_with_motion(raw, freed, SITE)) == []
+    assert doubts(heard_with_motion(raw, detected_in(freed, SITE))) == []
 
 
 def test_what_is_far_away_stays_so() -> None:
     raw = heard(phasors(100.0 * SIGNAL), SITE)
-    assert doubts(heard_with_motion(raw, phasors(50.0 * SIGNAL), SITE)) == ["low_signal"]
+    assert doubts(heard_with_motion(raw, detected_in(phasors(50.0 * SIGNAL), SITE))) == [
+        "low_signal"
+    ]
 
 
 def test_windows_of_another_length_tell_nothing() -> None:
     raw = heard(phasors(100.0 * SIGNAL), SITE)
     elsewhere = phasors(NOISE, TIME + 0.07)
-    assert not np.any(heard_with_motion(raw, elsewhere, SITE).loud)
-    assert np.all(heard_with_motion(raw, replace(elsewhere, time=TIME), SITE).loud)
+    assert not np.any(heard_with_motion(raw, detected_in(elsewhere, SITE)).loud)
+    here = detected_in(replace(elsewhere, time=TIME), SITE)
+    assert np.all(heard_with_motion(raw, here).loud)

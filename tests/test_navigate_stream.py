@@ -75,8 +75,10 @@ def test_a_stream_leads_to_the_states_of_the_log(walk: OnlineLog, site: Path, fo
     # The site went through its file, whose angles are in degrees.
     for found, own in zip(states, expected, strict=True):
         assert found["time"] == own["time"]
+        assert found["heard"] == own["heard"]
         for name in ("position", "quaternion", "velocity", "gyro_bias", "accel_bias"):
             assert np.allclose(found[name], own[name], rtol=1e-6, atol=1e-8)
+    assert {name for s in states for name in s["heard"]} == {b.name for b in walk.site.beacons}
     waiting = [s["time"] for s in given if not s["started"]]
     assert np.all(np.diff(waiting) >= 1.0)
     assert 5 <= len(waiting) <= 8

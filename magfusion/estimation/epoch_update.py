@@ -144,7 +144,8 @@ class EpochUpdate:
         self._hear(before, predicted, estimator.state, found)
         if found is not None:
             self._compare(found.samples, estimator.state)
-        return self._judged(estimator.state, self._lost_since(estimator.state))
+        judged = self._judged(estimator.state, self._lost_since(estimator.state))
+        return judged if found is None else replace(judged, heard=found.heard)
 
     # What was measured
 

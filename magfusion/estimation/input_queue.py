@@ -57,6 +57,12 @@ class Measured:
     steady: SteadyFields | None
     repeats: float
 
+    @property
+    def heard(self) -> tuple[str, ...]:
+        """The beacons that are detected."""
+        channels = zip(self.samples.channels, self.samples.valid[0], strict=True)
+        return tuple(dict.fromkeys(name for (name, _), valid in channels if valid))
+
 
 class Arrivals:
     """Streams in order of time, each on its own clock.

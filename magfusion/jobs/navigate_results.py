@@ -10,6 +10,7 @@ from magfusion.estimation.initialization.online import NoStart
 from magfusion.estimation.integrity.diagnosis import with_cause
 from magfusion.estimation.integrity.judgement import JudgedState
 from magfusion.estimation.integrity.recording import BRIDGED, recorded
+from magfusion.estimation.integrity.signal import Detected
 from magfusion.estimation.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.state import MOTION
 from magfusion.files.site import save_site
@@ -66,7 +67,7 @@ def row_columns(site: Site) -> dict[str, int]:
         "levels": 2,
         "pose_cov": 36,
     }
-    return told | _STATE | {"distortion": beacons, "excluded": beacons}
+    return told | _STATE | {"distortion": beacons, "excluded": beacons, "heard": beacons}
 
 
 def state_row(
@@ -83,6 +84,7 @@ def state_row(
         "pose_cov": state.cov[:6, :6],
         "distortion": np.array([level.get(name, np.nan) for name in names]),
         "excluded": np.array([float(name in state.judgement.excluded) for name in names]),
+        "heard": np.array([float(name in state.judgement.heard) for name in names]),
     }
 
 
@@ -148,6 +150,13 @@ def _chosen(rows: dict[str, Array], trust: Trust, kind: float) -> BoolArray:
     return own & (rows["verdict"][:, 0] < Verdict.FAILED.rank)
 
 
+def _freed(rows: dict[str, Array], site: Site) -> Detected:
+    """Return which beacons were heard at the epochs, the motion inside the windows taken off."""
+    own = rows["lagged"][:, 0] == CURRENT
+    names = tuple(beacon.name for beacon in site.beacons)
+    return Detected(rows["time"][own, 0], names, rows["heard"][own] > 0.0)
+
+
 def _part(rows: dict[str, Array], own: BoolArray, site: Site) -> Part | None:
     if not np.any(own):
         return None
@@ -181,7 +190,8 @@ def navigated(
     site, settings = navigator.site, navigator.settings
     trusted = _part(rows, _chosen(rows, navigator.summary.trust, CURRENT), site)
     poses = None if trusted is None or settings.earth else trusted.states
-    heard = recorded(log, site, BRIDGED, estimated=poses, beacons=True)
+    freed = _freed(rows, site)
+    heard = recorded(log, site, BRIDGED, estimated=poses, beacons=True, freed=freed)
     said = _not_said_again(navigator.summary.trust, heard)
     trust = with_cause(said | Trust(heard), log, site, settings.lockin)
     own = _chosen(rows, trust, CURRENT)

@@ -226,6 +226,7 @@ def state_content(navigator: Navigator, state: JudgedState) -> dict[str, Any]:
         "reasons": _said(state.judgement.reasons),
         "remarks": _said(state.judgement.remarks),
         "excluded": list(state.judgement.excluded),
+        "heard": list(state.judgement.heard),
         "protection_level_m": state.judgement.protection_level_m,
         "protection_level_deg": state.judgement.protection_level_deg,
     }

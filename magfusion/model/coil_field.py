@@ -7,25 +7,104 @@ is below 1e-9 from half a length off the axis, and below 1e-6 from three tenths 
 """
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.model.field_map import FieldMap
 from magfusion.model.physics.dipole import dipole_field, dipole_field_along, dipole_gradient
 from magfusion.model.physics.loop import loop_field, loop_field_and_gradient
 from magfusion.model.site import Beacon, Coil
-from magfusion.units import Array, IntArray
+from magfusion.units import Array, ComplexArray
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 
-class _Loops(NamedTuple):
-    """What stands for the coils of a beacon."""
+class Loops(NamedTuple):
+    """What stands for the coils of a beacon, or of several: with an axis of them, and of one."""
 
-    centre: Array  # (loops, 3), beacon axes (m)
-    moment: Array  # (loops, 3), beacon axes (A m^2)
-    radius: Array  # (loops,), zero for a dipole (m)
-    first: IntArray  # (coils,), the first loop of each
+    centre: Array  # (..., loops, 3), beacon axes (m)
+    moment: Array  # (..., loops, 3), beacon axes (A m^2)
+    radius: Array | None  # (..., loops), zero for a dipole (m); None where all are
+    first: tuple[int, ...]  # the first loop of each coil
+
+
+class Sources(NamedTuple):
+    """A beacon, or several of one form side by side, as arrays that broadcast against points.
+
+    Parameters
+    ----------
+    position_world : ndarray, shape (3,) or (beacons, 1, 3)
+        (m)
+    world_from_beacon : ndarray, shape (3, 3) or (beacons, 3, 3)
+    excitation : complex ndarray, shape (coils, tones) or (beacons, 1, coils, tones)
+        As of `magfusion.model.site.Beacon`.
+    loops : Loops
+    concentric : bool
+        All coils of a beacon are at one place.
+    field_map : FieldMap, optional
+        Of one beacon.
+    """
+
+    position_world: Array
+    world_from_beacon: Array
+    excitation: ComplexArray
+    loops: Loops
+    concentric: bool
+    field_map: FieldMap | None = None
+
+
+@lru_cache(maxsize=256)
+def alone(beacon: Beacon) -> Sources:
+    """Return a beacon as the source that it is."""
+    return Sources(
+        position_world=beacon.position_world,
+        world_from_beacon=beacon.world_from_beacon,
+        excitation=beacon.excitation,
+        loops=_loops(beacon),
+        concentric=bool(np.all(beacon.centres_beacon == beacon.centres_beacon[0])),
+        field_map=beacon.field_map,
+    )
+
+
+@lru_cache(maxsize=64)
+def side_by_side(beacons: tuple[Beacon, ...]) -> tuple[tuple[tuple[int, ...], Sources], ...]:
+    """Return beacons as few sources: those of one form together, one that has a map alone.
+
+    A field is evaluated of several at once at the cost of one where the points are few.
+
+    Returns
+    -------
+    tuple
+        Of the numbers of beacons, and their source.
+    """
+    of_form: dict[object, list[int]] = {}
+    sources = [alone(beacon) for beacon in beacons]
+    for k, source in enumerate(sources):
+        loops, mapped = source.loops, k if source.field_map is not None else None
+        shape = source.excitation.shape, loops.first, loops.centre.shape, loops.radius is None
+        of_form.setdefault((*shape, source.concentric, mapped), []).append(k)
+    return tuple((tuple(rows), _stacked([sources[k] for k in rows])) for rows in of_form.values())
+
+
+def _stacked(sources: list[Sources]) -> Sources:
+    if len(sources) == 1:
+        return sources[0]
+    loops = [source.loops for source in sources]
+    radius = [each.radius for each in loops if each.radius is not None]
+    return Sources(
+        position_world=np.stack([s.position_world for s in sources])[:, None],
+        world_from_beacon=np.stack([s.world_from_beacon for s in sources]),
+        excitation=np.stack([s.excitation for s in sources])[:, None],
+        loops=Loops(
+            centre=np.stack([each.centre for each in loops])[:, None],
+            moment=np.stack([each.moment for each in loops])[:, None],
+            radius=np.stack(radius)[:, None] if radius else None,
+            first=loops[0].first,
+        ),
+        concentric=sources[0].concentric,
+    )
 
 
 def is_sized(beacon: Beacon) -> bool:
@@ -39,17 +118,21 @@ def as_points(beacon: Beacon) -> Beacon:
     return replace(beacon, coils=points)
 
 
-def _loops(coils: tuple[Coil, ...]) -> _Loops:
+def _loops(beacon: Beacon) -> Loops:
+    coils = beacon.coils
+    if not is_sized(beacon):
+        whole = tuple(range(len(coils)))
+        return Loops(beacon.centres_beacon, beacon.moments_beacon, None, whole)
     nodes, weights = zip(*(_slices(coil) for coil in coils), strict=True)
     count = [len(weight) for weight in weights]
-    moment = np.repeat([coil.moment_beacon for coil in coils], count, axis=0)
+    moment = np.repeat(beacon.moments_beacon, count, axis=0)
     axis = moment / np.linalg.norm(moment, axis=1, keepdims=True)
-    centre = np.repeat([coil.centre_beacon for coil in coils], count, axis=0)
-    return _Loops(
+    centre = np.repeat(beacon.centres_beacon, count, axis=0)
+    return Loops(
         centre=centre + np.concatenate(nodes)[:, None] * axis,
         moment=np.concatenate(weights)[:, None] * moment,
         radius=np.repeat([coil.radius or 0.0 for coil in coils], count),
-        first=np.concatenate([[0], np.cumsum(count[:-1])]).astype(np.int64),
+        first=tuple(np.cumsum([0, *count[:-1]]).tolist()),
     )
 
 
@@ -60,12 +143,12 @@ def _slices(coil: Coil) -> tuple[Array, Array]:
     return 0.5 * coil.length * _NODES, 0.5 * _WEIGHTS
 
 
-def coil_fields(beacon: Beacon, offset_beacon: Array) -> Array:
+def coil_fields(source: Sources, offset_beacon: Array) -> Array:
     """Return the field of each coil at its peak current.
 
     Parameters
     ----------
-    offset_beacon : ndarray, shape (..., 3)
+    offset_beacon : ndarray, shape (..., 3) or (beacons, n, 3)
         From the beacon's origin, beacon axes (m).
 
     Returns
@@ -73,20 +156,20 @@ def coil_fields(beacon: Beacon, offset_beacon: Array) -> Array:
     ndarray, shape (..., coils, 3)
         Beacon axes (T).
     """
-    if not is_sized(beacon):
-        offset = offset_beacon[..., None, :] - beacon.centres_beacon
-        return dipole_field(offset, beacon.moments_beacon)
-    loops = _loops(beacon.coils)
-    field = loop_field(offset_beacon[..., None, :] - loops.centre, loops.moment, loops.radius)
+    loops = source.loops
+    offset = offset_beacon[..., None, :] - loops.centre
+    if loops.radius is None:
+        return dipole_field(offset, loops.moment)
+    field = loop_field(offset, loops.moment, loops.radius)
     return np.asarray(np.add.reduceat(field, loops.first, axis=-2))
 
 
-def coil_fields_and_gradients(beacon: Beacon, offset_beacon: Array) -> tuple[Array, Array]:
+def coil_fields_and_gradients(source: Sources, offset_beacon: Array) -> tuple[Array, Array]:
     """Return the field of each coil at its peak current, with its gradient.
 
     Parameters
     ----------
-    offset_beacon : ndarray, shape (..., 3)
+    offset_beacon : ndarray, shape (..., 3) or (beacons, n, 3)
         From the beacon's origin, beacon axes (m).
 
     Returns
@@ -96,13 +179,11 @@ def coil_fields_and_gradients(beacon: Beacon, offset_beacon: Array) -> tuple[Arr
     gradient : ndarray, shape (..., coils, 3, 3)
         ``[i, j] = d field_i / d offset_j`` (T/m).
     """
-    if not is_sized(beacon):
-        offset, moments = offset_beacon[..., None, :] - beacon.centres_beacon, beacon.moments_beacon
-        return dipole_field(offset, moments), dipole_gradient(offset, moments)
-    loops = _loops(beacon.coils)
-    field, gradient = loop_field_and_gradient(
-        offset_beacon[..., None, :] - loops.centre, loops.moment, loops.radius
-    )
+    loops = source.loops
+    offset = offset_beacon[..., None, :] - loops.centre
+    if loops.radius is None:
+        return dipole_field(offset, loops.moment), dipole_gradient(offset, loops.moment)
+    field, gradient = loop_field_and_gradient(offset, loops.moment, loops.radius)
     return (
         np.asarray(np.add.reduceat(field, loops.first, axis=-2)),
         np.asarray(np.add.reduceat(gradient, loops.first, axis=-3)),
@@ -125,17 +206,17 @@ class Driven(NamedTuple):
 
 
 def driven_dipoles(
-    beacon: Beacon, offset_beacon: Array, current: Array, along_beacon: Array | None
+    source: Sources, offset_beacon: Array, current: Array, along_beacon: Array | None
 ) -> Driven:
     """Return the field of coils without a size: of those at one place that of one moment.
 
     Parameters
     ----------
-    offset_beacon : ndarray, shape (n, 3)
+    offset_beacon : ndarray, shape (..., n, 3)
         From the beacon's origin, beacon axes (m).
-    current : ndarray, shape (n, coils)
+    current : ndarray, shape (..., n, coils)
         Of each coil, as a share of its peak.
-    along_beacon : ndarray, shape (n, 3), optional
+    along_beacon : ndarray, shape (..., n, 3), optional
         A displacement of the points.
 
     Returns
@@ -143,12 +224,19 @@ def driven_dipoles(
     Driven
         Beacon axes.
     """
-    field, along = np.zeros_like(offset_beacon), np.zeros_like(offset_beacon)
-    centres, place = np.unique(beacon.centres_beacon, axis=0, return_inverse=True)
-    for k, centre in enumerate(centres):
-        here = place == k
-        moment, offset = current[:, here] @ beacon.moments_beacon[here], offset_beacon - centre
-        field += dipole_field(offset, moment)
-        if along_beacon is not None:
-            along += dipole_field_along(offset, moment, along_beacon)
-    return Driven(field, None if along_beacon is None else along)
+    centre, moments = source.loops.centre, source.loops.moment
+    if source.concentric:
+        moment, offset = current @ _of_matrices(moments), offset_beacon - centre[..., 0, :]
+        by = None if along_beacon is None else dipole_field_along(offset, moment, along_beacon)
+        return Driven(dipole_field(offset, moment), by)
+    moment, offset = current[..., None] * moments, offset_beacon[..., None, :] - centre
+    field = np.sum(dipole_field(offset, moment), axis=-2)
+    if along_beacon is None:
+        return Driven(field, None)
+    along = dipole_field_along(offset, moment, along_beacon[..., None, :])
+    return Driven(field, np.sum(along, axis=-2))
+
+
+def _of_matrices(of_points: Array) -> Array:
+    """Return the array of each beacon's coils without the axis that is for its points."""
+    return of_points[..., 0, :, :] if of_points.ndim > 2 else of_points

@@ -10,10 +10,11 @@ import numpy as np
 
 from magfusion.model.coil_field import (
     Driven,
+    Sources,
+    alone,
     coil_fields,
     coil_fields_and_gradients,
     driven_dipoles,
-    is_sized,
 )
 from magfusion.model.receive_coils import (
     Observation,
@@ -51,11 +52,15 @@ def by_matrix(field_sensor: Array | ComplexArray) -> Array | ComplexArray:
     return columns.reshape(*field_sensor.shape, 9)
 
 
+def _source(beacon: Beacon | Sources) -> Sources:
+    return alone(beacon) if isinstance(beacon, Beacon) else beacon
+
+
 def _offset_beacon(
-    beacon: Beacon, magnetometer: Magnetometer, world_from_body: Array, position_world: Array
+    source: Sources, magnetometer: Magnetometer, world_from_body: Array, position_world: Array
 ) -> Array:
     sensor_world = position_world + world_from_body @ magnetometer.position_body
-    return (sensor_world - beacon.position_world) @ beacon.world_from_beacon
+    return (sensor_world - source.position_world) @ source.world_from_beacon
 
 
 def _turned(excitation: ComplexArray, phase: Array | None) -> ComplexArray:
@@ -71,13 +76,13 @@ class _Mapped(NamedTuple):
     slope: Array  # (..., coils, 3, 3), what the map's change along each axis adds to the gradient
 
 
-def _mapped(beacon: Beacon, offset_beacon: Array, model_beacon: Array) -> _Mapped | None:
+def _mapped(source: Sources, offset_beacon: Array, model_beacon: Array) -> _Mapped | None:
     """Evaluate the beacon's map at the sensor; None where it has none."""
-    if beacon.field_map is None:
+    if source.field_map is None:
         return None
-    world_from_beacon = beacon.world_from_beacon
-    sensor_world = beacon.position_world + offset_beacon @ world_from_beacon.T
-    value, gradient = beacon.field_map.mean(sensor_world)
+    world_from_beacon = source.world_from_beacon
+    sensor_world = source.position_world + offset_beacon @ world_from_beacon.T
+    value, gradient = source.field_map.mean(sensor_world)
     gradient = gradient @ world_from_beacon
     turn_beacon = value[..., 1:] @ world_from_beacon
     by_axis = (world_from_beacon.T @ gradient[..., 1:, :])[..., None, :, :]
@@ -90,7 +95,7 @@ def _mapped(beacon: Beacon, offset_beacon: Array, model_beacon: Array) -> _Mappe
 
 
 def predict(
-    beacon: Beacon,
+    beacon: Beacon | Sources,
     magnetometer: Magnetometer,
     world_from_body: Array,
     position_world: Array,
@@ -103,19 +108,20 @@ def predict(
             for at in points_apart(magnetometer)
         ]
         return joined_phasors(seen, magnetometer)
-    offset = _offset_beacon(beacon, magnetometer, world_from_body, position_world)
-    coils = coil_fields(beacon, offset)
-    mapped = _mapped(beacon, offset, coils)
+    source = _source(beacon)
+    offset = _offset_beacon(source, magnetometer, world_from_body, position_world)
+    coils = coil_fields(source, offset)
+    mapped = _mapped(source, offset, coils)
     if mapped is not None:
         coils = (mapped.correction @ coils[..., None])[..., 0]
-    in_beacon = np.swapaxes(_turned(beacon.excitation, phase), -1, -2) @ coils
-    beacon_from_body = beacon.world_from_beacon.T @ world_from_body
-    in_body = in_beacon @ beacon_from_body
+    in_beacon = np.swapaxes(_turned(source.excitation, phase), -1, -2) @ coils
+    body_from_beacon = _times(np.swapaxes(world_from_body, -1, -2), source.world_from_beacon)
+    in_body = in_beacon @ np.swapaxes(body_from_beacon, -1, -2)
     return in_body @ (magnetometer.body_from_sensor @ magnetometer.matrix.T)
 
 
 def observe(
-    beacon: Beacon,
+    beacon: Beacon | Sources,
     magnetometer: Magnetometer,
     world_from_body: Array,
     position_world: Array,
@@ -134,8 +140,9 @@ def observe(
 
     Parameters
     ----------
-    beacon : Beacon
-        Coils with their moments, centres, and complex drive in each tone.
+    beacon : Beacon or Sources
+        Coils with their moments, centres, and complex drive in each tone; of several beacons of
+        `magfusion.model.coil_field.side_by_side`, what is returned has an axis of them in front.
     magnetometer : Magnetometer
         Matrix, mounting and lever arm.
     world_from_body : ndarray, shape (..., 3, 3)
@@ -158,7 +165,7 @@ def observe(
         ]
         return joined(apart, magnetometer)
     mounting, matrix = magnetometer.body_from_sensor, magnetometer.matrix
-    seen = _seen(beacon, magnetometer, world_from_body, position_world, phase)
+    seen = _seen(_source(beacon), magnetometer, world_from_body, position_world, phase)
     phasor, platform_pose = seen.phasor_sensor, seen.platform_pose
     field_beacon = seen.tones_from_coils @ seen.coils_beacon
     sensor_from_body = matrix @ mounting.T
@@ -194,7 +201,7 @@ def observe(
 
 
 def observe_from(
-    beacon: Beacon,
+    beacon: Beacon | Sources,
     magnetometer: Magnetometer,
     world_from_body: Array,
     position_world: Array,
@@ -204,7 +211,7 @@ def observe_from(
     if is_apart(magnetometer):
         whole = observe(beacon, magnetometer, world_from_body, position_world, phase)
         return whole.phasor_sensor, whole.platform_pose
-    seen = _seen(beacon, magnetometer, world_from_body, position_world, phase)
+    seen = _seen(_source(beacon), magnetometer, world_from_body, position_world, phase)
     return seen.phasor_sensor, seen.platform_pose
 
 
@@ -221,26 +228,28 @@ class _Seen(NamedTuple):
 
 
 def _times(left: Array, right: Array) -> Array:
-    """Return ``left @ right`` of many and one: a single product is faster than as many small."""
-    return (left.reshape(-1, 3) @ right).reshape(left.shape)
+    """Return ``left @ right`` of many and one, or one a beacon: few products beat many small."""
+    if right.ndim == 2:
+        return (left.reshape(-1, 3) @ right).reshape(left.shape)
+    return (left.reshape(-1, 3) @ right).reshape(len(right), *left.shape)
 
 
 def _seen(
-    beacon: Beacon,
+    source: Sources,
     magnetometer: Magnetometer,
     world_from_body: Array,
     position_world: Array,
     phase: Array | None,
 ) -> _Seen:
-    offset_beacon = _offset_beacon(beacon, magnetometer, world_from_body, position_world)
-    coils, gradients = coil_fields_and_gradients(beacon, offset_beacon)
-    tones_from_coils = np.swapaxes(_turned(beacon.excitation, phase), -1, -2)
-    body_from_beacon = _times(np.swapaxes(world_from_body, -1, -2), beacon.world_from_beacon)
+    offset_beacon = _offset_beacon(source, magnetometer, world_from_body, position_world)
+    coils, gradients = coil_fields_and_gradients(source, offset_beacon)
+    tones_from_coils = np.swapaxes(_turned(source.excitation, phase), -1, -2)
+    body_from_beacon = _times(np.swapaxes(world_from_body, -1, -2), source.world_from_beacon)
     beacon_from_body = np.swapaxes(body_from_beacon, -1, -2)
     body_from_sensor = magnetometer.body_from_sensor @ magnetometer.matrix.T  # not a rotation
     measured_from_beacon = np.swapaxes(_times(beacon_from_body, body_from_sensor), -1, -2)
     # Coil by coil all is real; only their sum in a tone is complex.
-    mapped = _mapped(beacon, offset_beacon, coils)
+    mapped = _mapped(source, offset_beacon, coils)
     if mapped is not None:
         coils = (mapped.correction @ coils[..., None])[..., 0]
         gradients = mapped.correction @ gradients + mapped.slope
@@ -265,41 +274,48 @@ def _seen(
 
 
 def driven_field(
-    beacon: Beacon, position_world: Array, current: Array, along_world: Array | None = None
+    beacon: Beacon | Sources,
+    position_world: Array,
+    current: Array,
+    along_world: Array | None = None,
 ) -> Driven:
     """Return the field of a beacon at points, its coils' currents given, world axes.
 
     Parameters
     ----------
+    beacon : Beacon or Sources
+        As of `observe`.
     position_world : ndarray, shape (n, 3)
         (m)
-    current : ndarray, shape (n, coils)
+    current : ndarray, shape (n, coils) or (beacons, n, coils)
         Of each coil, as a share of its peak.
     along_world : ndarray, shape (n, 3), optional
         A displacement of the points, or their velocity.
     """
-    world_from_beacon = beacon.world_from_beacon
-    offset = (position_world - beacon.position_world) @ world_from_beacon
+    source = _source(beacon)
+    world_from_beacon = source.world_from_beacon
+    offset = (position_world - source.position_world) @ world_from_beacon
     along = None if along_world is None else along_world @ world_from_beacon
-    if is_sized(beacon) or beacon.field_map is not None:
-        driven = _driven_coils(beacon, offset, current, along)
+    if source.loops.radius is not None or source.field_map is not None:
+        driven = _driven_coils(source, offset, current, along)
     else:
-        driven = driven_dipoles(beacon, offset, current, along)
-    by = None if driven.along is None else driven.along @ world_from_beacon.T
-    return Driven(driven.field @ world_from_beacon.T, by)
+        driven = driven_dipoles(source, offset, current, along)
+    back = np.swapaxes(world_from_beacon, -1, -2)
+    return Driven(driven.field @ back, None if driven.along is None else driven.along @ back)
 
 
-def _driven_coils(beacon: Beacon, offset: Array, current: Array, along: Array | None) -> Driven:
+def _driven_coils(source: Sources, offset: Array, current: Array, along: Array | None) -> Driven:
     """Return the field of coils of any size, with the beacon's map, as `driven_dipoles`."""
-    coils, gradients = coil_fields_and_gradients(beacon, offset)
-    mapped = _mapped(beacon, offset, coils)
+    coils, gradients = coil_fields_and_gradients(source, offset)
+    mapped = _mapped(source, offset, coils)
     if mapped is not None:
         coils = (mapped.correction @ coils[..., None])[..., 0]
         gradients = mapped.correction @ gradients + mapped.slope
-    field = np.einsum("nc,ncx->nx", current, coils)
+    field = np.einsum("...nc,...ncx->...nx", current, coils)
     if along is None:
         return Driven(field, None)
-    return Driven(field, np.einsum("nc,ncxy,ny->nx", current, gradients, along, optimize=True))
+    by = np.einsum("...nc,...ncxy,...ny->...nx", current, gradients, along, optimize=True)
+    return Driven(field, by)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.model.coil_field import side_by_side
 from magfusion.model.field import driven_field
 from magfusion.model.parameters import Calibration
 from magfusion.model.receive_coils import is_apart, joined_samples, points_apart
@@ -78,16 +79,22 @@ def predicted_waveform(
 
 
 def _currents(calibration: Calibration, time: Array, carrier: ComplexArray) -> list[Array]:
-    """Return the current of each beacon's coils as a share of its peak, shape (n, coils)."""
+    """Return the currents of each source's coils as a share of their peak.
+
+    Shape (n, coils), or (beacons, n, coils) where it is several beacons.
+    """
     still = not np.any(calibration.drift)
     phase = calibration.phase if still else calibration.drive_phase(time)
     drive = carrier * (np.exp(calibration.log_gain) * np.exp(1j * phase))
-    out, start = [], 0
+    of_beacon, start = [], 0
     for beacon in calibration.site.beacons:
         tones = slice(start, start + len(beacon.tones))
-        out.append(np.asarray((drive[:, tones] @ beacon.excitation.T).real))
+        of_beacon.append(np.asarray((drive[:, tones] @ beacon.excitation.T).real))
         start = tones.stop
-    return out
+    return [
+        np.stack([of_beacon[k] for k in rows]) if len(rows) > 1 else of_beacon[rows[0]]
+        for rows, _ in side_by_side(calibration.site.beacons)
+    ]
 
 
 def _at_point(
@@ -105,11 +112,11 @@ def _at_point(
     if change is not None:
         along = change.position_world + np.cross(change.rotation_world, lever)
     field, by = np.tile(earth_field_world, (len(rotation), 1)), np.zeros((len(rotation), 3))
-    for beacon, current in zip(site.beacons, currents, strict=True):
-        driven = driven_field(beacon, motion.position_world + lever, current, along)
-        field += driven.field
+    for (_, source), current in zip(side_by_side(site.beacons), currents, strict=True):
+        driven = driven_field(source, motion.position_world + lever, current, along)
+        field += np.sum(driven.field.reshape(-1, *field.shape), axis=0)
         if driven.along is not None:
-            by += driven.along
+            by += np.sum(driven.along.reshape(-1, *field.shape), axis=0)
     measured_from_body = (magnetometer.matrix @ magnetometer.body_from_sensor.T).T
     if change is not None:
         by += np.cross(field, change.rotation_world)

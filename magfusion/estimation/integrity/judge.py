@@ -18,6 +18,7 @@ from magfusion.estimation.integrity.priors_of_log import bias_change, calibratio
 from magfusion.estimation.integrity.recording import BRIDGED, recorded
 from magfusion.estimation.integrity.residual_blocks import fields, fixes, inertial
 from magfusion.estimation.integrity.score import field_residual, moved_estimate, score_of
+from magfusion.estimation.integrity.signal import detected_in
 from magfusion.estimation.integrity.testimony import Case, Testimony
 from magfusion.estimation.integrity.tuned_noise import tuned_noise
 from magfusion.model.samples import Log
@@ -40,7 +41,8 @@ def judged(result: Smoothed, log: Log) -> tuple[Smoothed, Trust]:
     alone = result.earth_residual is None
     states = result.states if alone else None  # else the Earth field has had its say in them
     streams = log, result.declared.site, BRIDGED
-    heard = recorded(*streams, estimated=states, beacons=alone, freed=result.fields)
+    freed = detected_in(result.fields, result.declared.site)
+    heard = recorded(*streams, estimated=states, beacons=alone, freed=freed)
     trust = Trust((*tuned_noise(result.noise), *heard))
     pose_cov = result.states.pose_cov
     if pose_cov is None:

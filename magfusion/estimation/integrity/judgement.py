@@ -25,6 +25,8 @@ class Judgement:
         What the attitude (rad) and the position (m) may be off by beyond that, one sigma an axis.
     protection_level_m, protection_level_deg : float, optional
         None where there is none.
+    heard : tuple of str
+        Beacons that were told from noise there, the motion inside the window taken off.
     """
 
     findings: tuple[Finding, ...] = ()
@@ -34,6 +36,7 @@ class Judgement:
     shift: float = 0.0
     protection_level_m: float | None = None
     protection_level_deg: float | None = None
+    heard: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> Verdict:

@@ -14,11 +14,17 @@ from magfusion.estimation.integrity.samples import (
     frozen_samples,
     repeated_samples,
 )
-from magfusion.estimation.integrity.signal import Heard, heard_in, heard_with_motion, unheard
+from magfusion.estimation.integrity.signal import (
+    Detected,
+    Heard,
+    heard_in,
+    heard_with_motion,
+    unheard,
+)
 from magfusion.estimation.integrity.spectrum import undeclared_lines
 from magfusion.estimation.integrity.stamps import uneven_stamps
 from magfusion.estimation.integrity.turn_witness import turned_otherwise
-from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Trust, Verdict
@@ -53,7 +59,7 @@ def recorded(
     beacons: bool = False,
     hearing: Heard | None = None,
     lockin: LockinSettings | None = None,
-    freed: FieldSamples | None = None,
+    freed: Detected | None = None,
 ) -> tuple[Finding, ...]:
     """Return what is wrong with a recording; without a site, of the streams alone.
 
@@ -72,8 +78,8 @@ def recorded(
         How they are heard, where that is known already.
     lockin : LockinSettings, optional
         As it was asked for.
-    freed : FieldSamples, optional
-        The phasors of a solution, freed of the motion inside the windows.
+    freed : Detected, optional
+        How they are heard by a solution, the motion inside the windows taken off.
     """
     found = [*log.noticed, *(one for witness in WITNESSES for one in witness(log, site))]
     log = beginning(log)
@@ -86,7 +92,7 @@ def recorded(
         found += [f for f in undeclared_lines(log, site, lockin) if _matters(f)]
         hearing = heard_in(log, site) if hearing is None else hearing
         if hearing is not None and freed is not None:
-            hearing = heard_with_motion(hearing, freed, site)
+            hearing = heard_with_motion(hearing, freed)
         found += [] if hearing is None else unheard(hearing, site)
     return tuple(replace(f, verdict=Verdict.TRUSTWORTHY) if f.code in bridged else f for f in found)
 

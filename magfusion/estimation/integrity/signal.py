@@ -22,6 +22,7 @@ UNHEARD = 0.1  # share of the epochs without any beacon, from which it casts dou
 SILENCE = 1.0  # s; a shorter one is not said
 FALLEN = 0.2  # of the amplitude beside it, what is left of a beacon that is switched off
 LISTED = 3
+SAME_WINDOW = 1e-6  # s; between the centres of one and the same window
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +46,23 @@ class Heard:
     beacons: tuple[str, ...]
     snr: Array
     amplitude: Array
+    loud: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class Detected:
+    """Which beacons are told from noise in phasors that are freed of motion.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    beacons : tuple of str
+    loud : bool ndarray, shape (n, beacons)
+    """
+
+    time: Array
+    beacons: tuple[str, ...]
     loud: BoolArray
 
 
@@ -90,19 +108,30 @@ def heard_in(log: Log, site: Site, lockin: LockinSettings | None = None) -> Hear
         return None
 
 
-def heard_with_motion(raw: Heard, freed: FieldSamples, site: Site) -> Heard:
+def detected_in(samples: FieldSamples, site: Site) -> Detected:
+    """Return which beacons are told from noise in the phasors of a solution."""
+    found = heard(samples, site)
+    return Detected(found.time, found.beacons, found.loud)
+
+
+def heard_with_motion(raw: Heard, freed: Detected) -> Heard:
     """Return how well the beacons are heard once the motion inside the windows is taken off.
 
     Parameters
     ----------
     raw : Heard
         With that motion in the noise.
-    freed : FieldSamples
-        The phasors of a solution; those of its windows that are among ``raw``'s count.
+    freed : Detected
+        By a solution; those of its windows that are among ``raw``'s count.
     """
-    _, among, of = np.intersect1d(raw.time, freed.time, return_indices=True)
+    if len(freed.time) == 0:
+        return raw
+    nearest = np.clip(np.searchsorted(freed.time, raw.time), 1, len(freed.time) - 1)
+    nearest -= raw.time - freed.time[nearest - 1] < freed.time[nearest] - raw.time
+    among = np.flatnonzero(np.abs(freed.time[nearest] - raw.time) < SAME_WINDOW)
+    columns = np.array([raw.beacons.index(name) for name in freed.beacons])
     loud = raw.loud.copy()
-    loud[among] |= heard(freed, site).loud[of]
+    loud[np.ix_(among, columns)] |= freed.loud[nearest[among]]
     return replace(raw, loud=loud)
 
 

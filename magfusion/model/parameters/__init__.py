@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
-from magfusion.model.field import observe, observe_from, predict
 from magfusion.model.parameters.beacon import BEACON_POSITION as BEACON_POSITION
 from magfusion.model.parameters.beacon import BEACON_ROTATION as BEACON_ROTATION
 from magfusion.model.parameters.beacon import DRIFT as DRIFT
@@ -17,15 +16,17 @@ from magfusion.model.parameters.beacon import LOG_MOMENT as LOG_MOMENT
 from magfusion.model.parameters.beacon import PHASE as PHASE
 from magfusion.model.parameters.beacon import PHASE_SIGMA as PHASE_SIGMA
 from magfusion.model.parameters.beacon import BeaconParameter as BeaconParameter
+from magfusion.model.parameters.channels import linearize_channels as linearize_channels
+from magfusion.model.parameters.channels import predict_channels as predict_channels
 from magfusion.model.parameters.parameter import CENTIMETRE as CENTIMETRE
 from magfusion.model.parameters.parameter import DEGREES as DEGREES
 from magfusion.model.parameters.parameter import PERCENT as PERCENT
 from magfusion.model.parameters.parameter import Block as Block
 from magfusion.model.parameters.parameter import Calibration as Calibration
 from magfusion.model.parameters.parameter import Parameter as Parameter
-from magfusion.model.parameters.parameter import PhasorView
 from magfusion.model.parameters.parameter import SteadyView as SteadyView
 from magfusion.model.parameters.parameter import Unit as Unit
+from magfusion.model.parameters.parameter import dimension as dimension
 from magfusion.model.parameters.platform import CLOCK_RATE as CLOCK_RATE
 from magfusion.model.parameters.platform import DECLINATION as DECLINATION
 from magfusion.model.parameters.platform import MATRIX as MATRIX
@@ -36,7 +37,7 @@ from magfusion.model.parameters.platform import STRENGTH as STRENGTH
 from magfusion.model.parameters.platform import TIME_OFFSET as TIME_OFFSET
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
-from magfusion.units import Array, ComplexArray
+from magfusion.units import Array
 
 PARAMETERS: tuple[Parameter, ...] = (
     BEACON_ROTATION,
@@ -170,11 +171,6 @@ def _blocks(
     return placed(blocks)
 
 
-def dimension(blocks: tuple[Block, ...]) -> int:
-    """Return the length of the tangent vector."""
-    return blocks[-1].columns.stop if blocks else 0
-
-
 def prior_sigma(blocks: tuple[Block, ...]) -> Array:
     """Return the prior standard deviations, shape (dimension,)."""
     return np.concatenate([b.sigma for b in blocks]) if blocks else np.zeros(0)
@@ -209,89 +205,3 @@ def corrected_imu(
 def inertial_blocks(blocks: tuple[Block, ...]) -> tuple[Block, ...]:
     """Return the blocks that correct the inertial stream."""
     return tuple(block for block in blocks if block.parameter.inertial)
-
-
-def predict_channels(
-    calibration: Calibration, time: Array, world_from_body: Array, position_world: Array
-) -> ComplexArray:
-    """Return the phasors of every channel, shape (..., channels, 3), measured axes (T)."""
-    phase = calibration.drive_phase(time)
-    site = calibration.site
-    parts, start = [], 0
-    for beacon in site.beacons:
-        tones = slice(start, start + len(beacon.tones))
-        parts.append(
-            predict(
-                beacon,
-                site.platform.magnetometer,
-                world_from_body,
-                position_world,
-                phase[..., tones],
-            )
-        )
-        start = tones.stop
-    gain = np.exp(calibration.log_gain)[..., None]
-    return gain * np.concatenate(parts, axis=-2)
-
-
-def linearize_channels(
-    calibration: Calibration,
-    blocks: tuple[Block, ...],
-    time: Array,
-    world_from_body: Array,
-    position_world: Array,
-    twist_body: Array | None = None,
-) -> tuple[Array, Array, Array]:
-    """Predict every channel as real numbers, with the Jacobian by pose and calibration.
-
-    Parameters
-    ----------
-    blocks : tuple of Block
-        Columns of the calibration's tangent vector.
-    time : ndarray, shape (n,)
-    world_from_body : ndarray, shape (n, 3, 3)
-    position_world : ndarray, shape (n, 3)
-    twist_body : ndarray, shape (n, 6), optional
-        Needed where the time offset is among the blocks.
-
-    Returns
-    -------
-    value : ndarray, shape (n, channels, 6)
-        Real parts, then imaginary parts (T).
-    by_pose : ndarray, shape (n, channels, 6, 6)
-    by_calibration : ndarray, shape (n, channels, 6, dimension)
-    """
-    phase = calibration.drive_phase(time)
-    site, n = calibration.site, len(time)
-    channels = len(site.channels)
-    value = np.empty((n, channels, 6))
-    by_pose = np.empty((n, channels, 6, 6))
-    by_calibration = np.zeros((n, channels, 6, dimension(blocks)))
-    whole = any(not block.parameter.factor_of_phasor for block in blocks)
-    elapsed = time - calibration.reference_time
-    start = 0
-    for beacon in site.beacons:
-        rows = slice(start, start + len(beacon.tones))
-        place = (beacon, site.platform.magnetometer, world_from_body, position_world)
-        seen = observe(*place, phase[..., rows], twist_body) if whole else None
-        phasor, pose = (
-            observe_from(*place, phase[..., rows])
-            if seen is None
-            else (seen.phasor_sensor, seen.platform_pose)
-        )
-        value[:, rows] = _stacked(phasor[..., None])[..., 0]
-        by_pose[:, rows] = _stacked(pose)
-        view = PhasorView(calibration, beacon, elapsed, phasor, seen)
-        for block in blocks:
-            part = block.parameter.phasor_jacobian(view, block.owner)
-            if part is not None:
-                by_calibration[:, rows, :, block.columns] = _stacked(part)
-        start = rows.stop
-    if not np.any(calibration.log_gain):
-        return value, by_pose, by_calibration
-    gain = np.exp(calibration.log_gain)[..., None]
-    return gain * value, gain[..., None] * by_pose, gain[..., None] * by_calibration
-
-
-def _stacked(block: ComplexArray) -> Array:
-    return np.concatenate([block.real, block.imag], axis=-2)

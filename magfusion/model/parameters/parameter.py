@@ -284,3 +284,8 @@ class Block(NamedTuple):
     def key(self) -> tuple[Parameter, str]:
         """What distinguishes it from all others; a beacon may be called sensor, so not its name."""
         return self.parameter, self.owner
+
+
+def dimension(blocks: tuple[Block, ...]) -> int:
+    """Return the length of the tangent vector."""
+    return blocks[-1].columns.stop if blocks else 0

@@ -1,0 +1,140 @@
+"""The phasors of every channel of a site, with their Jacobian by pose and calibration.
+
+Beacons of one form are evaluated side by side: of a single epoch that costs what one costs.
+"""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from magfusion.model.coil_field import Sources, alone, side_by_side
+from magfusion.model.field import observe, observe_from, predict
+from magfusion.model.parameters.parameter import Block, Calibration, PhasorView, dimension
+from magfusion.model.receive_coils import Observation
+from magfusion.model.site import Beacon, Site
+from magfusion.units import Array, ComplexArray
+
+
+class _Group(NamedTuple):
+    """Beacons that are evaluated at once: what that returns has an axis of them in front."""
+
+    source: Sources
+    beacons: tuple[Beacon, ...]
+    tones: tuple[slice, ...]  # of the channels, of each
+
+    def of(self, by_channel: Array) -> Array:
+        """Return what is of their channels, shape (..., channels), to evaluate them with."""
+        own = [by_channel[..., tones] for tones in self.tones]
+        return np.stack(own) if len(own) > 1 else own[0]
+
+    def each(self, evaluated: Observation) -> Iterator[Observation]:
+        """Return what is of each beacon."""
+        if len(self.beacons) == 1:
+            yield evaluated
+            return
+        for k in range(len(self.beacons)):
+            own: dict[str, Any] = {
+                n: None if v is None else v[k] for n, v in vars(evaluated).items()
+            }
+            yield Observation(**own)
+
+    def parted(self, evaluated: ComplexArray) -> ComplexArray:
+        """Return the same with an axis of the beacons in front, if there is but one, too."""
+        return evaluated if len(self.beacons) > 1 else evaluated[None]
+
+
+def _groups(site: Site, *, beside: bool = True) -> list[_Group]:
+    """Return the beacons of a site in as few groups as their forms allow, or each alone."""
+    end = np.cumsum([len(beacon.tones) for beacon in site.beacons]).tolist()
+    tones = [slice(*ends) for ends in pairwise([0, *end])]
+    sources = (
+        side_by_side(site.beacons)
+        if beside
+        else [((k,), alone(beacon)) for k, beacon in enumerate(site.beacons)]
+    )
+    return [
+        _Group(source, tuple(site.beacons[k] for k in rows), tuple(tones[k] for k in rows))
+        for rows, source in sources
+    ]
+
+
+def predict_channels(
+    calibration: Calibration, time: Array, world_from_body: Array, position_world: Array
+) -> ComplexArray:
+    """Return the phasors of every channel, shape (..., channels, 3), measured axes (T)."""
+    phase, site = calibration.drive_phase(time), calibration.site
+    poses = world_from_body, position_world
+    shape = np.broadcast_shapes(
+        world_from_body.shape[:-2], position_world.shape[:-1], phase.shape[:-1]
+    )
+    out = np.empty((*shape, len(site.channels), 3), dtype=np.complex128)
+    beside = world_from_body.ndim == 3 and position_world.ndim == 2
+    for group in _groups(site, beside=beside):
+        phasor = predict(group.source, site.platform.magnetometer, *poses, group.of(phase))
+        for tones, own in zip(group.tones, group.parted(phasor), strict=True):
+            out[..., tones, :] = own
+    return np.asarray(np.exp(calibration.log_gain)[..., None] * out)
+
+
+def linearize_channels(
+    calibration: Calibration,
+    blocks: tuple[Block, ...],
+    time: Array,
+    world_from_body: Array,
+    position_world: Array,
+    twist_body: Array | None = None,
+) -> tuple[Array, Array, Array]:
+    """Predict every channel as real numbers, with the Jacobian by pose and calibration.
+
+    Parameters
+    ----------
+    blocks : tuple of Block
+        Columns of the calibration's tangent vector.
+    time : ndarray, shape (n,)
+    world_from_body : ndarray, shape (n, 3, 3)
+    position_world : ndarray, shape (n, 3)
+    twist_body : ndarray, shape (n, 6), optional
+        Needed where the time offset is among the blocks.
+
+    Returns
+    -------
+    value : ndarray, shape (n, channels, 6)
+        Real parts, then imaginary parts (T).
+    by_pose : ndarray, shape (n, channels, 6, 6)
+    by_calibration : ndarray, shape (n, channels, 6, dimension)
+    """
+    phase, site, n = calibration.drive_phase(time), calibration.site, len(time)
+    channels = len(site.channels)
+    value = np.empty((n, channels, 6))
+    by_pose = np.empty((n, channels, 6, 6))
+    by_calibration = np.zeros((n, channels, 6, dimension(blocks)))
+    whole = any(not block.parameter.factor_of_phasor for block in blocks)
+    elapsed = time - calibration.reference_time
+    for group in _groups(site):
+        place = group.source, site.platform.magnetometer, world_from_body, position_world
+        if whole:
+            seen = observe(*place, group.of(phase), twist_body)
+            phasor, pose = seen.phasor_sensor, seen.platform_pose
+            observations = list[Observation | None](group.each(seen))
+        else:
+            phasor, pose = observe_from(*place, group.of(phase))
+            observations = [None] * len(group.beacons)
+        phasor, pose = group.parted(phasor), group.parted(pose)
+        values, poses = _stacked(phasor[..., None])[..., 0], _stacked(pose)
+        for k, (beacon, tones) in enumerate(zip(group.beacons, group.tones, strict=True)):
+            value[:, tones], by_pose[:, tones] = values[k], poses[k]
+            view = PhasorView(calibration, beacon, elapsed, phasor[k], observations[k])
+            for block in blocks:
+                part = block.parameter.phasor_jacobian(view, block.owner)
+                if part is not None:
+                    by_calibration[:, tones, :, block.columns] = _stacked(part)
+    if not np.any(calibration.log_gain):
+        return value, by_pose, by_calibration
+    gain = np.exp(calibration.log_gain)[..., None]
+    return gain * value, gain[..., None] * by_pose, gain[..., None] * by_calibration
+
+
+def _stacked(block: ComplexArray) -> Array:
+    return np.concatenate([block.real, block.imag], axis=-2)
