@@ -27,7 +27,9 @@ from magfusion.estimation.state import MOTION, VELOCITY, State, as_trajectory
 from magfusion.estimation.stream_buffer import Buffer, check_clock
 from magfusion.model.parameters import CLOCK_RATE, TIME_OFFSET, Block
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
+from magfusion.receiver.cycles import cycles, joins
 from magfusion.receiver.receiver import LockinReceiver, Receiver
+from magfusion.receiver.turn import on_clock
 from magfusion.units import Array
 
 LONGEST_WAIT = 5.0  # s; the fields go on without an IMU that is silent for longer
@@ -287,7 +289,10 @@ class Arrivals:
             self.windows.extend(windows.number[windows.centre > after].tolist())
         else:
             offset = self.applied_offset
-            found = receiver.push(waveform, imu, until, state.gyro_bias_body, offset)
+            bias = state.gyro_bias_body
+            found = receiver.push(waveform, imu, until, bias, offset)
+            if len(found) and joins(receiver.site):
+                found = cycles(found, on_clock(imu, offset, bias), receiver.site)
             self.fields += found.rows(found.time > after).epochs()
 
     def next_window(self) -> float | None:

@@ -72,7 +72,8 @@ class Navigator:
         self.blocks = (*estimated, *placed(considered, dimension(estimated)))
         self._considered = dimension(considered)
         risk, bank = self.settings.risk, None
-        if risk is not None:
+        # Without its only beacon there is nothing to compare with.
+        if risk is not None and len(site.beacons) > 1:
             bank = SubsetBank(site, self.blocks, self._considered, risk)
         self._update = EpochUpdate(site, estimated, self.blocks, self.settings.earth, bank)
         self._process_noise = calibration_process_noise(site, self.blocks, self._considered)

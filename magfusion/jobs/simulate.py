@@ -28,6 +28,15 @@ class SimulateSettings(RandomSettings):
     motion: Literal["walk", "turn", "static"] = option("walk", "How the platform moves")
     duration: float = option(120.0, "Length", unit="s", least=1.0, most=1e6)
     box: str | None = option(None, "Room to move in, m: xmin,xmax,ymin,ymax,zmin,zmax")
+    rate: float | None = option(
+        None,
+        "Magnetometer samples",
+        unit="Hz",
+        least=10.0,
+        most=1e6,
+        note="default: 400, or as many as the tones and time slots of the site need",
+    )
+    imu_rate: float = option(200.0, "Inertial samples", unit="Hz", least=10.0, most=1e4)
     perturb: bool = option(True, "Draw the true calibration from the site's sigmas")
     iron: int = option(0, "Steel spheres about the room, 0.5 m from it or more", least=0, most=200)
     ambient: Literal["quiet", "day-night"] = option(
@@ -84,6 +93,7 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
     from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
     from magfusion.simulation.disturbance import Ambient, FieldDrift, office_noise
     from magfusion.simulation.log import EPOCH_NS, SimulationConfig
+    from magfusion.simulation.waveform import usual_rate_hz
 
     site = demo_site() if settings.site is None else load_site(settings.site)
     box = box_option(settings.box)
@@ -91,6 +101,8 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
         box_world=DEMO_BOX_WORLD if box is None else box,
         duration=settings.duration,
         motion=settings.motion,
+        imu_rate_hz=settings.imu_rate,
+        magnetometer_rate_hz=settings.rate or usual_rate_hz(site),
         perturb=settings.perturb,
         iron=settings.iron,
         random_field=settings.random_field,

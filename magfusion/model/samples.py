@@ -67,6 +67,9 @@ class FieldSamples:
         (T), measured axes; NaN where the channel is missing.
     phasor_cov : ndarray, shape (n, channels, 3, 3)
         Covariance of the real part, and of the imaginary part alike (T^2).
+    ahead : ndarray, shape (n, channels), optional
+        How much later than at ``time`` the sensor was where each phasor was measured (s): of coils
+        driven in turn, whose phasors are in the sensor's axes of ``time`` all the same.
     """
 
     time: Array
@@ -74,6 +77,7 @@ class FieldSamples:
     channels: tuple[tuple[str, int], ...]
     phasor_sensor: ComplexArray
     phasor_cov: Array
+    ahead: Array | None = None
 
     def __post_init__(self) -> None:
         n, c = len(self.time), len(self.channels)
@@ -105,6 +109,9 @@ class FieldSamples:
             channels=parts[0].channels,
             phasor_sensor=np.concatenate([p.phasor_sensor for p in parts]),
             phasor_cov=np.concatenate([p.phasor_cov for p in parts]),
+            ahead=None
+            if all(p.ahead is None for p in parts)
+            else np.concatenate([p.ahead_or_zero for p in parts]),
         )
 
     def epochs(self) -> list["FieldSamples"]:
@@ -119,7 +126,14 @@ class FieldSamples:
             self.channels,
             self.phasor_sensor[kept],
             self.phasor_cov[kept],
+            None if self.ahead is None else self.ahead[kept],
         )
+
+    @property
+    def ahead_or_zero(self) -> Array:
+        """How much later each phasor was measured (s), shape (n, channels)."""
+        shape = (len(self.time), len(self.channels))
+        return np.zeros(shape) if self.ahead is None else self.ahead
 
     @property
     def valid(self) -> BoolArray:

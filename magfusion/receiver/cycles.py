@@ -7,13 +7,25 @@ from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site
 from magfusion.receiver.slots import schedule
 from magfusion.receiver.turn import on_clock, turn_of
+from magfusion.units import Array, BoolArray
+
+# s; from the first to the last slot of an epoch. Half as long after its middle, a head that is
+# accelerated by 10 m/s^2 is 0.2 mm from where a steady velocity leads.
+LONGEST_EPOCH = 0.012
+
+
+def joins(site: Site) -> bool:
+    """Return whether a cycle is short enough to be one epoch while the platform moves."""
+    slots = schedule(site)
+    driven = [slot for beacon in site.beacons for _, slot in beacon.tones if slot is not None]
+    return bool((max(driven) - min(driven)) * slots.duration <= LONGEST_EPOCH)
 
 
 def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSamples:
     """Join the slots of each cycle to one row, as if they were simultaneous.
 
     The fields are turned by the gyro to the mean time of the slots; where the body moves, what it
-    moves by within the cycle remains.
+    moves by within the cycle remains, for which ``ahead`` tells when each was measured.
 
     Parameters
     ----------
@@ -32,30 +44,45 @@ def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSam
     InputError
         Where there is none.
     """
+    found = cycles(samples, on_clock(imu, site.platform.imu.time_offset), site)
+    whole: BoolArray = np.all(found.valid, axis=1)
+    if not np.any(whole):
+        raise InputError(
+            f"no cycle of {schedule(site).count} slots holds all of {len(samples.channels)} coils;"
+            " record longer, or give the site in which the log was recorded"
+        )
+    return found.rows(whole)
+
+
+def cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSamples:
+    """Join the slots of each cycle to one row, whichever of them there are.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        As of `whole_cycles`; at least one.
+    imu : ImuSamples
+        As from `magfusion.receiver.turn.on_clock`.
+    """
     slots = schedule(site)
     _, cycle = np.unique(slots.running(samples.time) // slots.count, return_inverse=True)
     row, channel = np.nonzero(samples.valid)
     number = int(cycle[-1]) + 1
-    seen = np.zeros((number, len(samples.channels)), dtype=bool)
-    seen[cycle[row], channel] = True
-    whole = seen.all(axis=1)
-    if not np.any(whole):
-        raise InputError(
-            f"no cycle of {slots.count} slots holds all of {len(samples.channels)} coils; record"
-            " longer, or give the site in which the log was recorded"
-        )
-    time = np.bincount(cycle, samples.time) / np.bincount(cycle)
-    measured_from_still = turn_of(on_clock(imu, site.platform.imu.time_offset), site)
+    time: Array = np.bincount(cycle, samples.time) / np.bincount(cycle)
+    measured_from_still = turn_of(imu, site)
     still_from_measured = np.linalg.inv(measured_from_still(samples.time[row]))
     turn = measured_from_still(time[cycle[row]]) @ still_from_measured
     phasor = np.full((number, *samples.phasor_sensor.shape[1:]), np.nan, dtype=np.complex128)
     phasor[cycle[row], channel] = (turn @ samples.phasor_sensor[row, channel][..., None])[..., 0]
     cov = np.full((number, *samples.phasor_cov.shape[1:]), np.nan)
     cov[cycle[row], channel] = turn @ samples.phasor_cov[row, channel] @ np.swapaxes(turn, 1, 2)
+    ahead = np.zeros((number, len(samples.channels)))
+    ahead[cycle[row], channel] = samples.time[row] - time[cycle[row]]
     return FieldSamples(
-        time=time[whole],
-        window=np.full(int(np.sum(whole)), slots.cycle),
+        time=time,
+        window=np.full(number, slots.cycle),
         channels=samples.channels,
-        phasor_sensor=phasor[whole],
-        phasor_cov=cov[whole],
+        phasor_sensor=phasor,
+        phasor_cov=cov,
+        ahead=ahead,
     )

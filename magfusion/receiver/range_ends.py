@@ -91,7 +91,7 @@ def _at_end(
     length = np.minimum(index - start + 1, LONGEST)
     kept = np.maximum(np.maximum.accumulate(np.where(inner, length, 0)), known.kept)
     found = np.zeros(len(begin), dtype=bool)
-    first = np.unique(start)
+    first = np.flatnonzero(start == index)
     stop = np.append(first[1:], len(value))
     extreme = (value[first] == low[stop - 1]) | (value[first] == high[stop - 1])
     long = (stop - first >= SHORTEST) & extreme

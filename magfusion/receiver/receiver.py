@@ -26,10 +26,10 @@ from magfusion.receiver.admission import (
 )
 from magfusion.receiver.design import Designs, separable, variance_growth
 from magfusion.receiver.lockin import WindowOperator, designs_of, window_operator
+from magfusion.receiver.slot_phasors import SlotValues, demodulate_slots, slot_values
 from magfusion.receiver.slots import (
     SlotSettings,
     check_carriers,
-    demodulate_slots,
     driven_slots,
     has_schedule,
     history_of,
@@ -45,6 +45,7 @@ from magfusion.units import Array, BoolArray, IntArray
 NO_SILENT_SLOT = "no silent slot beside it"
 # Of the samples of a window: its design tells whether they suffice; of a slot: it has few columns.
 LEAST_SHARE, LEAST_SHARE_OF_SLOT = 0.5, 0.9
+BEFORE = 256  # samples before a window, among which an axis that keeps one value is seen to
 
 
 class Receiver(ABC):
@@ -156,6 +157,12 @@ class Receiver(ABC):
             With the calibration of the magnetometer.
         """
 
+    def pushed(
+        self, waveform: Waveform, imu: ImuSamples, windows: Windows
+    ) -> tuple[FieldSamples, IntArray]:
+        """Return the phasors of windows, of which the last ones are new, as `phasors`."""
+        return self.phasors(waveform, imu, windows, self.site)
+
     @abstractmethod
     def _driven(self, number: IntArray) -> BoolArray:
         """Tell which windows lead to a row of phasors."""
@@ -186,6 +193,7 @@ class Receiver(ABC):
             As of `magfusion.receiver.turn.on_clock`; the offset is the site's where none is given.
         """
         assert self.grid is not None
+        waveform = self._since(waveform)
         new = self.admit(waveform, imu, until).number
         expected = int(np.sum(self._driven(new)))
         known = np.concatenate([self.recent, new])
@@ -195,7 +203,7 @@ class Receiver(ABC):
         windows = self.grid.windows(known, waveform.time)
         offset = self.site.platform.imu.time_offset if time_offset is None else time_offset
         known_imu = on_clock(imu, offset, gyro_bias_body)
-        found, number = self.phasors(waveform, known_imu, windows, self.site)
+        found, number = self.pushed(waveform, known_imu, windows)
         found = found.rows(number >= new[0])
         self._count(NO_SILENT_SLOT, expected - len(found))
         return found
@@ -255,6 +263,13 @@ class Receiver(ABC):
             self._count(reason, int(np.sum(verdict == k)))
         self.without_turn = windows.rows(verdict == REASONS.index(INERTIAL_GAP))
         return windows.rows(verdict < 0)
+
+    def _since(self, waveform: Waveform) -> Waveform:
+        """Return the samples that the next windows, or what is remembered for them, can need."""
+        oldest = min([*self.recent[:1].tolist(), self.next_number]) - 1
+        first = int(np.searchsorted(waveform.time, self.centre_of(oldest))) - BEFORE
+        rows = slice(max(first, 0), None)
+        return Waveform(waveform.time[rows], waveform.measured_sensor[rows])
 
     def _count(self, reason: str, dropped: int) -> None:
         if dropped:
@@ -376,9 +391,11 @@ class LockinReceiver(Receiver):
 class SlotReceiver(Receiver):
     """Of coils driven in turn: each slot a row at its own time, judged by whole cycles."""
 
+    _values: SlotValues  # of those that the phasors of later ones need
+
     def __init__(self, site: Site, settings: LockinSettings | SlotSettings | None = None) -> None:
         super().__init__(site)
-        self._given = settings
+        self._given, self._values = settings, SlotValues.none()
 
     @cached_property
     def settings(self) -> SlotSettings:
@@ -421,7 +438,20 @@ class SlotReceiver(Receiver):
         """Return the phasors of driven slots, freed of what the silent ones tell."""
         assert self.admission is not None
         rate_hz = 1.0 / self.admission.magnetometer_step
-        return demodulate_slots(waveform, imu, site, self.settings, windows, rate_hz)
+        values = slot_values(waveform, imu, site, self.settings, windows, rate_hz)
+        return demodulate_slots(values, imu, site, self.settings)
+
+    def pushed(
+        self, waveform: Waveform, imu: ImuSamples, windows: Windows
+    ) -> tuple[FieldSamples, IntArray]:
+        """Return the phasors of slots, of which the last ones are new, as `Receiver.pushed`."""
+        assert self.admission is not None
+        rate_hz = 1.0 / self.admission.magnetometer_step
+        known = self._values.rows(np.isin(self._values.number, windows.number))
+        fresh = windows.rows(~np.isin(windows.number, known.number))
+        later = slot_values(waveform, imu, self.site, self.settings, fresh, rate_hz)
+        self._values = known.joined(later)
+        return demodulate_slots(self._values, imu, self.site, self.settings)
 
     def _driven(self, number: IntArray) -> BoolArray:
         return driven_slots(self.site, number)

@@ -14,6 +14,7 @@ from magfusion.simulation.slots import check_slots, slot_gates
 from magfusion.units import Array
 
 LEAST_SAMPLES_PER_CYCLE = 2.5
+USUAL_RATE_HZ, USUAL_SAMPLES_PER_SLOT = 400.0, 16
 
 
 def _vertical() -> Array:
@@ -37,6 +38,13 @@ class Mains:
     frequency_hz: float = 50.0
     harmonics: tuple[float, ...] = (0.1, 0.3)
     direction_world: Array = field(default_factory=_vertical)
+
+
+def usual_rate_hz(site: Site) -> float:
+    """Return a sampling rate that suits the fastest tone and the shortest time slot (Hz)."""
+    least = [LEAST_SAMPLES_PER_CYCLE * float(b.tone_frequencies_hz.max()) for b in site.beacons]
+    slots = [USUAL_SAMPLES_PER_SLOT / b.slots.duration for b in site.beacons if b.slots is not None]
+    return max(USUAL_RATE_HZ, *least, *slots)
 
 
 def simulate_waveform(

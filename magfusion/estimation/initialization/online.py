@@ -1,6 +1,6 @@
 """The first state of an online estimator: the smoother over the data gathered so far."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from dataclasses import fields as fields_of
 
 import numpy as np
@@ -18,8 +18,13 @@ from magfusion.estimation.stream_buffer import Buffer
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
 from magfusion.model.site import Site
 from magfusion.model.trust import Trust, Verdict
+from magfusion.receiver.cycles import cycles, joins
 from magfusion.receiver.receiver import Receiver
+from magfusion.receiver.slots import has_schedule
+from magfusion.receiver.turn import on_clock
 from magfusion.receiver.windows import LockinSettings
+
+START_RATE_HZ = 20.0  # of the cycles of a slotted tracker that a start is made of
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +116,10 @@ def find_online_start(
         steady=_joined_steady(steady, whole) if whole and steady else None,
     )
     asked = {f.name: getattr(settings, f.name) for f in fields_of(EstimatorSettings)}
+    heard = log
     try:
+        if log.waveform is not None and has_schedule(site) and joins(site):
+            log = _of_cycles(log, log.waveform, site, settings)
         result = smooth(log, site, SmootherSettings(loss="huber", **asked))
         honest, trust = judged(result, log)
         score = score_of(result, imu)
@@ -127,12 +135,22 @@ def find_online_start(
     beside = given if lined else beside_lines(log, site, given)
     return OnlineStart(
         state,
-        log.waveform,
+        heard.waveform,
         result.rival_chi_square,
         trust,
         score,
         *_wider(result, honest),
         None if beside is given else beside,
+    )
+
+
+def _of_cycles(log: Log, waveform: Waveform, site: Site, settings: EstimatorSettings) -> Log:
+    """Return the phasors of a slotted tracker, a cycle an epoch, and no more than a start needs."""
+    _, found = Receiver.of(site, settings.lockin).whole(waveform, log.imu)
+    epochs = cycles(found, on_clock(log.imu, site.platform.imu.time_offset), site)
+    every = max(1, int(len(epochs) / (START_RATE_HZ * float(np.ptp(epochs.time)) + 1.0)))
+    return replace(
+        log, waveform=None, fields=epochs.rows(slice((len(epochs) - 1) % every, None, every))
     )
 
 

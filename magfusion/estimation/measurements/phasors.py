@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.measurements.measurement import Loss, Measurement, Rows
 from magfusion.estimation.state import States
+from magfusion.model.field import skew
 from magfusion.model.noise import (
     measurement_cov,
     paired_whitening,
@@ -49,6 +50,8 @@ class FieldPhasors(Measurement):
     moving : bool ndarray, shape (n,)
         Where the clocks have a bearing: a platform that stands is where it was a little earlier.
         Noise in its rate and velocity would pass for information on them.
+    ahead : ndarray, shape (n, channels), optional
+        How much later the sensor was where each was measured (s), as of `FieldSamples`.
     robust : {None, 'huber', 'cauchy'}
         Loss of each channel.
     excess : ndarray, shape (n, channels), optional
@@ -65,6 +68,7 @@ class FieldPhasors(Measurement):
     by_time_offset: Array
     applied_offset: Array
     moving: BoolArray
+    ahead: Array | None = None
     robust: str | None = None
     excess: Array | None = None
     predicted: "Predictions" = field(default_factory=lambda: Predictions(), compare=False)
@@ -85,6 +89,9 @@ class FieldPhasors(Measurement):
 
     def error(self, states: States, calibration: Calibration) -> Array:
         """Return the whitened error, shape (n, channels, 6), without a derivative."""
+        if self.ahead is not None:
+            value, _, _, _ = self.unwhitened(states, calibration, ())
+            return (self.sqrt_information @ (value - self.measured)[..., None])[..., 0]
         lag, world_from_body, position_world = self._at_field(states, calibration)
         phasor = predict_channels(calibration, self.time, world_from_body, position_world)
         value = np.concatenate([phasor.real, phasor.imag], axis=-1)
@@ -95,28 +102,34 @@ class FieldPhasors(Measurement):
         self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
     ) -> Rows:
         """Return the rows at an estimate, a group for each channel."""
-        value, by_pose, by_calibration = self.predicted.of(self, states, calibration, blocks)
+        value, by_pose, by_velocity, by_calibration = self.predicted.of(
+            self, states, calibration, blocks
+        )
         return Rows(
             error=(self.sqrt_information @ (value - self.measured)[..., None])[..., 0],
             by_pose=self.sqrt_information @ by_pose,
+            by_velocity=None if by_velocity is None else self.sqrt_information @ by_velocity,
             by_calibration=self.sqrt_information @ by_calibration,
         )
 
     def unwhitened(
         self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
-    ) -> tuple[Array, Array, Array]:
-        """Return the prediction, and its derivatives by poses and calibration."""
+    ) -> tuple[Array, Array, Array | None, Array]:
+        """Return the prediction, and its derivatives by poses, velocities and calibration."""
         velocity_body = np.swapaxes(states.world_from_body, 1, 2) @ states.velocity_world[..., None]
         twist_body = np.concatenate([self.rate_body, velocity_body[..., 0]], axis=1)
         lag, world_from_body, position_world = self._at_field(states, calibration)
-        value, by_pose, by_calibration = linearize_channels(
-            calibration,
-            blocks,
-            self.time,
-            world_from_body,
-            position_world,
-            np.where(self.moving[:, None], twist_body, 0.0),
-        )
+        twist_body = np.where(self.moving[:, None], twist_body, 0.0)
+        place = world_from_body, position_world, twist_body
+        by_velocity = None
+        if self.ahead is not None:
+            value, by_pose, by_velocity, by_calibration = self._apart(
+                self.ahead, calibration, blocks, *place
+            )
+        else:
+            value, by_pose, by_calibration = linearize_channels(
+                calibration, blocks, self.time, *place
+            )
         value += lag[:, None, None] * self.by_time_offset
         by_lag = np.where(self.moving[:, None, None], self.by_time_offset, 0.0)
         for block in blocks:
@@ -125,7 +138,40 @@ class FieldPhasors(Measurement):
             elif block.parameter == CLOCK_RATE:
                 run = self.time - calibration.imu_begin
                 by_calibration[..., block.columns.start] += run[:, None, None] * by_lag
-        return value, by_pose, by_calibration
+        return value, by_pose, by_velocity, by_calibration
+
+    def _apart(
+        self,
+        ahead: Array,
+        calibration: Calibration,
+        blocks: tuple[Block, ...],
+        world_from_body: Array,
+        position_world: Array,
+        twist_body: Array,
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return prediction and derivatives with the sensor where each channel was measured."""
+        count, channels = ahead.shape
+        lever_body = calibration.site.platform.magnetometer.position_body
+        swing_body = np.cross(twist_body[:, :3], lever_body)
+        velocity_body = twist_body[:, 3:] + swing_body
+        velocity_world = (world_from_body @ velocity_body[..., None])[..., 0]
+        shift_world = ahead[..., None] * velocity_world[:, None]
+        found = linearize_channels(
+            calibration,
+            blocks,
+            np.repeat(self.time, channels),
+            np.repeat(world_from_body, channels, axis=0),
+            (position_world[:, None] + shift_world).reshape(-1, 3),
+            np.repeat(twist_body, channels, axis=0),
+        )
+        own = np.arange(count * channels), np.tile(np.arange(channels), count)
+        value, by_pose, by_calibration = (
+            part[own].reshape(count, channels, *part.shape[2:]) for part in found
+        )
+        by_place = ahead[..., None, None] * by_pose[..., 3:]
+        by_velocity = by_place @ np.swapaxes(world_from_body, 1, 2)[:, None]
+        by_pose[..., :3] -= by_place @ skew(swing_body)[:, None]
+        return value, by_pose, by_velocity, by_calibration
 
     def without(self, rejected: BoolArray) -> "FieldPhasors":
         """Return the measurement without some channels, shape (channels,)."""
@@ -161,14 +207,14 @@ class Predictions:
         states: States,
         calibration: Calibration,
         blocks: tuple[Block, ...],
-    ) -> tuple[Array, Array, Array]:
+    ) -> "_Unwhitened":
         """Return `FieldPhasors.unwhitened`."""
         if len(states) != 1:
             return phasors.unwhitened(states, calibration, blocks)
         pose = states.world_from_body, states.position_world, states.velocity_world
         at = tuple(part.tobytes() for part in pose)
         clocks = phasors.rate_body, phasors.by_time_offset, phasors.applied_offset, phasors.moving
-        of = (calibration, blocks, *clocks)
+        of = (calibration, blocks, *clocks, phasors.ahead)
         for known in self._kept:
             if at == known.at and all(a is b for a, b in zip(of, known.of, strict=True)):
                 return known.found
@@ -177,12 +223,15 @@ class Predictions:
         return found
 
 
+_Unwhitened = tuple[Array, Array, Array | None, Array]
+
+
 class _Prediction(NamedTuple):
     """A prediction with the state, and with all else, that it is of."""
 
     at: tuple[bytes, ...]
     of: tuple[object, ...]
-    found: tuple[Array, Array, Array]
+    found: _Unwhitened
 
 
 def field_phasors(
@@ -235,6 +284,7 @@ def field_phasors(
         by_time_offset=stacked(by),
         applied_offset=applied_offset,
         moving=np.ones(len(epoch), dtype=bool) if standing is None else ~standing,
+        ahead=samples.ahead,
         excess=excess,
     )
 

@@ -1,0 +1,285 @@
+"""Time division: what each slot holds, and one phasor of each that is driven.
+
+Every slot is stamped with its own time, a row of its own with one channel: what is measured one
+after the other is not simultaneous, and at 100 deg/s slots of 5 ms make 0.7 deg of that.  All
+samples are turned by the gyro into axes that do not turn with the body, in which the Earth's field
+of a silent slot is the one of its neighbours, and back into those of the slot's own time.
+"""
+
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+
+from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
+from magfusion.model.site import Site, Slots
+from magfusion.receiver.admission import Windows
+from magfusion.receiver.ambient import ambient_weights, removed
+from magfusion.receiver.noise import smoothed_over_windows
+from magfusion.receiver.slots import (
+    NOISE_CYCLES,
+    SlotSettings,
+    carriers_hz,
+    is_pulsed,
+    owners,
+    schedule,
+)
+from magfusion.receiver.turn import turn_of
+from magfusion.units import Array, BoolArray, ComplexArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class SlotValues:
+    """What slots hold, each in the measured axes of its own time.
+
+    Parameters
+    ----------
+    number : int ndarray, shape (n,)
+        Counted on from the start of the schedule, increasing.
+    centre, time : ndarray, shape (n,)
+        Middle of the slot, and mean time of its samples (s).
+    value : complex ndarray, shape (n, 3)
+        Phasor at the carrier, or field of direct current (T).
+    variance : ndarray, shape (n,)
+        Of a component, for samples of unit variance.
+    noise : ndarray, shape (n, 3, 3)
+        Covariance per sample of what is beside the carrier in this slot alone (T^2).
+    """
+
+    number: IntArray
+    centre: Array
+    time: Array
+    value: ComplexArray
+    variance: Array
+    noise: Array
+
+    @staticmethod
+    def none() -> "SlotValues":
+        """Return no slots."""
+        number, nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
+        value = np.zeros((0, 3), dtype=np.complex128)
+        return SlotValues(number, nothing, nothing, value, nothing, np.zeros((0, 3, 3)))
+
+    def rows(self, kept: BoolArray) -> "SlotValues":
+        """Return some slots."""
+        return SlotValues(*(part[kept] for part in vars(self).values()))
+
+    def joined(self, later: "SlotValues") -> "SlotValues":
+        """Return these and later ones."""
+        pairs = zip(vars(self).values(), vars(later).values(), strict=True)
+        return SlotValues(*(np.concatenate(pair) for pair in pairs))
+
+
+@dataclass(frozen=True, eq=False)
+class _Sums:
+    """What least squares makes of each slot."""
+
+    time: Array  # (n,) weighted mean of the sample times
+    value: ComplexArray  # (n, 3) non-turning axes
+    variance: Array  # (n,) of a component, for samples of unit variance
+
+
+def slot_values(
+    waveform: Waveform,
+    imu: ImuSamples,
+    site: Site,
+    settings: SlotSettings,
+    windows: Windows,
+    rate_hz: float,
+) -> SlotValues:
+    """Fit what each slot holds, driven or silent, to its raw samples.
+
+    Parameters
+    ----------
+    imu : ImuSamples
+        As from `magfusion.receiver.turn.on_clock`.
+    site : Site
+        Whose beacons share one schedule.
+    windows : Windows
+        The slots that were admitted, numbered from the start of the schedule.
+    rate_hz : float
+        Usual sampling rate.
+    """
+    if len(windows) == 0:
+        return SlotValues.none()
+    slots = schedule(site)
+    carrier = carriers_hz(site, slots)
+    first, last = int(windows.first[0]), int(windows.first[-1] + windows.count[-1])
+    time = waveform.time[first:last]
+    own = Windows(windows.number, windows.centre, windows.first - first, windows.count)
+    measured_from_still = turn_of(imu, site)
+    clean = waveform.measured_sensor[first:last] - site.platform.magnetometer.offset
+    still = _applied(np.asarray(np.linalg.inv(measured_from_still(time))), clean)
+    place = windows.number % slots.count
+    sums = _slot_sums(time, still, own, slots, carrier[place], settings, rate_hz)
+    noise = _noise(time, still, own, slots, carrier[place], rate_hz)
+    turn = measured_from_still(sums.time)
+    return SlotValues(
+        windows.number,
+        windows.centre,
+        sums.time,
+        _applied(turn, sums.value),
+        sums.variance,
+        turn @ noise @ np.swapaxes(turn, 1, 2),
+    )
+
+
+@overload
+def _applied(turn: Array, vectors: Array) -> Array: ...
+@overload
+def _applied(turn: Array, vectors: ComplexArray) -> ComplexArray: ...
+def _applied(turn: Array, vectors: Array | ComplexArray) -> Array | ComplexArray:
+    out = np.empty_like(vectors)
+    np.matmul(turn, vectors[..., None], out=out[..., None])
+    return out
+
+
+def demodulate_slots(
+    values: SlotValues, imu: ImuSamples, site: Site, settings: SlotSettings
+) -> tuple[FieldSamples, IntArray]:
+    """Turn what the slots of a tracker hold into one phasor for each driven slot.
+
+    Pulses of direct current give a real phasor, the field itself.
+
+    Parameters
+    ----------
+    imu : ImuSamples
+        As from `magfusion.receiver.turn.on_clock`.
+
+    Returns
+    -------
+    samples : FieldSamples
+        A row for each driven slot with silent ones beside it, at the mean time of its samples, with
+        one channel.  The covariance holds the noise of the slot and of what was taken off, not what
+        hum leaves.
+    number : int ndarray, shape (n,)
+        The slot of each row.
+    """
+    slots, pulsed = schedule(site), is_pulsed(site)
+    turn = turn_of(imu, site)(values.time)
+    still_from_measured: Array = np.asarray(np.linalg.inv(turn))
+    still = _applied(still_from_measured, values.value)
+    noise = _smoothed_noise(values, still_from_measured, still, slots)
+    place = values.number % slots.count
+    owner = owners(site, slots)
+    driven, silent = np.flatnonzero(owner[place] >= 0), np.flatnonzero(owner[place] < 0)
+    index, weight = ambient_weights(
+        values.number[driven],
+        values.number[silent],
+        slots.count,
+        settings.removal,
+        cycles=settings.cycles,
+        mains_turns=settings.mains_hz * slots.duration if pulsed else 0.0,
+    )
+    value = removed(still[driven], still[silent], index, weight)
+    usable = np.isfinite(value).all(axis=1)
+    kept, weight = driven[usable], weight[usable]
+    # Slots share what was taken off them, and no number of slots averages that out.
+    shared = 0.0 if settings.removal == "none" else 1.0 / max(len(np.unique(place[silent])), 1)
+    variance = values.variance[kept] * (1.0 + np.maximum(np.sum(weight**2, axis=1), shared))
+    phasor = _applied(turn[kept], value[usable])
+    found = _rows(site, slots, values.time[kept], owner[place[kept]], phasor)
+    cov = variance[:, None, None] * (turn[kept] @ noise[kept] @ np.swapaxes(turn[kept], 1, 2))
+    found.phasor_cov[np.arange(len(kept)), owner[place[kept]]] = cov
+    return found, values.number[kept]
+
+
+def _samples_of(windows: Windows) -> tuple[IntArray, IntArray, IntArray]:
+    """Return all samples in slots, the slot of each, and where each slot begins among them."""
+    owner = np.repeat(np.arange(len(windows.count)), windows.count)
+    begins = np.concatenate([[0], np.cumsum(windows.count)[:-1]])
+    sample = np.arange(len(owner)) - begins[owner] + windows.first[owner]
+    return sample, owner, begins
+
+
+def _hann(time: Array, begin: Array, slots: Slots, rate_hz: float) -> Array:
+    return 1.0 - np.cos(2.0 * np.pi * (time - begin + 0.5 / rate_hz) / slots.duration)
+
+
+def _slot_sums(
+    time: Array,
+    still: Array,
+    windows: Windows,
+    slots: Slots,
+    carrier_hz: Array,
+    settings: SlotSettings,
+    rate_hz: float,
+) -> _Sums:
+    """Fit a constant, and beside a carrier its two quadratures, to each slot."""
+    sample, owner, begins = _samples_of(windows)
+    slot_begin = windows.centre - 0.5 * slots.duration
+    begin, at = slot_begin[owner], time[sample]
+    weight = np.ones(len(at))
+    if settings.taper == "hann":
+        weight = _hann(at, begin, slots, rate_hz)
+    columns = [np.ones(len(at))]
+    if np.any(carrier_hz):
+        angle = 2.0 * np.pi * carrier_hz[owner] * (at - begin)
+        columns += [np.cos(angle), np.sin(angle)]
+
+    def total(values: Array) -> Array:
+        return np.add.reduceat(values, begins, axis=0)
+
+    size = len(columns)
+    normal, spread = np.empty((2, len(begins), size, size))
+    right = np.empty((len(begins), size, 3))
+    for i, a in enumerate(columns):
+        right[:, i] = total((weight * a)[:, None] * still[sample])
+        for j, b in enumerate(columns):
+            normal[:, i, j] = total(weight * a * b)
+            spread[:, i, j] = total(weight**2 * a * b)
+    inverse = np.linalg.inv(normal)
+    fitted = inverse @ right
+    cov = inverse @ spread @ inverse
+    centre = total(weight * at) / total(weight)
+    if size == 1:
+        return _Sums(centre, fitted[:, 0].astype(np.complex128), cov[:, 0, 0])
+    reference = np.exp(-2j * np.pi * carrier_hz * slot_begin)
+    value = (fitted[:, 1] - 1j * fitted[:, 2]) * reference[:, None]
+    return _Sums(centre, value, 0.5 * (cov[:, 1, 1] + cov[:, 2, 2]))
+
+
+def _noise(
+    time: Array, still: Array, windows: Windows, slots: Slots, carrier_hz: Array, rate_hz: float
+) -> Array:
+    """Return the covariance per sample of what is beside the carrier, (n, 3, 3), still axes.
+
+    It is the power three cycles a slot away, tapered so that neither carrier nor hum leaks there.
+    """
+    sample, owner, begins = _samples_of(windows)
+    slot_begin = windows.centre - 0.5 * slots.duration
+    at = time[sample] - slot_begin[owner]
+    weight = _hann(time[sample], slot_begin[owner], slots, rate_hz)
+    away = 3.0 / slots.duration
+    above = carrier_hz + away < 0.5 * rate_hz
+    probe = np.where(above, carrier_hz + away, carrier_hz - away)
+    turned = weight * np.exp(-2j * np.pi * probe[owner] * at)
+    seen = np.add.reduceat(turned[:, None] * still[sample], begins, axis=0)
+    power = np.add.reduceat(weight**2, begins)
+    return np.asarray(np.einsum("nx,ny->nxy", seen, np.conj(seen)).real / power[:, None, None])
+
+
+def _smoothed_noise(
+    values: SlotValues, still_from_measured: Array, still: ComplexArray, slots: Slots
+) -> Array:
+    """Return the covariance per sample over many cycles, (n, 3, 3), still axes."""
+    cov = still_from_measured @ values.noise @ np.swapaxes(still_from_measured, 1, 2)
+    number = NOISE_CYCLES * slots.count
+    smooth = smoothed_over_windows(cov[:, None], values.centre, slots.cycle, number, None)[:, 0]
+    least = 1e-12 * np.max(np.abs(still))
+    return smooth + least**2 * np.eye(3)
+
+
+def _rows(
+    site: Site, slots: Slots, time: Array, channel: IntArray, phasor: ComplexArray
+) -> FieldSamples:
+    shape = (len(time), len(site.channels), 3)
+    every = np.full(shape, np.nan, dtype=np.complex128)
+    every[np.arange(len(time)), channel] = phasor
+    return FieldSamples(
+        time=time,
+        window=np.full(len(time), slots.duration),
+        channels=site.channels,
+        phasor_sensor=every,
+        phasor_cov=np.full((*shape, 3), np.nan),
+    )
