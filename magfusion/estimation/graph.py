@@ -380,6 +380,7 @@ def marginals(
     poses = np.array([tree.marginalCovariance(X(i)) for i in range(graph.epochs)])
     calibration = last_marginal(tree, linear, ordering) if graph.blocks else np.zeros((0, 0))
     response = np.zeros((len(calibration), 0))
+    del tree, linear  # of a long log they are as much again as what follows
     if considered and graph.measurements:
         steps = graph.responses(estimate, considered)
         keys = [X(i) for i in range(graph.epochs)]

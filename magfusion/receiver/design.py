@@ -67,15 +67,22 @@ class Designs:
     time: Array
     windows: Windows
     kept: dict[int, Maps] = field(default_factory=dict)
+    asked: set[int] = field(default_factory=set)
 
     def pieces(self) -> Iterator[tuple[slice, Maps]]:
-        """Yield windows with their maps, as many at once as fit in memory."""
+        """Yield windows with their maps, as many at once as fit in memory.
+
+        Those of many windows are kept when they are asked for again: most logs are demodulated
+        once.
+        """
         for begin in range(0, len(self.windows), CHUNK):
             rows = slice(begin, begin + CHUNK)
             known = self.kept.get(begin)
             maps = self._maps(self.windows.rows(rows)) if known is None else known
-            if known is None and self._size() + _size(maps) < KEPT:
+            again = begin in self.asked or len(self.windows) <= CHUNK
+            if known is None and again and self._size() + _size(maps) < KEPT:
                 self.kept[begin] = maps
+            self.asked.add(begin)
             yield rows, maps
 
     def _size(self) -> int:
