@@ -15,6 +15,7 @@ from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site, Slots
 from magfusion.model.trajectory import Trajectory
 from magfusion.receiver.cycles import cycles, joins, whole_cycles
+from magfusion.receiver.turn import turn_of
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.waveform import usual_rate_hz
 
@@ -79,7 +80,7 @@ def _states(poses: Trajectory, step: np.ndarray) -> States:
 
 def test_a_cycle_is_predicted_where_each_slot_was() -> None:
     site = _site()
-    found = cycles(_slot_rows(site, 40), _imu(), site)
+    found = cycles(_slot_rows(site, 40), turn_of(_imu(), site), site)
     assert len(found) == 10
     measured = _measured(site, found)
     size = np.max(np.linalg.norm(measured.sqrt_information @ measured.measured[..., None], axis=2))
@@ -93,7 +94,7 @@ def test_a_cycle_is_predicted_where_each_slot_was() -> None:
 
 def test_derivatives_are_those_of_the_prediction() -> None:
     site = _site()
-    found = cycles(_slot_rows(site, 8), _imu(), site)
+    found = cycles(_slot_rows(site, 8), turn_of(_imu(), site), site)
     measured, calibration = _measured(site, found), initial_calibration(site, 0.0)
     poses = _poses(found.time)
     rows = measured.linearize(_states(poses, np.zeros(9)), calibration, ())
@@ -111,7 +112,7 @@ def test_a_slot_that_was_lost_leaves_the_others_of_its_cycle() -> None:
     site = _site()
     rows = _slot_rows(site, 40)
     kept = np.arange(len(rows)) != 4
-    found = cycles(rows.rows(kept), _imu(), site)
+    found = cycles(rows.rows(kept), turn_of(_imu(), site), site)
     assert np.sum(found.valid, axis=1).tolist() == [3, 2] + [3] * 8
     assert len(whole_cycles(rows.rows(kept), _imu(), site)) == 9
 

@@ -27,9 +27,7 @@ from magfusion.estimation.state import MOTION, VELOCITY, State, as_trajectory
 from magfusion.estimation.stream_buffer import Buffer, check_clock
 from magfusion.model.parameters import CLOCK_RATE, TIME_OFFSET, Block
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
-from magfusion.receiver.cycles import cycles, joins
 from magfusion.receiver.receiver import LockinReceiver, Receiver
-from magfusion.receiver.turn import on_clock
 from magfusion.units import Array
 
 LONGEST_WAIT = 5.0  # s; the fields go on without an IMU that is silent for longer
@@ -124,6 +122,7 @@ class Arrivals:
         self.receiver = receiver
         # What stands in for them needs a state, which a whole log has only when it is smoothed.
         receiver.needs_turn = not isinstance(receiver, LockinReceiver)
+        receiver.joined = True
         self.applied_offset = applied_offset
         self.imu = Buffer("imu", 6)
         self.waveform = Buffer("magnetometer", 3)
@@ -289,10 +288,7 @@ class Arrivals:
             self.windows.extend(windows.number[windows.centre > after].tolist())
         else:
             offset = self.applied_offset
-            bias = state.gyro_bias_body
-            found = receiver.push(waveform, imu, until, bias, offset)
-            if len(found) and joins(receiver.site):
-                found = cycles(found, on_clock(imu, offset, bias), receiver.site)
+            found = receiver.push(waveform, imu, until, state.gyro_bias_body, offset)
             self.fields += found.rows(found.time > after).epochs()
 
     def next_window(self) -> float | None:

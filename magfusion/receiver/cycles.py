@@ -6,7 +6,7 @@ from magfusion.errors import InputError
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site
 from magfusion.receiver.slots import schedule
-from magfusion.receiver.turn import on_clock, turn_of
+from magfusion.receiver.turn import Turn, on_clock, turn_of
 from magfusion.units import Array, BoolArray
 
 # s; from the first to the last slot of an epoch. Half as long after its middle, a head that is
@@ -44,7 +44,7 @@ def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSam
     InputError
         Where there is none.
     """
-    found = cycles(samples, on_clock(imu, site.platform.imu.time_offset), site)
+    found = cycles(samples, turn_of(on_clock(imu, site.platform.imu.time_offset), site), site)
     whole: BoolArray = np.all(found.valid, axis=1)
     if not np.any(whole):
         raise InputError(
@@ -54,22 +54,21 @@ def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSam
     return found.rows(whole)
 
 
-def cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSamples:
+def cycles(samples: FieldSamples, measured_from_still: Turn, site: Site) -> FieldSamples:
     """Join the slots of each cycle to one row, whichever of them there are.
 
     Parameters
     ----------
     samples : FieldSamples
         As of `whole_cycles`; at least one.
-    imu : ImuSamples
-        As from `magfusion.receiver.turn.on_clock`.
+    measured_from_still : callable
+        As from `magfusion.receiver.turn.turn_of`.
     """
     slots = schedule(site)
     _, cycle = np.unique(slots.running(samples.time) // slots.count, return_inverse=True)
     row, channel = np.nonzero(samples.valid)
     number = int(cycle[-1]) + 1
     time: Array = np.bincount(cycle, samples.time) / np.bincount(cycle)
-    measured_from_still = turn_of(imu, site)
     still_from_measured = np.linalg.inv(measured_from_still(samples.time[row]))
     turn = measured_from_still(time[cycle[row]]) @ still_from_measured
     phasor = np.full((number, *samples.phasor_sensor.shape[1:]), np.nan, dtype=np.complex128)

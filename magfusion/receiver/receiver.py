@@ -24,6 +24,7 @@ from magfusion.receiver.admission import (
     sample_rate_hz,
     usual_step,
 )
+from magfusion.receiver.cycles import cycles, joins
 from magfusion.receiver.design import Designs, separable, variance_growth
 from magfusion.receiver.lockin import WindowOperator, designs_of, window_operator
 from magfusion.receiver.slot_phasors import SlotValues, demodulate_slots, slot_values
@@ -38,13 +39,14 @@ from magfusion.receiver.slots import (
     slot_lockin,
     slot_settings_of,
 )
-from magfusion.receiver.turn import on_clock
+from magfusion.receiver.turn import Turn, on_clock, turn_of
 from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz, default_settings
 from magfusion.units import Array, BoolArray, IntArray
 
 NO_SILENT_SLOT = "no silent slot beside it"
 # Of the samples of a window: its design tells whether they suffice; of a slot: it has few columns.
 LEAST_SHARE, LEAST_SHARE_OF_SLOT = 0.5, 0.9
+INERTIAL_MARGIN = 0.1  # s; by which their clocks may be apart, and before a window
 BEFORE = 256  # samples before a window, among which an axis that keeps one value is seen to
 
 
@@ -63,6 +65,8 @@ class Receiver(ABC):
         Reason to number of windows.
     needs_turn : bool
         Whether windows without inertial samples are of no use.
+    joined : bool
+        Whether the slots of a short cycle that are pushed are one epoch.
     without_turn : Windows
         Of those that were judged last, which lack nothing else.
     """
@@ -73,10 +77,11 @@ class Receiver(ABC):
     recent: IntArray
     dropped: Counter[str]
     needs_turn: bool
+    joined: bool
     without_turn: Windows
 
     def __init__(self, site: Site) -> None:
-        self.needs_turn = True
+        self.needs_turn, self.joined = True, False
         self.without_turn = Windows.none()
         self.site = site
         self.grid = self.admission = None
@@ -158,10 +163,18 @@ class Receiver(ABC):
         """
 
     def pushed(
-        self, waveform: Waveform, imu: ImuSamples, windows: Windows
-    ) -> tuple[FieldSamples, IntArray]:
-        """Return the phasors of windows, of which the last ones are new, as `phasors`."""
-        return self.phasors(waveform, imu, windows, self.site)
+        self, waveform: Waveform, imu: ImuSamples, windows: Windows, since: int
+    ) -> tuple[FieldSamples, int]:
+        """Return the phasors of windows from a number on, and how many windows they are of.
+
+        Parameters
+        ----------
+        windows : Windows
+            With those before that they need.
+        """
+        found, number = self.phasors(waveform, imu, windows, self.site)
+        found = found.rows(number >= since)
+        return found, len(found)
 
     @abstractmethod
     def _driven(self, number: IntArray) -> BoolArray:
@@ -193,7 +206,7 @@ class Receiver(ABC):
             As of `magfusion.receiver.turn.on_clock`; the offset is the site's where none is given.
         """
         assert self.grid is not None
-        waveform = self._since(waveform)
+        waveform, imu = self._since(waveform, imu, time_offset)
         new = self.admit(waveform, imu, until).number
         expected = int(np.sum(self._driven(new)))
         known = np.concatenate([self.recent, new])
@@ -203,9 +216,8 @@ class Receiver(ABC):
         windows = self.grid.windows(known, waveform.time)
         offset = self.site.platform.imu.time_offset if time_offset is None else time_offset
         known_imu = on_clock(imu, offset, gyro_bias_body)
-        found, number = self.pushed(waveform, known_imu, windows)
-        found = found.rows(number >= new[0])
-        self._count(NO_SILENT_SLOT, expected - len(found))
+        found, seen = self.pushed(waveform, known_imu, windows, int(new[0]))
+        self._count(NO_SILENT_SLOT, expected - seen)
         return found
 
     def whole(self, waveform: Waveform, imu: ImuSamples) -> tuple[Windows, FieldSamples]:
@@ -264,12 +276,18 @@ class Receiver(ABC):
         self.without_turn = windows.rows(verdict == REASONS.index(INERTIAL_GAP))
         return windows.rows(verdict < 0)
 
-    def _since(self, waveform: Waveform) -> Waveform:
+    def _since(
+        self, waveform: Waveform, imu: ImuSamples, time_offset: float | None
+    ) -> tuple[Waveform, ImuSamples]:
         """Return the samples that the next windows, or what is remembered for them, can need."""
-        oldest = min([*self.recent[:1].tolist(), self.next_number]) - 1
-        first = int(np.searchsorted(waveform.time, self.centre_of(oldest))) - BEFORE
-        rows = slice(max(first, 0), None)
-        return Waveform(waveform.time[rows], waveform.measured_sensor[rows])
+        oldest = self.centre_of(min([*self.recent[:1].tolist(), self.next_number]) - 1)
+        first = max(int(np.searchsorted(waveform.time, oldest)) - BEFORE, 0)
+        offset = self.site.platform.imu.time_offset if time_offset is None else time_offset
+        begin = max(int(np.searchsorted(imu.time, oldest - offset - INERTIAL_MARGIN)) - 1, 0)
+        return (
+            Waveform(waveform.time[first:], waveform.measured_sensor[first:]),
+            ImuSamples(imu.time[begin:], imu.gyro_body[begin:], imu.accel_body[begin:]),
+        )
 
     def _count(self, reason: str, dropped: int) -> None:
         if dropped:
@@ -436,22 +454,29 @@ class SlotReceiver(Receiver):
         self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
     ) -> tuple[FieldSamples, IntArray]:
         """Return the phasors of driven slots, freed of what the silent ones tell."""
-        assert self.admission is not None
-        rate_hz = 1.0 / self.admission.magnetometer_step
-        values = slot_values(waveform, imu, site, self.settings, windows, rate_hz)
-        return demodulate_slots(values, imu, site, self.settings)
+        turn = turn_of(imu, site)
+        values = self._held(waveform, turn, windows, site)
+        return demodulate_slots(values, turn, site, self.settings)
 
     def pushed(
-        self, waveform: Waveform, imu: ImuSamples, windows: Windows
-    ) -> tuple[FieldSamples, IntArray]:
-        """Return the phasors of slots, of which the last ones are new, as `Receiver.pushed`."""
-        assert self.admission is not None
-        rate_hz = 1.0 / self.admission.magnetometer_step
+        self, waveform: Waveform, imu: ImuSamples, windows: Windows, since: int
+    ) -> tuple[FieldSamples, int]:
+        """Return the phasors of slots from a number on, as `Receiver.pushed`."""
+        turn = turn_of(imu, self.site)
         known = self._values.rows(np.isin(self._values.number, windows.number))
         fresh = windows.rows(~np.isin(windows.number, known.number))
-        later = slot_values(waveform, imu, self.site, self.settings, fresh, rate_hz)
-        self._values = known.joined(later)
-        return demodulate_slots(self._values, imu, self.site, self.settings)
+        self._values = known.joined(self._held(waveform, turn, fresh, self.site))
+        found, number = demodulate_slots(self._values, turn, self.site, self.settings)
+        found = found.rows(number >= since)
+        seen = len(found)
+        if seen and self.joined and joins(self.site):
+            found = cycles(found, turn, self.site)
+        return found, seen
+
+    def _held(self, waveform: Waveform, turn: Turn, windows: Windows, site: Site) -> SlotValues:
+        assert self.admission is not None
+        rate_hz = 1.0 / self.admission.magnetometer_step
+        return slot_values(waveform, turn, site, self.settings, windows, rate_hz)
 
     def _driven(self, number: IntArray) -> BoolArray:
         return driven_slots(self.site, number)

@@ -11,7 +11,7 @@ from typing import overload
 
 import numpy as np
 
-from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
+from magfusion.model.samples import FieldSamples, Waveform
 from magfusion.model.site import Site, Slots
 from magfusion.receiver.admission import Windows
 from magfusion.receiver.ambient import ambient_weights, removed
@@ -24,7 +24,7 @@ from magfusion.receiver.slots import (
     owners,
     schedule,
 )
-from magfusion.receiver.turn import turn_of
+from magfusion.receiver.turn import Turn
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 
@@ -81,7 +81,7 @@ class _Sums:
 
 def slot_values(
     waveform: Waveform,
-    imu: ImuSamples,
+    measured_from_still: Turn,
     site: Site,
     settings: SlotSettings,
     windows: Windows,
@@ -91,8 +91,8 @@ def slot_values(
 
     Parameters
     ----------
-    imu : ImuSamples
-        As from `magfusion.receiver.turn.on_clock`.
+    measured_from_still : callable
+        As from `magfusion.receiver.turn.turn_of`.
     site : Site
         Whose beacons share one schedule.
     windows : Windows
@@ -107,7 +107,6 @@ def slot_values(
     first, last = int(windows.first[0]), int(windows.first[-1] + windows.count[-1])
     time = waveform.time[first:last]
     own = Windows(windows.number, windows.centre, windows.first - first, windows.count)
-    measured_from_still = turn_of(imu, site)
     clean = waveform.measured_sensor[first:last] - site.platform.magnetometer.offset
     still = _applied(np.asarray(np.linalg.inv(measured_from_still(time))), clean)
     place = windows.number % slots.count
@@ -135,7 +134,7 @@ def _applied(turn: Array, vectors: Array | ComplexArray) -> Array | ComplexArray
 
 
 def demodulate_slots(
-    values: SlotValues, imu: ImuSamples, site: Site, settings: SlotSettings
+    values: SlotValues, measured_from_still: Turn, site: Site, settings: SlotSettings
 ) -> tuple[FieldSamples, IntArray]:
     """Turn what the slots of a tracker hold into one phasor for each driven slot.
 
@@ -143,8 +142,8 @@ def demodulate_slots(
 
     Parameters
     ----------
-    imu : ImuSamples
-        As from `magfusion.receiver.turn.on_clock`.
+    measured_from_still : callable
+        As from `magfusion.receiver.turn.turn_of`.
 
     Returns
     -------
@@ -156,7 +155,7 @@ def demodulate_slots(
         The slot of each row.
     """
     slots, pulsed = schedule(site), is_pulsed(site)
-    turn = turn_of(imu, site)(values.time)
+    turn = measured_from_still(values.time)
     still_from_measured: Array = np.asarray(np.linalg.inv(turn))
     still = _applied(still_from_measured, values.value)
     noise = _smoothed_noise(values, still_from_measured, still, slots)

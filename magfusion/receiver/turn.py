@@ -11,6 +11,8 @@ from magfusion.model.site import Site
 from magfusion.model.strapdown import turn_at, turn_from_gyro
 from magfusion.units import Array
 
+Turn = Callable[[Array], Array]
+
 
 def on_clock(
     imu: ImuSamples, time_offset: float, gyro_bias_body: Array | None = None
@@ -51,7 +53,7 @@ def standing_in(imu: ImuSamples, silence: tuple[Array, Array]) -> ImuSamples:
     return ImuSamples(np.insert(imu.time, at, time), gyro, accel)
 
 
-def turn_of(imu: ImuSamples, site: Site) -> Callable[[Array], Array]:
+def turn_of(imu: ImuSamples, site: Site) -> Turn:
     """Return what gives, at times (m,), the ``measured_from_still`` (m, 3, 3) of a field.
 
     The axes stand still as the body's do at the first inertial sample.

@@ -21,7 +21,7 @@ from magfusion.model.trust import Trust, Verdict
 from magfusion.receiver.cycles import cycles, joins
 from magfusion.receiver.receiver import Receiver
 from magfusion.receiver.slots import has_schedule
-from magfusion.receiver.turn import on_clock
+from magfusion.receiver.turn import on_clock, turn_of
 from magfusion.receiver.windows import LockinSettings
 
 START_RATE_HZ = 20.0  # of the cycles of a slotted tracker that a start is made of
@@ -147,7 +147,8 @@ def find_online_start(
 def _of_cycles(log: Log, waveform: Waveform, site: Site, settings: EstimatorSettings) -> Log:
     """Return the phasors of a slotted tracker, a cycle an epoch, and no more than a start needs."""
     _, found = Receiver.of(site, settings.lockin).whole(waveform, log.imu)
-    epochs = cycles(found, on_clock(log.imu, site.platform.imu.time_offset), site)
+    known = on_clock(log.imu, site.platform.imu.time_offset)
+    epochs = cycles(found, turn_of(known, site), site)
     every = max(1, int(len(epochs) / (START_RATE_HZ * float(np.ptp(epochs.time)) + 1.0)))
     return replace(
         log, waveform=None, fields=epochs.rows(slice((len(epochs) - 1) % every, None, every))
