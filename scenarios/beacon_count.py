@@ -17,14 +17,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from algorithms_compared import (
-    MAPPED,
-    Outcome,
-    Task,
-    means,
-    standard_error,
-    try_world,
-)
+from algorithms_figures import means, standard_error
+from algorithms_tried import MAPPED, Outcome, Task, try_world
 from harness import Scale, blank_figure, chosen_scale, conclude, save_picture, scenario_parser
 
 from magfusion.simulation.monte_carlo import run_many

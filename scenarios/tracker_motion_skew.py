@@ -1,6 +1,7 @@
 """A head that turns while its tracker measures: slots are not simultaneous, and an IMU knows it.
 
-A tracker in time slots sees each coil at another time.  The scenario turns it at 100 deg/s:
+A tracker in time slots sees each coil at another time.  The scenario turns it at 100 deg/s, about
+coils of 4 cm whose size is known to all estimators, by Biot and Savart in what they are given:
 
 1. The closed form takes three slots for one: it is wrong by 0.7 degrees with slots of 5 ms.  When
    each slot is a measurement of its own, at its own time, with the turn between them from the gyro,
@@ -17,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from harness import blank_figure, conclude, rms, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation, RotationSpline
-from time_slots_and_mains import DISTANCE, UNIT, tracker
+from time_slots_and_mains import DISTANCE, UNIT, located, tracker
 
 from magfusion.estimation.batch import smooth
 from magfusion.estimation.navigator import Navigator, NavigatorSettings
@@ -26,7 +27,7 @@ from magfusion.model.field import observe_from
 from magfusion.model.samples import FieldSamples, ImuSamples, Log
 from magfusion.model.site import Site, Slots
 from magfusion.model.trajectory import Trajectory
-from magfusion.papers.p000_tracker.pose import locate_by_svd, unit_coupling, world_poses
+from magfusion.papers.p000_tracker.pose import world_poses
 from magfusion.receiver.receiver import received
 from magfusion.simulation.field import phasors_world, synchronised_drives
 from magfusion.simulation.inertial import simulate_imu
@@ -109,7 +110,7 @@ def skew(config: Config, slot_ms: float) -> Skew:
         [(middle * turn).inv().apply(field_world[:, k].real) for k, turn in enumerate(turns)],
         axis=1,
     )
-    fix = locate_by_svd(unit_coupling(site.beacons[0], seen.astype(np.complex128), np.eye(3)))
+    fix = located(site, seen.astype(np.complex128))
     together = np.swapaxes(fix.sensor_from_beacon, 1, 2)
     start = fix.nearest(position).position_beacon[:, 0]
     apart = slots_apart(site, seen, turns, together, start)
@@ -215,7 +216,7 @@ def snapshots(site: Site, slots: FieldSamples, motion: Motion) -> Trajectory:
     row, channel = np.nonzero(slots.valid)
     phasor = np.full((len(held), *slots.phasor_sensor.shape[1:]), np.nan, dtype=np.complex128)
     phasor[cycle[row], channel] = slots.phasor_sensor[row, channel]
-    fix = locate_by_svd(unit_coupling(beacon, phasor[held == 3], np.eye(3)))
+    fix = located(site, phasor[held == 3])
     guess = (motion.position_world(time) - beacon.position_world) @ beacon.world_from_beacon
     attitude, position = world_poses(site, beacon, fix.nearest(guess))
     return Trajectory(time, attitude[:, 0], position[:, 0])

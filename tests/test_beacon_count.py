@@ -8,7 +8,7 @@ from pathlib import Path
 import beacon_count
 import numpy as np
 import pytest
-from algorithms_compared import MAPPED, Outcome
+from algorithms_tried import MAPPED, Outcome
 from beacon_count import Config, bounds, errors, run
 
 from magfusion.units import Array

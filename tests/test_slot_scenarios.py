@@ -67,6 +67,20 @@ def test_each_removal_costs_the_noise_that_it_should() -> None:
     assert noise["none"] < noise["state"] < noise["interpolate"] < noise["subtract"]
 
 
+def test_what_coils_of_true_size_turn_the_closed_form_by_is_taken_off(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The next term of a coil's field goes with the square of its radius over the distance."""
+    found = mains.taken_for_dipoles_deg(CONFIG)
+    monkeypatch.setattr(mains, "COIL_RADIUS", 0.5 * mains.COIL_RADIUS)
+    smaller = mains.taken_for_dipoles_deg(CONFIG)
+    assert found["dipoles"] / smaller["dipoles"] == pytest.approx(4.0, rel=0.01)
+    noise_deg = mains.PRINTED_NOISE_DEG["none"]  # at 60 dB; as measured here
+    assert mains.COIL_RADIUS == 0.01  # halved
+    assert found["dipoles"] == pytest.approx(2.0 * noise_deg, rel=0.1)
+    assert found["coils"] < 1e-6
+
+
 @pytest.mark.parametrize(("slot_ms", "skew_deg"), [(1.0, 0.13), (5.0, 0.68), (20.0, 2.5)])
 def test_slots_at_their_own_times_have_no_skew(slot_ms: float, skew_deg: float) -> None:
     found = moving.skew(moving.Config(), slot_ms)

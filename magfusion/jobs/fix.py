@@ -41,8 +41,8 @@ class FixSettings(RegionSettings, WindowSettings, RiskSettings):
     )
     free: str | None = option(
         None,
-        "Find these of every beacon beside the pose, whatever the site says of them; gains as far"
-        " as the epochs ask for it",
+        "Find these of every beacon beside the pose, whatever the site says of them (gains are"
+        " found anyway, where nothing less explains the fields)",
         metavar="phase,gain",
     )
 
@@ -104,8 +104,8 @@ def run_fix(
     Parameters
     ----------
     free : tuple of str
-        What is found beside the pose, as in `magfusion.estimation.snapshot.likelihood.fix_epochs`;
-        gains as far as the epochs ask for it (`magfusion.estimation.snapshot.gain_spread`).
+        What is found beside the pose, whether or not the fields ask for it, as in
+        `magfusion.estimation.integrity.explained_fixes`.
     risk : Risk, optional
         What the protection levels promise.
 
@@ -116,20 +116,15 @@ def run_fix(
     import numpy as np
 
     from magfusion.estimation.demodulation import fix_inputs, phasors
-    from magfusion.estimation.integrity.fix_separation import separate_fixes, separation_trust
-    from magfusion.estimation.integrity.fix_witness import judged_fixes
-    from magfusion.estimation.integrity.gain_witness import gains_of
+    from magfusion.estimation.integrity.explained_fixes import explained_fixes
     from magfusion.estimation.integrity.place_witness import of_place
     from magfusion.estimation.integrity.recording import BRIDGED, recorded
-    from magfusion.estimation.snapshot.gain_spread import gain_spread
-    from magfusion.estimation.snapshot.likelihood import fix_epochs
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
     from magfusion.model.parameters import initial_calibration
-    from magfusion.model.trust import Risk, Trust
+    from magfusion.model.trust import Trust
     from magfusion.results.report import dropped_figures, fix_figures, where_found
     from magfusion.results.verdict import level_figures, trust_figures
 
-    risk = Risk() if risk is None else risk
     claimed = claim(job.output, "smooth", "fix")
     log, site = read_job(job, report=report)
     began = time.perf_counter()
@@ -139,30 +134,17 @@ def run_fix(
     report("fixing", 1, 3)
     calibration = initial_calibration(site, float(np.mean(phasor_samples.time)))
     samples, gravity = fix_inputs(phasor_samples, log, site)
-    held = tuple(part for part in free if part != "gain")
-    fixes = fix_epochs(samples, calibration, gravity=gravity, free=held)
-    gain_sigma = 0.0
-    if "gain" in free:
-        gain_sigma = gain_spread(samples, calibration, fixes, gravity=gravity, free=held)
-        free = (*held, "gain") if gain_sigma else held
-    if "gain" in free:
-        fixes = fix_epochs(samples, calibration, gravity=gravity, free=free, gain_sigma=gain_sigma)
-    report("fixing without each beacon", 2, 3)
-    separated = separate_fixes(
-        samples, calibration, fixes, gravity=gravity, free=free, gain_sigma=gain_sigma, risk=risk
+    found = explained_fixes(
+        samples, calibration, gravity=gravity, free=free, risk=risk, report=report
     )
-    heard = np.sum(samples.valid, axis=1)
-    fixes, states, trust = judged_fixes(separated.fixes, separated.states, heard)
     report("done", 3, 3)
-    trust |= separation_trust(separated, tuple(beacon.name for beacon in site.beacons), risk)
-    if "gain" in free:
-        trust |= Trust(tuple(gains_of(fixes, site, gain_sigma)))
+    fixes, states = found.fixes, found.states
     first = (fixes.world_from_body, fixes.position_world, fixes.pose_cov)
-    trust |= Trust(of_place(site, fixes.time, *(part[:, 0] for part in first)))
+    trust = found.trust | Trust(of_place(site, fixes.time, *(part[:, 0] for part in first)))
     trust |= Trust(recorded(log, site, BRIDGED, beacons=True))
     figures = heading("fix", log.name) | trust_figures(trust) | fix_figures(fixes, site)
     figures |= dropped_figures(dropped) | level_figures(states)
-    figures |= Figures(where_found("gain_spread", gain_sigma > 0.0, gain_sigma))
+    figures |= Figures(where_found("gain_spread", found.gain_spread > 0.0, found.gain_spread))
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     with claimed as whole:
         directory = found_in(whole, trust)

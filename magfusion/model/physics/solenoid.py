@@ -80,11 +80,14 @@ def loop_field(offset: Array, moment: Array, radius: float) -> Array:
     along = np.cross(axis, across)
     field = np.zeros_like(offset)
     count = _azimuths(offset, axis, radius)
-    for angle in np.arange(count) * 2.0 * np.pi / count:
-        outward = np.cos(angle) * across + np.sin(angle) * along
-        separation = offset - radius * outward
-        cubed = np.einsum("ni,ni->n", separation, separation)[:, None] ** 1.5
-        field += np.cross(np.cross(axis, outward), separation) / cubed
+    angle = (2.0 * np.pi / count * np.arange(count))[:, None]
+    outward = np.cos(angle) * across + np.sin(angle) * along
+    element = np.cross(axis, outward)
+    turned = np.cross(element[:, None], np.eye(3))  # element x e_i in row i
+    for from_centre, by_element in zip(radius * outward, turned, strict=True):
+        separation = offset - from_centre
+        square = np.einsum("ni,ni->n", separation, separation)
+        field += (separation @ by_element) / (square * np.sqrt(square))[:, None]
     return MU0_OVER_4PI * current * radius * (2.0 * np.pi / count) * field
 
 

@@ -1,0 +1,106 @@
+"""What a fix frees by itself: nothing, a beacon, or all gains, as little as explains the fields."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_gain_spread import error, scaled
+
+from magfusion.estimation.integrity.explained_fixes import ExplainedFixes, explained_fixes
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.model.trust import Verdict
+from magfusion.simulation.worlds import S0, draw_world, ring
+
+TARGETS = 40
+FOUR = ring(4)
+
+
+@pytest.fixture(scope="module")
+def room() -> tuple[Site, FieldSamples, np.ndarray]:
+    """Four beacons and noise alone: site, fields and where they are."""
+    rng = np.random.default_rng(8)
+    world = draw_world(S0, rng, FOUR, model_error=0.01)
+    targets = FOUR.draw_targets(rng, TARGETS)
+    return world.site, world.measure(targets, np.eye(3), rng), targets
+
+
+def explained(site: Site, samples: FieldSamples, free: tuple[str, ...] = ()) -> ExplainedFixes:
+    return explained_fixes(samples, initial_calibration(site, 0.0), survey_error=False, free=free)
+
+
+def codes(found: ExplainedFixes) -> list[str]:
+    return [finding.code for finding in found.trust.findings]
+
+
+def moved(site: Site, count: int, step: float = 0.5) -> Site:
+    """Return a site in which some beacons stand elsewhere than they are."""
+    shifts = step * np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]])[:count]
+    placed = tuple(
+        replace(beacon, position_world=beacon.position_world + shift)
+        for beacon, shift in zip(site.beacons, shifts, strict=False)
+    )
+    return replace(site, beacons=placed + site.beacons[count:])
+
+
+def scattered(samples: FieldSamples) -> FieldSamples:
+    gains = np.random.default_rng(9).normal(0.0, 0.15, (TARGETS, 4))
+    return scaled(samples, gains)
+
+
+def test_where_nothing_errs_the_fixes_are_those_with_gains_held_bit_for_bit(
+    room: tuple[Site, FieldSamples, np.ndarray],
+) -> None:
+    site, samples, _ = room
+    found = explained(site, samples)
+    held = fix_epochs(samples, initial_calibration(site, 0.0), survey_error=False)
+    assert found.gain_spread == 0.0
+    assert found.trust.verdict is Verdict.TRUSTWORTHY
+    for name in ("position_world", "world_from_body", "pose_cov", "log_gain"):
+        np.testing.assert_array_equal(getattr(found.fixes, name), getattr(held, name))
+
+
+def test_a_beacon_that_stands_elsewhere_is_left_out_and_gains_are_held(
+    room: tuple[Site, FieldSamples, np.ndarray],
+) -> None:
+    site, samples, targets = room
+    found = explained(moved(site, 1), samples)
+    assert codes(found) == ["beacon_excluded"]
+    assert f"beacon {site.beacons[0].name} " in found.trust.findings[0].text
+    assert found.gain_spread == 0.0
+    assert error(found.fixes, targets) < 2.0 * error(explained(site, samples).fixes, targets)
+    # Who asks for gains gets them, and a fix that is worse.
+    assert explained(moved(site, 1), samples, ("gain",)).gain_spread > 0.0
+
+
+def test_gains_that_err_from_place_to_place_are_freed_unasked(
+    room: tuple[Site, FieldSamples, np.ndarray],
+) -> None:
+    site, samples, targets = room
+    samples = scattered(samples)
+    found = explained(site, samples)
+    assert codes(found) == ["gain_spread"]
+    assert found.trust.verdict is Verdict.TRUSTWORTHY
+    assert found.gain_spread == pytest.approx(0.15, rel=0.3)
+    held = fix_epochs(samples, initial_calibration(site, 0.0), survey_error=False)
+    assert error(found.fixes, targets) < 0.2 * error(held, targets)
+    off = np.linalg.norm(found.fixes.position_world[:, 0] - targets, axis=1)
+    sigma = np.sqrt(np.trace(found.fixes.pose_cov[:, 0, 3:, 3:], axis1=1, axis2=2))
+    assert np.mean(off < 3.0 * sigma) > 0.95
+
+
+def test_a_survey_that_gains_do_not_explain_stays_in_doubt_without_them(
+    room: tuple[Site, FieldSamples, np.ndarray],
+) -> None:
+    site, samples, _ = room
+    found = explained(moved(site, 3), samples.rows(slice(0, 15)))
+    assert found.gain_spread == 0.0
+    assert found.trust.verdict is not Verdict.TRUSTWORTHY
+    assert "gain_spread" not in codes(found)
+
+
+def test_too_few_epochs_free_nothing(room: tuple[Site, FieldSamples, np.ndarray]) -> None:
+    site, samples, _ = room
+    assert explained(site, scattered(samples).rows(slice(0, 6))).gain_spread == 0.0
