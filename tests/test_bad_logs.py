@@ -159,7 +159,6 @@ IMU = "time_ns,gyro_x,gyro_y,gyro_z,accel_x,accel_y,accel_z"
 
 BAD_DIRECTORIES: list[tuple[Callable[[Path], object], str]] = [
     (lambda log: (log / "log.yaml").unlink(), "holds no log.yaml"),
-    (lambda log: (log / "imu.parquet").unlink(), "holds no imu.parquet or imu.csv"),
     (_no_field, "holds no magnetometer.parquet and no fields.parquet"),
     (lambda log: (log / "imu.csv").write_text(IMU), "holds imu.parquet and imu.csv; keep one"),
     (_header(magfusion_log=2), r"log.yaml: magfusion_log: found 2"),

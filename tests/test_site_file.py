@@ -255,7 +255,6 @@ NEEDED: list[Key] = [
     ("platform",),
     *((*BEACON, key) for key in ("name", "position_m", "rpy_deg", "frequency_hz", "coils")),
     (*COIL, "moment_a_m2"),
-    IMU,
     *((*IMU, f"{sensor}_{key}") for sensor in ("gyro", "accel") for key in ("noise", "bias_walk")),
     *((*IMU, f"{sensor}_bias_sigma") for sensor in ("gyro", "accel")),
     MAGNETOMETER,

@@ -29,6 +29,7 @@ from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import MotionModel, Site
 from magfusion.model.trajectory import Trajectory
+from magfusion.model.without_imu import logged, require_motion_prior
 from magfusion.units import Array, BoolArray, IntArray
 
 QUIET = 0.3  # sigmas; a last pass that moved the poses by less has converged all the same
@@ -147,6 +148,8 @@ def smooth(
         Where the graph cannot be solved.
     """
     settings = SmootherSettings() if settings is None else settings
+    log, site = logged(log, site)
+    require_motion_prior(site)
     for beacon in site.beacons:
         if beacon.unknown is not None:
             raise InputError(

@@ -143,6 +143,8 @@ class Arrivals:
         check_clock("imu", stamps, self._newest)
         rows = np.hstack([np.atleast_2d(gyro_body), np.atleast_2d(accel_body)])
         self.imu.add(stamps, rows)
+        if not self.receiver.site.platform.inertial:
+            return
         for instrument, own in ((self._gyro, rows[:, :3]), (self._accel, rows[:, 3:])):
             for after, until in instrument.stretches(stamps, own):
                 self.frozen += self.imu.leave_out(after, until)

@@ -31,10 +31,13 @@ from magfusion.estimation.process_noise import calibration_process_noise
 from magfusion.estimation.propagation import Propagated, propagate
 from magfusion.estimation.state import State
 from magfusion.estimation.state_of_now import CarriedState, Said, StateOfNow
+from magfusion.estimation.still_samples import StillSamples
 from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
 from magfusion.model.parameters import dimension, placed
+from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.samples import FieldSamples, SteadyFields
 from magfusion.model.site import Site
+from magfusion.model.without_imu import on_motion_prior, require_motion_prior
 from magfusion.receiver.receiver import Receiver
 from magfusion.units import Array
 
@@ -58,12 +61,16 @@ class Navigator:
     _white: list[float]
     _resets: Resets
     _now: StateOfNow
+    _still: StillSamples
     summary: Summary
     why_no_start: NoStart
     rival_chi_square: float | None
 
     def __init__(self, site: Site, settings: NavigatorSettings | None = None) -> None:
-        self.site = site
+        if site.platform.imu == NO_IMU:
+            site = on_motion_prior(site)
+        require_motion_prior(site)
+        self.site, self._still = site, StillSamples()
         self.settings = NavigatorSettings() if settings is None else settings
         if self.settings.earth:
             check_earth(site)
@@ -97,7 +104,7 @@ class Navigator:
         Raises
         ------
         InputError
-            Where a number is not finite or the clock jumped.
+            Where a number is not finite or the clock jumped, or the site describes no IMU.
         """
         self.hear_imu(time, gyro_body, accel_body)
         self.advance()
@@ -107,6 +114,11 @@ class Navigator:
 
         What takes longer is for `advance`, so that the state of now need not wait for it.
         """
+        if not self.site.platform.inertial:
+            raise InputError(
+                "imu: the site has a motion prior in its place; describe platform.imu, or leave the"
+                " inertial samples out"
+            )
         self._arrived.add_imu(time, gyro_body, accel_body)
         self._now.reach(self._arrived)
 
@@ -119,6 +131,7 @@ class Navigator:
             Where a number is not finite or the clock jumped.
         """
         self._arrived.add_magnetometer(time, measured_sensor)
+        self._stand_still(np.atleast_1d(time), raw=True)
         self.advance()
 
     def add_fields(self, samples: FieldSamples, steady: SteadyFields | None = None) -> None:
@@ -133,6 +146,8 @@ class Navigator:
         late = self._arrived.add_fields(samples, steady if self.settings.earth else None, after)
         if late:
             self.counts["field too late"] += late
+        heard = np.append([s.time[0] for s in self._arrived.fields], samples.time)
+        self._stand_still(np.unique(heard), raw=False)
         self.advance()
 
     def add_measurement(self, time: float, measurement: Measurement) -> None:
@@ -149,6 +164,16 @@ class Navigator:
         if not self._arrived.add_measurement(time, measurement, after):
             self.counts["measurement too late"] += 1
         self.advance()
+
+    def _stand_still(self, time: Array, *, raw: bool) -> None:
+        """Go on with a motion prior to where the fields have come (s), where it has no IMU."""
+        if self.site.platform.inertial:
+            return
+        made = self._still.stamps(time, raw=raw)
+        if len(made):
+            nothing = np.zeros((len(made), 3))
+            self._arrived.add_imu(made, nothing, nothing)
+            self._now.reach(self._arrived)
 
     # What comes out
 
@@ -372,7 +397,9 @@ class Navigator:
         hung_since, bridged = self._arrived.hung_since, predicted.bridged
         judgement = judgement.beside(*imu_remarks(hung_since, before, time, bridged=bridged))
         state, counts = self._estimator.state, self.counts
-        restarts = counts["found by a fix"] + counts["lost and found again"]
+        restarts = counts["lost and found again"]
+        if self.site.platform.inertial:  # a motion prior may be wide, and a fix its rule
+            restarts += counts["found by a fix"]
         self._resets.hear(predicted.state, state, self._judgement, judgement, restarts)
         self._tell(state, judgement)
         lag = self._arrived.apply_offset_anew(state, self.blocks)

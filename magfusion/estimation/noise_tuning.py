@@ -38,9 +38,15 @@ SCALES = 8  # epochs in a row that are compared, so far apart that they share no
 FAULT = 3.0  # of a declared model error; more is no error of that kind, and is not covered by it
 WEIGHINGS = 5  # times that the epochs are weighed by what is found, at first as if noise were all
 OF_IMU = ("gyro_noise", "accel_noise")  # a beacon may be called "imu", too
+# Of a motion prior, by what of the IMU stands for it; the rate is that of the bias, in its rows.
+OF_MOTION = {"angular_accel_density": "gyro_bias_walk", "accel_density": "accel_noise"}
+WALK = slice(12, 15)
 NONE = 1e-4  # of a part that was not declared: as good as none
 PLAUSIBLE = 6.0  # by a factor of more, either way, white noise is a fault under another name
 LEFT = 1e-3  # of an error; of which less is left says nothing
+# Of a beacon's noise; where less is left no IMU holds the pose, the beacon alone does, and by its
+# own residuals, which it takes with it, it would seem better and better from pass to pass.
+SELF_MADE = 0.5
 
 
 @dataclass(frozen=True)
@@ -50,8 +56,8 @@ class Tuned:
     Parameters
     ----------
     owner : str
-        Beacon, or "imu".
-    key : {'noise_factor', 'model_error', 'gyro_noise', 'accel_noise'}
+        Beacon, "imu" or "motion_prior".
+    key : {'noise_factor', 'model_error', 'gyro_noise', 'accel_noise', or of `OF_MOTION`}
     declared, found : float
         In the unit of the site's file.
     """
@@ -70,10 +76,11 @@ class Tuned:
 def tuned_site(site: Site, tuned: Sequence[Tuned]) -> Site:
     """Return a site with the noise that was found."""
     of_imu: dict[str, Any] = {t.key: t.found for t in tuned if t.key in OF_IMU}
+    of_imu |= {OF_MOTION[t.key]: t.found for t in tuned if t.key in OF_MOTION}
     platform = replace(site.platform, imu=replace(site.platform.imu, **of_imu))
     beacons = []
     for beacon in site.beacons:
-        named = (t for t in tuned if t.owner == beacon.name and t.key not in OF_IMU)
+        named = (t for t in tuned if t.owner == beacon.name and t.key not in (*OF_IMU, *OF_MOTION))
         own: dict[str, Any] = {t.key: t.found for t in named}
         beacons.append(replace(beacon, **own))
     return replace(site, platform=platform, beacons=tuple(beacons))
@@ -86,7 +93,7 @@ def with_noise(calibration: Calibration, tuned: Sequence[Tuned]) -> Calibration:
 
 def plausible(tuned: Sequence[Tuned]) -> bool:
     """Tell whether what was found is noise: a fault is none, and must not be hidden by it."""
-    white = [t.factor for t in tuned if t.key != "model_error"]
+    white = [t.factor for t in tuned if t.key != "model_error" and t.key not in OF_MOTION]
     return all(1.0 / PLAUSIBLE < factor < PLAUSIBLE for factor in white)
 
 
@@ -175,11 +182,14 @@ def tune(
         # Of a strong beacon less noise than declared is not to be told from a little model error.
         unsure = LEAST**2 * float(np.sum(known[2:]) / np.sum(known[0]))
         white = float(np.sqrt(max(white, min(white + unsure, 1.0))))
+        self_made = not declared.platform.inertial and _left_of_noise(channels) < SELF_MADE
+        white = max(white, 1.0) if self_made else white
         found.append(
             Tuned(beacon.name, "noise_factor", prior.noise_factor, white * prior.noise_factor)
         )
         if tuned:
             factor = min(float(np.exp(log[1])), FAULT)  # faults come first
+            factor = max(factor, 1.0) if self_made else factor
             found.append(Tuned(beacon.name, "model_error", usual, factor * usual))
     return (*found, *_tuned_imu(system, now, declared))
 
@@ -192,6 +202,13 @@ def _without(own: ChannelErrors, blind: BoolArray | None) -> ChannelErrors:
     variance = own.variance[0][kept], own.variance[1][kept]
     left = noise, model, inertial
     return replace(own, epoch=own.epoch[kept], seen=own.seen[kept], left=left, variance=variance)
+
+
+def _left_of_noise(channels: list[ChannelErrors]) -> float:
+    """Return the share of a beacon's noise that its residuals still have."""
+    left = sum(float(np.sum(own.left[0] ** 2)) for own in channels)
+    given = sum(float(np.sum(own.variance[0])) * own.size[0] ** 2 for own in channels)
+    return left / given if given > 0.0 else 1.0
 
 
 def _by_scale(channels: list[ChannelErrors], alike: Array, lag: int) -> tuple[Array, Array, Array]:
@@ -248,7 +265,10 @@ def _tuned_imu(system: Leavings, now: Site, declared: Site) -> list[Tuned]:
     """Return the densities of gyro and accelerometer."""
     plain = system.inertial()
     found = []
-    for key, rows in (("gyro_noise", GYRO), ("accel_noise", ACCEL)):
+    owner, of_turn, names = "imu", GYRO, {name: name for name in OF_IMU}
+    if not declared.platform.inertial:
+        owner, of_turn, names = "motion_prior", WALK, OF_MOTION
+    for (name, key), rows in zip(names.items(), (of_turn, ACCEL), strict=True):
         scale = system.sigma[:, rows]
         square, noise, model, own = (np.sum((p[:, rows] / scale) ** 2, axis=1) for p in plain)
         before, usual = getattr(declared.platform.imu, key), getattr(now.platform.imu, key)
@@ -263,7 +283,7 @@ def _tuned_imu(system: Leavings, now: Site, declared: Site) -> list[Tuned]:
         weight = np.full(count, min(1.0, (every[2] + fixed[0]) ** 2 / every[2]))
         log = _likeliest(square[here], known, fixed, weight, 3)
         # What is declared below these holds scale and vibration too, which are not white.
-        found.append(Tuned("imu", key, before, float(before * np.exp(max(log[0], 0.0)))))
+        found.append(Tuned(owner, name, before, float(before * np.exp(max(log[0], 0.0)))))
     return found
 
 

@@ -20,10 +20,12 @@ from magfusion.files.inertial_tables import (
 from magfusion.files.table import LARGEST_TIME_NS, Span, find_table
 from magfusion.files.trajectory_table import read_trajectory, write_trajectory
 from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
-from magfusion.model.samples import Log
+from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding
 
 HEADER = "log.yaml"
+_NOTHING: tuple[Finding, ...] = ()
 STREAMS = ("imu", "magnetometer", "fields", "truth")
 
 
@@ -54,7 +56,8 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
     Returns
     -------
     Log
-        Streams without a row in the span are None.
+        Streams without a row in the span are None; without a table of inertial samples there are
+        none.
 
     Raises
     ------
@@ -70,13 +73,13 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
     header = read_yaml(path / HEADER, LogHeader)
     span = Span(header.epoch_ns, start, end)
     tables = {stem: find_table(path, stem) for stem in STREAMS}
-    if tables["imu"] is None:
-        raise InputError(f"{path}: holds no imu.parquet or imu.csv; add the inertial samples.")
     if tables["magnetometer"] is None and tables["fields"] is None:
         raise InputError(
             f"{path}: holds no magnetometer.parquet and no fields.parquet (nor .csv); add one."
         )
-    imu, of_imu = read_imu(tables["imu"], span)
+    imu, of_imu = ImuSamples.empty(), _NOTHING
+    if tables["imu"] is not None:
+        imu, of_imu = read_imu(tables["imu"], span)
     waveform, of_waveform = read_waveform(tables["magnetometer"], span)
     log = Log(
         name=header.name,
@@ -110,7 +113,8 @@ def write_log(log: Log, path: Path) -> None:
             _keep_others(path, unfinished)
         header = {"magfusion_log": 1, "name": log.name, "epoch_ns": log.epoch_ns}
         write_yaml(header | {"source": log.source}, unfinished / HEADER)
-        write_imu(log.imu, unfinished / "imu.parquet", log.epoch_ns)
+        if log.inertial and len(log.imu):
+            write_imu(log.imu, unfinished / "imu.parquet", log.epoch_ns)
         if log.waveform is not None:
             write_waveform(log.waveform, unfinished / "magnetometer.parquet", log.epoch_ns)
         if log.fields is not None:

@@ -12,19 +12,19 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.files.field_map import read_field_maps, write_field_maps
 from magfusion.files.site_correlation import load_correlation, save_correlation
+from magfusion.files.site_motion import MILLION, MotionEntry, imu_entry, prior_entry
 from magfusion.files.site_region import region_entry
 from magfusion.files.site_schema import (
     BeaconEntry,
     ClockEntry,
     EarthEntry,
-    ImuEntry,
     MagnetometerEntry,
-    MotionEntry,
     SiteEntry,
 )
 from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
 from magfusion.model.field_map import FieldMap
 from magfusion.model.physics.earth import earth_field_world
+from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.site import (
     Beacon,
     BeaconSigma,
@@ -40,12 +40,12 @@ from magfusion.model.site import (
     Site,
     Slots,
 )
+from magfusion.model.without_imu import as_declared
 from magfusion.units import DEGREE, Array
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-MILLION = 1e6  # ppm in one
 SAME_FIELD = 1e-12  # T; less is rounding
 Model = TypeVar("Model", bound="DataclassInstance")
 
@@ -92,9 +92,10 @@ def load_site(path: Path | str, *, unknown: bool = False, without: bool = False)
         model_error_length=entry.world.model_error_correlation_m,
         beacons=tuple(replace(_beacon(b), field_map=maps.get(b.name)) for b in entry.beacons),
         platform=Platform(
-            _model(ImuModel, entry.platform.imu),
+            NO_IMU if entry.platform.imu is None else _model(ImuModel, entry.platform.imu),
             _magnetometer(entry.platform.magnetometer),
             _model(MotionModel, entry.platform.motion),
+            None if entry.platform.motion_prior is None else entry.platform.motion_prior.prior(),
         ),
         earth_field_world=field_world,
         location=location,
@@ -127,7 +128,7 @@ def save_site(site: Site, path: Path | str) -> None:
         Replaced as a whole, or left as it was if anything fails.  Field maps are written beside
         it, as ``<stem>_field_map.parquet``, a correlation as ``<stem>_correlation.parquet``.
     """
-    path = Path(path)
+    path, site = Path(path), as_declared(site)
     maps = {b.name: b.field_map for b in site.beacons if b.field_map is not None}
     beside = path.with_name(f"{path.stem}_field_map.parquet")
     content = {
@@ -135,9 +136,10 @@ def save_site(site: Site, path: Path | str) -> None:
         "world": _world_entry(site) | ({"field_map": beside.name} if maps else {}),
         "beacons": [_beacon_entry(b) for b in site.beacons],
         "platform": {
-            "imu": _imu_entry(site.platform.imu),
+            **imu_entry(site.platform.imu),
             "magnetometer": _magnetometer_entry(site.platform.magnetometer),
             **_model_entry("motion", site.platform.motion, MotionEntry),
+            **prior_entry(site.platform.motion_prior),
         },
         **_model_entry("clock", site.clock, ClockEntry),
         **region_entry(site.region),
@@ -235,13 +237,6 @@ def _si(key: str, value: float) -> float:
     if key.endswith("_ppm"):
         return value / MILLION
     return value * DEGREE if key.endswith("_deg") else value
-
-
-def _ppm(value: float) -> float:
-    """Return the number that is read back as the same, where there is one."""
-    near = value * MILLION
-    around = (near, np.nextafter(near, np.inf), np.nextafter(near, -np.inf))
-    return float(next((one for one in around if one / MILLION == value), near))
 
 
 def _model_entry(key: str, model: object, entry: type[StrictModel]) -> dict[str, Any]:
@@ -360,15 +355,6 @@ def _coil_entry(coil: Coil) -> dict[str, Any]:
         "slot": coil.slot,
     }
     return entry | {k: _plain(v) for k, v in options.items() if v is not None}
-
-
-def _imu_entry(imu: ImuModel) -> dict[str, Any]:
-    usual = {
-        "clock_rate_ppm": ImuModel.clock_rate,
-        "clock_rate_sigma_ppm": ImuModel.clock_rate_sigma,
-    }
-    keys = zip(ImuEntry.model_fields, vars(imu).values(), strict=True)
-    return {k: _ppm(v) if k.endswith("_ppm") else float(v) for k, v in keys if usual.get(k) != v}
 
 
 def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:

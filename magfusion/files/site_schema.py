@@ -13,6 +13,7 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticKnownError
 
+from magfusion.files.site_motion import ImuEntry, MotionEntry, MotionPriorEntry
 from magfusion.files.site_region import RegionEntry
 from magfusion.files.site_values import (
     HIGHEST_FREQUENCY,
@@ -47,7 +48,6 @@ from magfusion.model.site import (
     Coil,
     EarthModel,
     Magnetometer,
-    MotionModel,
     Site,
 )
 from magfusion.units import DEGREE, Array
@@ -72,7 +72,7 @@ _PositionSigma = Annotated[Array, sigma_array(3, largest=1e4)]
 _RotationSigma = Annotated[Array, sigma_array(3, largest=360.0)]
 
 
-_CLOCK, _EARTH, _MOTION = ClockModel(), EarthModel(), MotionModel()
+_CLOCK, _EARTH = ClockModel(), EarthModel()
 
 
 class LocationEntry(StrictModel):
@@ -101,20 +101,6 @@ class EarthEntry(StrictModel):
     strength_sigma: _Positive = _EARTH.strength_sigma
     declination_walk_deg: _NotNegative = _EARTH.declination_walk / DEGREE
     strength_walk_t: Annotated[_NotNegative, tesla(LARGEST_EARTH_FIELD)] = _EARTH.strength_walk
-
-
-class MotionEntry(StrictModel):
-    """`magfusion.model.site.MotionModel`, field by field in its order."""
-
-    rest_gyro_rad_s: _Positive = _MOTION.rest_gyro
-    rest_accel_m_s2: _Positive = _MOTION.rest_accel
-    rest_span_s: Annotated[float, Field(ge=0.2, le=60.0)] = _MOTION.rest_span
-    rest_speed_sigma_m_s: _Positive = _MOTION.rest_speed_sigma
-    rest_known_speed_m_s: _Positive = _MOTION.rest_known_speed
-    speed_sigma_m_s: _Positive = _MOTION.speed_sigma
-    accel_sigma_m_s2: _Positive = _MOTION.accel_sigma
-    accel_span_s: _Positive = _MOTION.accel_span
-    start_speed_sigma_m_s: _Positive = _MOTION.start_speed_sigma
 
 
 class WorldEntry(StrictModel):
@@ -287,24 +273,6 @@ class BeaconEntry(StrictModel):
         return self
 
 
-_MILLISECONDS = 0.01  # s; what an undeclared time offset may be
-
-
-class ImuEntry(StrictModel):
-    """Inertial noise and the IMU's clock."""
-
-    gyro_noise: _Positive
-    accel_noise: _Positive
-    gyro_bias_walk: _NotNegative
-    accel_bias_walk: _NotNegative
-    gyro_bias_sigma: Annotated[_FromZero, between(0.0, 100.0)]
-    accel_bias_sigma: Annotated[_FromZero, between(0.0, 1e3)]
-    time_offset_s: Annotated[float, between(-1e10, 1e10)] = 0.0
-    time_offset_sigma_s: Annotated[_FromZero, between(0.0, 1e3)] = _MILLISECONDS
-    clock_rate_ppm: Annotated[float, between(-1e4, 1e4)] = 0.0
-    clock_rate_sigma_ppm: Annotated[_FromZero, between(0.0, 1e4)] = 50.0  # of quartz
-
-
 class MagnetometerSigmaEntry(StrictModel):
     """Priors of the magnetometer's calibration; an absent one is zero."""
 
@@ -347,9 +315,10 @@ class MagnetometerEntry(StrictModel):
 class PlatformEntry(StrictModel):
     """What moves."""
 
-    imu: ImuEntry
+    imu: ImuEntry | None = None
     magnetometer: MagnetometerEntry
     motion: MotionEntry = MotionEntry()
+    motion_prior: MotionPriorEntry | None = None
 
 
 class SiteEntry(StrictModel):

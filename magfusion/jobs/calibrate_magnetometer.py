@@ -61,11 +61,12 @@ def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
     """
     from magfusion.calibration.magnetometer_log import calibrate_log
     from magfusion.files.site import save_site
-    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed, require_imu
     from magfusion.results.report import write_report
 
     claimed = claim(job.output, JOB)
     log, site = read_job(job)
+    require_imu(job, log, "gravity and gyro tell how the magnetometer turned")
     if log.waveform is None:
         raise InputError(
             f"{job.log_path}: holds no waveform, only phasors, which do not hold the Earth's field;"

@@ -23,11 +23,13 @@ from magfusion.files.site import load_site
 from magfusion.files.trajectory_table import read_trajectory
 from magfusion.files.tum import read_tum
 from magfusion.jobs.region import ANYWHERE, Where
+from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Trust, Verdict
+from magfusion.model.without_imu import logged
 from magfusion.receiver.receiver import Receiver
 from magfusion.results.page import PAGE
 from magfusion.results.report import FAILED
@@ -241,6 +243,12 @@ def read_job(job: Job, *, unknown: bool = False, report: Report = quiet) -> tupl
     """
     site = read_site(job, unknown=unknown)
     log = _open(job, report)
+    log, site = logged(log, site)
+    if log.inertial and site.platform.imu == NO_IMU:
+        raise InputError(
+            f"{job.declared_path}: platform.imu: is missing, and {job.log_path} holds inertial"
+            " samples; describe the sensor, or remove its samples to do without"
+        )
     if log.waveform is not None:
         with named(job.declared_path):
             Receiver.of(site).check()
@@ -249,6 +257,20 @@ def read_job(job: Job, *, unknown: bool = False, report: Report = quiet) -> tupl
         with named(job.log_path):
             log = replace(log, fields=order_channels(log.fields, site))
     return log, site
+
+
+def require_imu(job: Job, log: Log, what: str) -> None:
+    """Refuse a log without inertial samples.
+
+    Raises
+    ------
+    InputError
+    """
+    if not log.inertial:
+        raise InputError(
+            f"{job.log_path}: holds no imu.parquet or imu.csv, and {what}; record the inertial"
+            " sensor beside the magnetometer"
+        )
 
 
 def read_recording(job: Job, report: Report = quiet) -> tuple[Log, Site | None]:

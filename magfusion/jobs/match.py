@@ -66,7 +66,7 @@ def run_match(settings: MatchSettings, output: Path) -> Figures:
     """
     from magfusion.files.attitude_table import write_attitudes
     from magfusion.jobs.attitude_database import steady
-    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed, require_imu
     from magfusion.jobs.match_trust import judged
     from magfusion.results.figures import Figure, Figures, heading
     from magfusion.results.plots.match import write_match_plot
@@ -76,6 +76,8 @@ def run_match(settings: MatchSettings, output: Path) -> Figures:
     _check(settings)
     job, claimed = settings.job(output), claim(output, "match")
     log, site = read_job(job)
+    if settings.gravity:
+        require_imu(job, log, "gravity is by the accelerometer")
     with named(job.log_path):
         taken = steady(log, site, settings)
     found = _match(job, log, site, taken, settings)

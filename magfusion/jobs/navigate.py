@@ -12,7 +12,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.jobs.live import LiveSettings, state_sinks
-from magfusion.jobs.rates import RateSettings
+from magfusion.jobs.rates import RateSettings, refuse_rate
 from magfusion.jobs.region import RegionSettings
 from magfusion.jobs.settings import (
     Command,
@@ -168,6 +168,7 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
     from magfusion.files.row_file import claim_rows
     from magfusion.jobs.inputs import CHECKPOINT, claim, found_in, named, read_job, refuse_failed
     from magfusion.jobs.navigate_results import motion_of, write_navigated
+    from magfusion.model.without_imu import require_motion_prior
     from magfusion.results.report import write_report
 
     job, claimed = settings.job(output), claim(output, "navigate")
@@ -178,6 +179,9 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
         if path != place or not settings.resume:
             claim_checkpoint(path)
     log, site = read_job(job, report=report)
+    refuse_rate(job.log_path, log, settings.rates)
+    with named(job.log_path):
+        require_motion_prior(site)
     navigator = replace(navigator, lockin=beside_lines(log, site, navigator.lockin))
     if settings.earth and log.waveform is None:
         raise InputError(

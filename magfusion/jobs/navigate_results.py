@@ -166,6 +166,8 @@ def _part(rows: dict[str, Array], own: BoolArray, site: Site) -> Part | None:
         pose_cov=rows["pose_cov"][own].reshape(-1, 6, 6),
         **{name: rows[name][own] for name in tuple(_STATE)[2:]},
     )
+    if not site.platform.inertial:  # the prior's bias is the rate, and no bias
+        states = replace(states, gyro_bias_body=None, accel_bias_body=None)
     excluded = tuple(
         tuple(b.name for b, out in zip(site.beacons, row, strict=True) if out)
         for row in rows["excluded"][own]

@@ -9,6 +9,9 @@ from magfusion.errors import InputError
 from magfusion.jobs.settings import Settings, option
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from magfusion.model.samples import Log
     from magfusion.units import Rate
 
 LOWEST_RATE, HIGHEST_RATE = 0.1, 1e4  # Hz
@@ -45,3 +48,14 @@ class RateSettings(Settings):
         if self.rate == "field":
             return "field"
         return "imu" if self.rate == "imu" else float(self.rate)
+
+
+def refuse_rate(path: Path, log: Log, rate: Rate) -> None:
+    """Refuse states at inertial samples that a log has not.
+
+    Raises
+    ------
+    InputError
+    """
+    if rate == "imu" and not log.inertial:
+        raise InputError(f"{path}: holds no inertial samples to tell states at; give --rate HZ")

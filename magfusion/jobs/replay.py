@@ -92,7 +92,7 @@ class Replay:
 
 def feed(navigator: Navigator, piece: Piece) -> None:
     """Give a piece to a navigator."""
-    if len(piece.imu):
+    if len(piece.imu) and navigator.site.platform.inertial:
         navigator.add_imu(piece.imu.time, piece.imu.gyro_body, piece.imu.accel_body)
     if piece.waveform is not None and len(piece.waveform):
         navigator.add_magnetometer(piece.waveform.time, piece.waveform.measured_sensor)

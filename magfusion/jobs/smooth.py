@@ -113,11 +113,13 @@ def run_smooth(
     from magfusion.estimation.self_survey import smooth_and_place
     from magfusion.jobs.failure import reason_of
     from magfusion.jobs.inputs import claim, named, read_job, refuse_failed
+    from magfusion.jobs.rates import refuse_rate
     from magfusion.jobs.smooth_result import finished, with_errors, write_finished
     from magfusion.results.report import FAILED
 
     claimed = claim(job.output, "smooth", "fix")
     log, site = read_job(job, unknown=True, report=report)
+    refuse_rate(job.log_path, log, rate)
     began = time.perf_counter()
     try:
         with named(job.log_path):

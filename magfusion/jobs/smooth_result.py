@@ -121,8 +121,13 @@ def with_errors(
 def write_finished(whole: Path, log: Log, done: Finished, *, rate: Rate) -> None:
     """Write all files of a smoothed log: below `FAILED` where its verdict is that."""
     result, by_state = done.result, done.states
+    if not log.inertial:  # the prior's bias is the rate, and no bias
+        states = replace(result.states, gyro_bias_body=None, accel_bias_body=None)
+        result = replace(result, states=states)
     refined, innovations = result_site(result, log.name), _innovations(result)
-    written = result.states if rate == "field" else at_rate(result, log, rate)
+    written = result.states if rate == "field" else at_rate(done.result, log, rate)
+    if not log.inertial:
+        written = replace(written, gyro_bias_body=None, accel_bias_body=None)
     directory = found_in(whole, done.trust)
     write_tum(written, directory / "trajectory.tum", log.epoch_ns)
     rows = states_between(by_state, result.states, written)

@@ -235,23 +235,36 @@ def state_content(navigator: Navigator, state: JudgedState) -> dict[str, Any]:
     world_from_body, cov = state.world_from_body, state.cov
     rival = navigator.rival_chi_square
     position_cov = world_from_body @ cov[POSITION, POSITION] @ world_from_body.T
+    biases, sigmas = _of_imu(navigator, state)
     quaternion = Rotation.from_matrix(world_from_body).as_quat(scalar_first=True)
     return told | {
         "ambiguous": rival is not None and rival < AMBIGUOUS_CHI_SQUARE,
         "position": state.position_world.tolist(),
         "quaternion": quaternion.tolist(),
         "velocity": state.velocity_world.tolist(),
-        "gyro_bias": state.gyro_bias_body.tolist(),
-        "accel_bias": state.accel_bias_body.tolist(),
+        **biases,
         "sigma": {
             "position": _sigma(position_cov),
             "rotation_body": _sigma(cov[ROTATION, ROTATION]),
             "velocity": _sigma(cov[VELOCITY, VELOCITY]),
-            "gyro_bias": _sigma(cov[GYRO_BIAS, GYRO_BIAS]),
-            "accel_bias": _sigma(cov[ACCEL_BIAS, ACCEL_BIAS]),
+            **sigmas,
         },
         "distortion": dict(navigator.distortion),
     }
+
+
+def _of_imu(
+    navigator: Navigator, state: JudgedState
+) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
+    """Return the biases of the IMU and their sigmas; of a motion prior the rate, body axes."""
+    gyro, accel = _sigma(state.cov[GYRO_BIAS, GYRO_BIAS]), _sigma(state.cov[ACCEL_BIAS, ACCEL_BIAS])
+    if not navigator.site.platform.inertial:
+        return {"rate": (-state.gyro_bias_body).tolist()}, {"rate": gyro}
+    biases = {
+        "gyro_bias": state.gyro_bias_body.tolist(),
+        "accel_bias": state.accel_bias_body.tolist(),
+    }
+    return biases, {"gyro_bias": gyro, "accel_bias": accel}
 
 
 def _sigma(cov: Array) -> list[float]:

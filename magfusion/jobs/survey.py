@@ -118,7 +118,7 @@ def make_survey(
     detected = samples.valid.any(axis=1)
     still = np.ones(len(samples), dtype=bool)
     if points == "rests":
-        still = _at_rest(samples, log, site)
+        still = _at_rest(samples, log, site) if log.inertial else _stands(samples, poses)
     used = np.flatnonzero(exists & detected & still)
     dropped = {
         "outside the trajectory": int(np.sum(~exists)),
@@ -161,6 +161,22 @@ def _at_rest(samples: FieldSamples, log: Log, site: Site) -> BoolArray:
     first = np.searchsorted(time, samples.time - half)
     last = np.searchsorted(time, samples.time + half, side="right")
     return np.asarray((last > first) & (total[last] == total[first]))
+
+
+def _stands(samples: FieldSamples, poses: Trajectory) -> BoolArray:
+    """Return during which windows the known poses stay within `STILL`, where no IMU tells."""
+    from magfusion.model.trajectory import interpolate
+
+    still = np.ones(len(samples), dtype=bool)
+    ends = []
+    for sign in (-0.5, 0.5):
+        there, exists = interpolate(poses, samples.time + sign * samples.window, MAX_GAP)
+        position = np.full((len(samples), 3), np.nan)
+        position[exists] = there.position_world
+        ends.append(position)
+        still &= exists
+    moved = np.linalg.norm(ends[1] - ends[0], axis=1)
+    return np.asarray(still & (moved < STILL))
 
 
 def _stops(time: Array, position: Array) -> IntArray:

@@ -31,6 +31,11 @@ class ImuSamples:
     def __len__(self) -> int:
         return len(self.time)
 
+    @staticmethod
+    def empty() -> "ImuSamples":
+        """Return no sample."""
+        return ImuSamples(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+
 
 @dataclass(frozen=True, eq=False)
 class Waveform:
@@ -191,11 +196,13 @@ class StreamClock:
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """One recording; streams that it does not hold are None.
+    """One recording; streams that it does not hold are None, an IMU that it does not is empty.
 
     ``epoch_ns`` is the log clock's zero, to which drive phases and every ``time`` refer.
     ``steady`` goes with ``fields``, at the same times; no file holds it.  ``clocks`` says of which
-    streams the stamps scatter, ``noticed`` what else was mended in it.
+    streams the stamps scatter, ``noticed`` what else was mended in it.  Where not ``inertial``, the
+    samples of the IMU are those of a motion prior (`magfusion.model.without_imu`), and measured
+    nothing.
     """
 
     name: str
@@ -208,3 +215,4 @@ class Log:
     steady: SteadyFields | None = None
     clocks: Mapping[str, StreamClock] = field(default_factory=dict)
     noticed: tuple[Finding, ...] = ()
+    inertial: bool = True

@@ -9,6 +9,9 @@ import numpy as np
 
 from magfusion.model.correlation import Correlation
 from magfusion.model.field_map import FieldMap
+from magfusion.model.platform_motion import A_HAND, MotionPrior, Replaced
+from magfusion.model.platform_motion import ImuModel as ImuModel
+from magfusion.model.platform_motion import MotionModel as MotionModel
 from magfusion.model.region import Bounds, Region, bounds_of
 from magfusion.units import Array, ComplexArray, IntArray
 
@@ -210,61 +213,6 @@ class EarthModel:
     strength_walk: float = 1e-6
 
 
-@dataclass(frozen=True)
-class MotionModel:
-    """How the platform moves, and what counts as rest; by default that of a hand.
-
-    Parameters
-    ----------
-    rest_gyro, rest_accel : float
-        It rests where rate (rad/s) and specific force (m/s^2) deviate less from their means.
-    rest_span : float
-        Duration of that (s).
-    rest_speed_sigma : float
-        Of the zero velocity (m/s).
-    rest_known_speed : float
-        A velocity with a larger sigma is not taken for zero (m/s).
-    speed_sigma : float
-        Usual speed (m/s).
-    accel_sigma : float
-        Of the mean specific force against gravity, in motion (m/s^2).
-    accel_span : float
-        Over which it is averaged (s).
-    start_speed_sigma : float
-        Prior of the first velocity (m/s).
-    """
-
-    rest_gyro: float = 0.03
-    rest_accel: float = 0.25
-    rest_span: float = 1.0
-    rest_speed_sigma: float = 0.01
-    rest_known_speed: float = 0.1
-    speed_sigma: float = 1.0
-    accel_sigma: float = 1.5
-    accel_span: float = 2.0
-    start_speed_sigma: float = 10.0
-
-
-@dataclass(frozen=True)
-class ImuModel:
-    """Inertial noise: densities per square root of hertz, walks per square root of second.
-
-    ``time_offset`` says that the sample stamped t was taken at t + offset on the log's clock (s);
-    that is of the first sample, and grows by ``clock_rate`` from there on.
-    """
-
-    gyro_noise: float
-    accel_noise: float
-    gyro_bias_walk: float
-    accel_bias_walk: float
-    gyro_bias_sigma: float
-    accel_bias_sigma: float
-    time_offset: float = 0.0
-    time_offset_sigma: float = 0.01
-    clock_rate: float = 0.0
-    clock_rate_sigma: float = 5e-5
-
-
 @dataclass(frozen=True, eq=False)
 class MagnetometerSigma:
     """Prior standard deviations of the magnetometer's calibration; zero means known.
@@ -323,11 +271,27 @@ class Magnetometer:
 
 @dataclass(frozen=True)
 class Platform:
-    """What moves: an IMU and a magnetometer rigidly mounted beside it."""
+    """What moves: an IMU and a magnetometer rigidly mounted beside it.
+
+    Parameters
+    ----------
+    motion_prior : MotionPrior, optional
+        What is assumed of the motion where a log has no inertial samples.
+    replaced : Replaced, optional
+        What that prior takes the place of (`magfusion.model.without_imu`); None where the IMU
+        measures.
+    """
 
     imu: ImuModel
     magnetometer: Magnetometer
-    motion: MotionModel = MotionModel()
+    motion: MotionModel = A_HAND
+    motion_prior: MotionPrior | None = None
+    replaced: Replaced | None = None
+
+    @property
+    def inertial(self) -> bool:
+        """Whether an IMU measures the motion."""
+        return self.replaced is None
 
 
 @dataclass(frozen=True)

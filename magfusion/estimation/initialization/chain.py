@@ -14,7 +14,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
 POSITION_SIGMA = 0.1  # m; added to the fixes' own, which calibration errors exceed
-ROTATION_SIGMA = 0.1  # rad
+ROTATION_SIGMA = 0.1  # rad; and what the gyro's bias may add
 LEAP_COST = 100.0  # of a jump between unrelated hypotheses: one bad epoch must not break a chain
 RIVAL_COST = 1000.0  # chi square; a chain worse by more is no rival
 
@@ -70,7 +70,7 @@ def choose_chains(
     unary = np.minimum(fixes.cost - np.min(fixes.cost, axis=1, keepdims=True), LEAP_COST)
     unary = unary + _gravity_cost(fixes, imu, time, site)
     unary = np.where(np.isfinite(fixes.cost), unary, np.inf)
-    link = _link_cost(fixes, attitude, site.platform.motion.speed_sigma)
+    link = _link_cost(fixes, attitude, site)
     chains: list[Start] = []
     left = unary.copy()
     for _ in range(fixes.cost.shape[1]):
@@ -114,7 +114,7 @@ def _gravity_cost(fixes: Fixes, imu: ImuSamples, time: Array, site: Site) -> Arr
     return np.minimum(np.sum(error**2, axis=-1) / motion.accel_sigma**2, LEAP_COST)
 
 
-def _link_cost(fixes: Fixes, attitude: Rotation, speed_sigma: float) -> Array:
+def _link_cost(fixes: Fixes, attitude: Rotation, site: Site) -> Array:
     """Cost of going from hypothesis i to j between neighbouring epochs, shape (n-1, h, h)."""
     dt = np.diff(fixes.time)
     turn = (attitude[:-1].inv() * attitude[1:]).as_matrix()
@@ -122,8 +122,9 @@ def _link_cost(fixes: Fixes, attitude: Rotation, speed_sigma: float) -> Array:
     between = np.swapaxes(expected[:, :, None], -1, -2) @ fixes.world_from_body[1:, None]
     angle = Rotation.from_matrix(between.reshape(-1, 3, 3)).magnitude().reshape(between.shape[:3])
     jump = fixes.position_world[1:, None] - fixes.position_world[:-1, :, None]
-    spread = (speed_sigma * dt) ** 2 + POSITION_SIGMA**2
-    cost = np.sum(jump**2, axis=-1) / spread[:, None, None] + (angle / ROTATION_SIGMA) ** 2
+    spread = (site.platform.motion.speed_sigma * dt) ** 2 + POSITION_SIGMA**2
+    turned = (site.platform.imu.gyro_bias_sigma * dt) ** 2 + ROTATION_SIGMA**2
+    cost = np.sum(jump**2, axis=-1) / spread[:, None, None] + angle**2 / turned[:, None, None]
     return np.minimum(cost, LEAP_COST)
 
 

@@ -114,6 +114,7 @@ def find_online_start(
         waveform=None if fields else Waveform(time[time <= until], rows[time <= until]),
         fields=FieldSamples.joined(whole) if whole else None,
         steady=_joined_steady(steady, whole) if whole and steady else None,
+        inertial=site.platform.inertial,
     )
     asked = {f.name: getattr(settings, f.name) for f in fields_of(EstimatorSettings)}
     heard = log

@@ -155,6 +155,8 @@ def _upright(imu: ImuSamples, time_offset: float, time: Array, site: Site) -> Gr
     stamps, motion = imu.time + time_offset, site.platform.motion
     chain = attitude_from_gyro(stamps, imu.gyro_body)
     turned = mean_about(stamps, chain.apply(imu.accel_body), time, motion.accel_span)
+    if not site.platform.inertial:
+        return Gravity(np.tile([0.0, 0.0, 1.0], (len(time), 1)), np.full(len(time), np.inf))
     up = attitude_at(chain, stamps, imu.gyro_body, time).inv().apply(turned)
     sigma = np.full(len(time), motion.accel_sigma / site.gravity)
     return Gravity(up / np.linalg.norm(up, axis=1, keepdims=True), sigma)

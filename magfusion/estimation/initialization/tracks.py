@@ -201,8 +201,11 @@ def _noise(site: Site, dt: float, size: int, bridged: bool) -> Array:
     noise[3 + index, 3 + index] = accel**2 * dt**3 / 3.0
     noise[6 + index, 6 + index] = accel**2 * dt
     noise[3 + index, 6 + index] = noise[6 + index, 3 + index] = 0.5 * accel**2 * dt**2
+    walk = max(imu.gyro_bias_walk, LEAST_WALK)
+    noise[index, index] += walk**2 * dt**3 / 3.0
+    noise[index, 12 + index] = noise[12 + index, index] = -0.5 * walk**2 * dt**2
     noise[9 + index, 9 + index] = max(imu.accel_bias_walk, LEAST_WALK) ** 2 * dt
-    noise[12 + index, 12 + index] = max(imu.gyro_bias_walk, LEAST_WALK) ** 2 * dt
+    noise[12 + index, 12 + index] = walk**2 * dt
     return noise
 
 

@@ -72,7 +72,7 @@ def still_means(log: Log, site: Site | None, span: float = SPAN) -> StillMeans:
     offset = 0.0 if site is None else site.platform.imu.time_offset
     time = imu.time + offset
     nothing = StillMeans(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    if len(time) < 2:
+    if len(time) < 2 or not log.inertial:
         return nothing
     still_from_body = attitude_from_gyro(imu.time, imu.gyro_body)
     force = still_from_body.apply(imu.accel_body)

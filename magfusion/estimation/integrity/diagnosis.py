@@ -221,6 +221,8 @@ def _moves(known: Snapshots) -> bool:
 
 def _of_motion(known: Snapshots, samples: FieldSamples, imu: ImuSamples) -> list[Explanation]:
     site = known.site
+    if not site.platform.inertial:
+        return []
     every = surveyed(samples, known.calibration)
     motion = compared(every, imu, site)
     if motion is None:

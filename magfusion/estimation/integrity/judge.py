@@ -19,10 +19,11 @@ from magfusion.estimation.integrity.recording import BRIDGED, recorded
 from magfusion.estimation.integrity.residual_blocks import fields, fixes, inertial
 from magfusion.estimation.integrity.score import field_residual, moved_estimate, score_of
 from magfusion.estimation.integrity.signal import detected_in
-from magfusion.estimation.integrity.testimony import Case, Testimony
+from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
 from magfusion.estimation.integrity.tuned_noise import tuned_noise
 from magfusion.model.samples import Log
 from magfusion.model.trust import Trust, Verdict
+from magfusion.model.without_imu import logged
 from magfusion.units import Array
 
 EXPLAINED = 0.3  # of the residuals, left beside a cause that explains them
@@ -38,6 +39,7 @@ def judged(result: Smoothed, log: Log) -> tuple[Smoothed, Trust]:
     log : Log
         Of which the result is: its raw streams are witnesses too.
     """
+    log, _ = logged(log, result.declared.site)
     alone = result.earth_residual is None
     states = result.states if alone else None  # else the Earth field has had its say in them
     streams = log, result.declared.site, BRIDGED
@@ -63,6 +65,7 @@ def judged(result: Smoothed, log: Log) -> tuple[Smoothed, Trust]:
 def _heard(case: Case) -> Iterator[Testimony]:
     """Yield what every witness says: what is held first, since it may explain the others."""
     of_held, priors, biases = held(case), calibration_change(case), bias_change(case)
+    biases = biases if case.log.inertial else NOTHING
     after, causes = _explained(case, of_held.named)
     ends = [field_residual(case.result, after, raw=raw) for raw in (True, False)]
     residuals = [fields(case, *ends), inertial(case, after)]

@@ -233,6 +233,8 @@ class OnlineWitness:
         return Judgement(tuple(found), inflation=inflation)
 
     def _of_biases(self, state: State) -> Judgement:
+        if not self.site.platform.inertial:
+            return Judgement()
         imu, elapsed = self.site.platform.imu, state.time - self._began
         found, inflation, turn = [], 1.0, 0.0
         for code, name, bias, sigma, walk, first, unit in (
@@ -303,7 +305,7 @@ class OnlineWitness:
     def _of_gravity(self) -> Judgement:
         """Judge what is left of the mean specific force: no platform falls for seconds."""
         span = self._gravity.weight  # s that are heard, without the gaps of the IMU
-        if span < LEAST_SPAN:
+        if span < LEAST_SPAN or not self.site.platform.inertial:
             return Judgement()
         left = float(np.linalg.norm(self._gravity.mean))
         motion, imu = self.site.platform.motion, self.site.platform.imu

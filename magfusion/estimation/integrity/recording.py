@@ -83,8 +83,8 @@ def recorded(
     """
     found = [*log.noticed, *(one for witness in WITNESSES for one in witness(log, site))]
     log = beginning(log)
-    found += turned_otherwise(log, site)
-    if not any(finding.code in UNSTEADY for finding in found):
+    found += turned_otherwise(log, site) if log.inertial else []
+    if log.inertial and not any(finding.code in UNSTEADY for finding in found):
         found += wrong_compasses(log, site, poses, estimated)
         if site is not None and log.waveform is not None:
             found += iron_on_body(still_means(log, site, IRON_SPAN), site)

@@ -263,16 +263,21 @@ def inertial(case: Case, estimate: Estimate) -> Testimony:
     worst = max(speaking, key=lambda one: -one.log_p)
     rms = float(np.sqrt(worst.square))
     names = ", ".join(dict.fromkeys(one.name for one in speaking))
-    finding = Finding(
-        "inertial_residuals",
+    text = (
         f"The inertial data contradict the motion that the fields tell of"
         f" {_when([one for one in speaking if one.name == worst.name], time)}: {names} deviate by"
         f" up to {rms:.2g} times what the declared noise allows. Shocks, a false axis or scale,"
         " stamps, or declared noise that is too small: check the inertial sensor, or declare"
-        " larger gyro_noise and accel_noise.",
-        Verdict.DOUBTFUL,
-        float(sigmas(worst.log_p)),
+        " larger gyro_noise and accel_noise."
     )
+    code = "inertial_residuals"
+    if not case.log.inertial:
+        text = (
+            f"The platform moves faster than its motion prior has it"
+            f" {_when([one for one in speaking if one.name == worst.name], time)}: up to {rms:.2g}"
+            " times. Declare larger densities in platform.motion_prior."
+        )
+    finding = Finding(code, text, Verdict.DOUBTFUL, float(sigmas(worst.log_p)))
     factor = np.ones(len(result.states))
     for one in speaking:
         rows = np.append(one.rows, one.rows[-1]) | np.insert(one.rows, 0, one.rows[0])

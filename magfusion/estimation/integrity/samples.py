@@ -55,10 +55,10 @@ class Stream:
 
 def streams(log: Log) -> tuple[Stream, ...]:
     """Return the raw streams of a log."""
-    found = [
-        Stream("gyroscope", log.imu.time, log.imu.gyro_body, "rad/s"),
-        Stream("accelerometer", log.imu.time, log.imu.accel_body, "m/s^2"),
-    ]
+    found = []
+    if log.inertial:
+        found.append(Stream("gyroscope", log.imu.time, log.imu.gyro_body, "rad/s"))
+        found.append(Stream("accelerometer", log.imu.time, log.imu.accel_body, "m/s^2"))
     if log.waveform is not None:
         wave = log.waveform
         found.append(Stream("magnetometer", wave.time, wave.measured_sensor, "uT", 1e6))

@@ -97,7 +97,7 @@ def _unevenness(time: Array, step: Array, gap: IntArray) -> float:
 
 def timings(log: Log) -> tuple[Timing, ...]:
     """Return the timing of the raw streams of a log."""
-    found = [timing("imu", log.imu.time)]
+    found = [timing("imu", log.imu.time)] if log.inertial else []
     if log.waveform is not None:
         found.append(timing("magnetometer", log.waveform.time))
     return tuple(one for one in found if one is not None)

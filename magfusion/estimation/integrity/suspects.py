@@ -196,7 +196,10 @@ def held_blocks(site: Site, estimated: tuple[Block, ...], *, steady: bool) -> tu
         Whether the steady field is measured.
     """
     known = {block.key for block in estimated}
-    kinds = [p for p in (*PARAMETERS, *INERTIAL) if steady or not p.steady_only]
+    every = (*PARAMETERS, *INERTIAL)
+    if not site.platform.inertial:
+        every = tuple(p for p in PARAMETERS if p not in (TIME_OFFSET, CLOCK_RATE))
+    kinds = [p for p in every if steady or not p.steady_only]
     return placed(
         Block(kind, owner, slice(0), np.full(len(kind.sigma(site, owner)), TYPICAL[kind]))
         for kind, owner in candidates(site, kinds)

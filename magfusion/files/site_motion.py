@@ -1,0 +1,93 @@
+"""How a platform moves and what measures it, as a site's file has it."""
+
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from magfusion.files.site_values import between
+from magfusion.files.yaml_files import StrictModel
+from magfusion.model.platform_motion import NO_IMU, ImuModel, MotionModel, MotionPrior
+
+_AboveZero = Annotated[float, Field(gt=0.0)]
+_FromZero = Annotated[float, Field(ge=0.0)]
+_Positive = Annotated[_AboveZero, between(1e-12, 1e6)]
+_NotNegative = Annotated[_FromZero, between(0.0, 1e6)]
+_MOTION, _PRIOR = MotionModel(), MotionPrior()
+MILLION = 1e6  # ppm in one
+
+
+class MotionEntry(StrictModel):
+    """`magfusion.model.site.MotionModel`, field by field in its order."""
+
+    rest_gyro_rad_s: _Positive = _MOTION.rest_gyro
+    rest_accel_m_s2: _Positive = _MOTION.rest_accel
+    rest_span_s: Annotated[float, Field(ge=0.2, le=60.0)] = _MOTION.rest_span
+    rest_speed_sigma_m_s: _Positive = _MOTION.rest_speed_sigma
+    rest_known_speed_m_s: _Positive = _MOTION.rest_known_speed
+    speed_sigma_m_s: _Positive = _MOTION.speed_sigma
+    accel_sigma_m_s2: _Positive = _MOTION.accel_sigma
+    accel_span_s: _Positive = _MOTION.accel_span
+    start_speed_sigma_m_s: _Positive = _MOTION.start_speed_sigma
+
+
+_MILLISECONDS = 0.01  # s; what an undeclared time offset may be
+
+
+class ImuEntry(StrictModel):
+    """Inertial noise and the IMU's clock."""
+
+    gyro_noise: _Positive
+    accel_noise: _Positive
+    gyro_bias_walk: _NotNegative
+    accel_bias_walk: _NotNegative
+    gyro_bias_sigma: Annotated[_FromZero, between(0.0, 100.0)]
+    accel_bias_sigma: Annotated[_FromZero, between(0.0, 1e3)]
+    time_offset_s: Annotated[float, between(-1e10, 1e10)] = 0.0
+    time_offset_sigma_s: Annotated[_FromZero, between(0.0, 1e3)] = _MILLISECONDS
+    clock_rate_ppm: Annotated[float, between(-1e4, 1e4)] = 0.0
+    clock_rate_sigma_ppm: Annotated[_FromZero, between(0.0, 1e4)] = 50.0  # of quartz
+
+
+class MotionPriorEntry(StrictModel):
+    """`magfusion.model.platform_motion.MotionPrior`, field by field in its order."""
+
+    accel_density_m_s2_rthz: Annotated[_AboveZero, between(1e-6, 1e4)]
+    angular_accel_density_rad_s2_rthz: Annotated[_AboveZero, between(1e-6, 1e5)]
+    rate_sigma_rad_s: Annotated[_AboveZero, between(1e-6, 1e3)] = _PRIOR.rate_sigma
+
+    def prior(self) -> MotionPrior:
+        """Return what it says."""
+        return MotionPrior(
+            self.accel_density_m_s2_rthz,
+            self.angular_accel_density_rad_s2_rthz,
+            self.rate_sigma_rad_s,
+        )
+
+
+def imu_entry(imu: ImuModel) -> dict[str, Any]:
+    """Return the entry of an IMU under its key; nothing where there is none."""
+    if imu == NO_IMU:
+        return {}
+    usual = {
+        "clock_rate_ppm": ImuModel.clock_rate,
+        "clock_rate_sigma_ppm": ImuModel.clock_rate_sigma,
+    }
+    keys = zip(ImuEntry.model_fields, vars(imu).values(), strict=True)
+    entry = {k: _ppm(v) if k.endswith("_ppm") else float(v) for k, v in keys if usual.get(k) != v}
+    return {"imu": entry}
+
+
+def prior_entry(prior: MotionPrior | None) -> dict[str, Any]:
+    """Return the entry of a motion prior under its key; nothing where there is none."""
+    if prior is None:
+        return {}
+    keys = zip(MotionPriorEntry.model_fields, vars(prior).values(), strict=True)
+    return {"motion_prior": {key: float(value) for key, value in keys}}
+
+
+def _ppm(value: float) -> float:
+    """Return the number that is read back as the same, where there is one."""
+    near = value * MILLION
+    around = (near, np.nextafter(near, np.inf), np.nextafter(near, -np.inf))
+    return float(next((one for one in around if one / MILLION == value), near))
