@@ -135,7 +135,6 @@ BAD_SITES: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
         r"beacons\[0\].frequency_hz.*-20",
     ),
     "an unknown key": (lambda s: s["world"].update(gravity=9.81), "world.gravity.*not a known key"),
-    "no beacon": (lambda s: s.update(beacons=[]), "beacons.*at least one beacon"),
     "a shared frequency": (
         lambda s: s["beacons"][1].update(frequency_hz=20.0),
         "beacons A and B both transmit at 20 Hz",
@@ -157,6 +156,15 @@ def test_a_bad_site_is_refused_by_file_key_and_remedy(
     sentence = refuse(job, log, "-o", tmp_path / "run")
     assert str(log) in sentence
     assert re.search(pattern, sentence)
+
+
+@pytest.mark.parametrize("job", ["fix", "demodulate", "survey"])
+def test_no_beacon_is_no_site_for_what_hears_beacons(
+    job: str, log: Path, tmp_path: Path, refuse: Refuse
+) -> None:
+    _change_site(log / "site.yaml", lambda s: s.update(beacons=[]))
+    sentence = refuse(job, log, "-o", tmp_path / "run")
+    assert re.search("beacons.*at least one beacon", sentence)
 
 
 HOSTILE_YAML = {

@@ -65,7 +65,7 @@ def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
     from magfusion.results.report import write_report
 
     claimed = claim(job.output, JOB)
-    log, site = read_job(job)
+    log, site = read_job(job, without=True)
     require_imu(job, log, "gravity and gyro tell how the magnetometer turned")
     if log.waveform is None:
         raise InputError(

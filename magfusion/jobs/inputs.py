@@ -207,13 +207,15 @@ def topics_option(text: str | None) -> Topics | None:
     return Topics(**{role: name for role, _, name in roles})
 
 
-def read_site(job: Job, *, unknown: bool = False) -> Site:
+def read_site(job: Job, *, unknown: bool = False, without: bool = False) -> Site:
     """Read the site of a job.
 
     Parameters
     ----------
     unknown : bool
         Whether the job can do with beacons that were never surveyed.
+    without : bool
+        Whether it can do without any.
 
     Raises
     ------
@@ -225,23 +227,27 @@ def read_site(job: Job, *, unknown: bool = False) -> Site:
         raise InputError(
             f"{job.log_path}: holds no site.yaml; name the site's file with --site SITE.yaml"
         )
-    return job.where.bounded(load_site(job.declared_path, unknown=unknown))
+    return job.where.bounded(load_site(job.declared_path, unknown=unknown, without=without))
 
 
-def read_job(job: Job, *, unknown: bool = False, report: Report = quiet) -> tuple[Log, Site]:
+def read_job(
+    job: Job, *, unknown: bool = False, without: bool = False, report: Report = quiet
+) -> tuple[Log, Site]:
     """Read the log and the site of a job, and see that they belong together.
 
     Parameters
     ----------
     unknown : bool
         Whether the job can do with beacons that were never surveyed.
+    without : bool
+        Whether it can do without any.
 
     Raises
     ------
     InputError
         For anything in either file that a user must correct.
     """
-    site = read_site(job, unknown=unknown)
+    site = read_site(job, unknown=unknown, without=without)
     log = _open(job, report)
     log, site = logged(log, site)
     if log.inertial and site.platform.imu == NO_IMU:
@@ -250,8 +256,9 @@ def read_job(job: Job, *, unknown: bool = False, report: Report = quiet) -> tupl
             " samples; describe the sensor, or remove its samples to do without"
         )
     if log.waveform is not None:
-        with named(job.declared_path):
-            Receiver.of(site).check()
+        if site.beacons:
+            with named(job.declared_path):
+                Receiver.of(site).check()
         log = mended(log, site)
     if log.fields is not None:
         with named(job.log_path):

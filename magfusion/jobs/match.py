@@ -75,7 +75,7 @@ def run_match(settings: MatchSettings, output: Path) -> Figures:
 
     _check(settings)
     job, claimed = settings.job(output), claim(output, "match")
-    log, site = read_job(job)
+    log, site = read_job(job, without=True)
     if settings.gravity:
         require_imu(job, log, "gravity is by the accelerometer")
     with named(job.log_path):

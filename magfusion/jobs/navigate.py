@@ -123,13 +123,33 @@ def run(
     if str(settings.log) == "-":
         _run_pipe(settings, given)
         return None
+    from magfusion.jobs.orientation import run_orientation, without_beacons
+
+    job = settings.job(output)
+    if without_beacons(job):
+        _refuse_without_beacons(given)
+        return run_orientation("navigate", job, settings.rates, back=False, report=report)
     if given & {"form", "keep_going"}:
         raise InputError("--keep-going and --format belong to a stream; give - in place of a log")
     return run_navigate(settings, output, report)
 
 
+OF_BEACONS = {"checkpoint", "resume", "mavlink", "foxglove", "ros2", "live", "realtime", "blend"}
+
+
+def _refuse_without_beacons(given: set[str]) -> None:
+    refused = sorted(given & OF_BEACONS)
+    if refused:
+        raise InputError(
+            f"--{refused[0].replace('_', '-')} is not for a site without beacons, where only the"
+            " orientation is found; leave it out"
+        )
+
+
 def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
+    from magfusion.files.site import load_site
     from magfusion.files.standard_streams import binary_input, binary_output, until_closed
+    from magfusion.jobs.orientation import run_orientation_stream
     from magfusion.jobs.stream import StreamSettings, run_stream
 
     if settings.site is None:
@@ -139,6 +159,13 @@ def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
             "--output, --start, --end, --topics, --realtime and --json belong to a log; leave them"
             " out with -"
         )
+    site = load_site(settings.site, without=True)
+    if not site.beacons:
+        _refuse_without_beacons(given)
+        with until_closed():
+            streams = (binary_input(), binary_output(), sys.stderr)
+            run_orientation_stream(site, settings.form, settings.keep_going, *streams)
+        return
     chosen = StreamSettings(
         settings.navigator(settings.job(Path())),
         settings.form,

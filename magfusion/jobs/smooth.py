@@ -77,7 +77,11 @@ class SmoothSettings(
 
 def run(settings: SmoothSettings, output: Path, report: Report = quiet) -> Figures:
     """Smooth a log as the settings ask, or several together; see `run_smooth`, `run_joint`."""
+    from magfusion.jobs.orientation import run_orientation, without_beacons
+
     job = settings.job(output)
+    if not settings.more and without_beacons(job):
+        return run_orientation("smooth", job, settings.rates, back=True, report=report)
     smoother = settings.smoother(job)
     if settings.more:
         from magfusion.jobs.joint_result import run_joint

@@ -166,7 +166,8 @@ def _beacon_place(name: str) -> str:
 def log_beacons(recording: rr.RecordingStream, site: Site, scale: Scale) -> None:
     """Draw the beacons: axes, moments, coils, and the shell of their coverage."""
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    longest = max(np.linalg.norm(b.moments_beacon, axis=1).max() for b in site.beacons)
+    sizes = [float(np.linalg.norm(b.moments_beacon, axis=1).max()) for b in site.beacons]
+    longest = max(sizes, default=1.0)
     for index, beacon in enumerate(site.beacons):
         colour = beacon_colour(index)
         place = _beacon_place(beacon.name)

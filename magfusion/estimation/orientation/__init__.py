@@ -1,0 +1,1 @@
+"""Orientation without beacons: from gyroscope, gravity and the Earth's field."""

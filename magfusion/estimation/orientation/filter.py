@@ -1,0 +1,330 @@
+"""A filter of orientation: gravity, the Earth's field, rest, and a field that something disturbs.
+
+Gravity is what the specific force is on average: the velocity of what moves is held near zero, by
+the speed that it shows.  The field's deviation from the declared one is in the state, once in world
+axes, where it changes as the platform moves, and once with the platform.  Where neither explains
+what is measured something has changed: a magnet was attached, or iron is near.  Then both are free
+again, and the gyroscope holds the heading until the motion tells which of them it was.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.orientation.layout import (
+    ACCEL_BIAS,
+    FAR,
+    GYRO_BIAS,
+    GYRO_MATRIX,
+    LAG,
+    MATRIX,
+    MICROTESLA,
+    NEAR,
+    OFFSET,
+    SIZE,
+    SPEED,
+    TURN,
+    Orientation,
+)
+from magfusion.estimation.orientation.stretch import Stretch, Turned, body_from_end, turned
+from magfusion.model.field import observe_earth, skew
+from magfusion.model.platform_motion import NO_IMU
+from magfusion.model.site import Site
+from magfusion.model.strapdown import triad
+from magfusion.units import Array
+
+GYRO_SCALE = 0.003  # usual error of a gyroscope's scale and axes
+AMBIENT = 0.02  # of the field's size: usual disturbance of each component, indoors
+SETTLED, MOVED = 10.0, 2.0  # s; over which it changes, at rest and in motion
+MEMORY = 5.0  # s; over which its size is learnt, and that of the speed
+NOISE_MEMORY, NOISE_FACTOR = 10.0, 20.0  # s; samples of the field are not independent
+SYNCHRONY = 0.003  # s; to which samples of field and rate belong together
+SPEED_TIME = 0.5  # s; so long a speed counts once
+LEAKAGE = 1.0  # s; over which a speed is thought to vanish, to learn its size
+LEAST_SPEED = 0.3  # m/s
+REST_RATE = np.deg2rad(0.03)  # rad/s, of one second
+GATE = 25.0  # chi square of three components
+LEAST_CHANGE, FREED = 3.0, 4.0  # uT; factor of the variance of what has changed
+TILT, HEADING = 0.05, 0.3  # rad; of the first attitude
+FAR_STRENGTH = 0.04  # of the field's size: what the declared one may be off by anywhere
+OFFSET_WALK = 0.01  # uT per square root of second
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """One stretch, as it was worked in: what a smoother needs of it.
+
+    Parameters
+    ----------
+    predicted, state : Orientation
+        Before and after the measurements of its end.
+    transition : ndarray, shape (40, 40)
+    attitude : ndarray, shape (n + 1, 3, 3)
+        ``begin_from_then`` at its samples.
+    disturbance : float
+        Usual deviation of the field then (uT).
+    changed : bool
+        Whether the field was explained by nothing known, and was freed.
+    """
+
+    stretch: Stretch
+    predicted: Orientation
+    state: Orientation
+    transition: Array
+    attitude: Array
+    disturbance: float
+    changed: bool
+
+
+class OrientationFilter:
+    """A running estimate of orientation.
+
+    Parameters
+    ----------
+    site : Site
+        Its beacons are left aside.
+
+    Raises
+    ------
+    InputError
+        Where it has no Earth field, or no gravity.
+    """
+
+    def __init__(self, site: Site) -> None:
+        if site.earth_field_world is None or not site.gravity > 0.0:
+            raise InputError(
+                "a site without beacons needs the Earth's field and gravity; give earth_field_t or"
+                " a location in its world"
+            )
+        self.site = site
+        self.earth = site.earth_field_world / MICROTESLA
+        if site.platform.imu == NO_IMU:
+            raise InputError(
+                "platform.imu: is missing; without beacons and without an inertial sensor nothing"
+                " tells an orientation"
+            )
+        sensor = site.platform.magnetometer
+        self.sensor = sensor
+        self.measured_from_body = sensor.matrix @ sensor.body_from_sensor.T
+        self.state: Orientation | None = None
+        self._least = (AMBIENT * float(np.linalg.norm(self.earth))) ** 2
+        self._deviation = self._least
+        self._noise: float | None = None
+        self._speed, self._leaky = LEAST_SPEED**2, np.zeros(3)
+        self._before: Array | None = None
+        self._begun: float | None = None
+
+    @property
+    def disturbance(self) -> float:
+        """Usual deviation of the field of late (uT)."""
+        return float(np.sqrt(self._deviation))
+
+    def take(self, stretch: Stretch) -> Update:
+        """Work in a stretch."""
+        if self.state is None or np.isnan(stretch.begin):
+            self.state = self._started(stretch)
+            self._before = None
+        before = self.state
+        turn = turned(stretch, before)
+        predicted, transition = self._predicted(before, stretch, turn)
+        rows = [self._of_speed(predicted, stretch)]
+        if stretch.rests and self._may_rest(predicted, turn):
+            rows.append(self._of_rest(predicted, stretch))
+        changed = False
+        if len(stretch.field_time):
+            row, changed, predicted = self._of_field(predicted, stretch, turn)
+            rows.append(row)
+        self.state = _updated(predicted, rows, self.measured_from_body)
+        return Update(
+            stretch, predicted, self.state, transition, turn.attitude, self.disturbance, changed
+        )
+
+    def _started(self, stretch: Stretch) -> Orientation:
+        """Return the attitude by gravity and field; what is known of the instruments is kept."""
+        imu, sensor, size = self.site.platform.imu, self.sensor, float(np.linalg.norm(self.earth))
+        time = float(stretch.time[0])
+        old = self.state
+        if old is None:
+            across = float(np.hypot(self.earth[0], self.earth[1]))
+            east = np.array([self.earth[1], -self.earth[0], 0.0]) / max(across, 1e-9)
+            far = (FAR_STRENGTH * size) ** 2 * (np.eye(3) - np.outer(east, east))
+            declination = self.site.earth.declination_sigma * across
+            cov = np.zeros((SIZE, SIZE))
+            cov[GYRO_BIAS, GYRO_BIAS] = imu.gyro_bias_sigma**2 * np.eye(3)
+            cov[ACCEL_BIAS, ACCEL_BIAS] = imu.accel_bias_sigma**2 * np.eye(3)
+            cov[GYRO_MATRIX, GYRO_MATRIX] = GYRO_SCALE**2 * np.eye(9)
+            cov[OFFSET, OFFSET] = np.diag((sensor.sigma.offset / MICROTESLA) ** 2)
+            cov[NEAR, NEAR] = self._least * np.eye(3)
+            cov[MATRIX, MATRIX] = np.diag(sensor.sigma.matrix.ravel() ** 2)
+            cov[LAG, LAG] = imu.time_offset_sigma**2
+            cov[FAR, FAR] = far + declination**2 * np.outer(east, east)
+            zero = np.zeros(3)
+            old = Orientation(
+                time=time,
+                world_from_body=np.eye(3),
+                velocity_world=zero,
+                gyro_bias=zero,
+                accel_bias=zero,
+                gyro_matrix=np.zeros((3, 3)),
+                offset=sensor.offset / MICROTESLA,
+                near=zero,
+                matrix=sensor.matrix,
+                lag=0.0,
+                far=zero,
+                cov=cov,
+            )
+        up = np.mean(stretch.accel_body, axis=0) - old.accel_bias
+        heading = HEADING
+        if len(stretch.field):
+            measured = np.mean(stretch.field, axis=0) - old.offset
+            field = sensor.body_from_sensor @ np.linalg.solve(old.matrix, measured)
+        else:
+            field, heading = np.array([1.0, 0.0, 0.0]), np.pi
+        attitude = triad(self.earth + old.far, up, field)
+        cov = old.cov.copy()
+        for part, sigma in ((TURN, np.array([TILT, TILT, heading])), (SPEED, np.ones(3))):
+            cov[part, :] = cov[:, part] = 0.0
+            cov[part, part] = np.diag(sigma**2)
+        return replace(
+            old, time=time, world_from_body=attitude, velocity_world=np.zeros(3), cov=cov
+        )
+
+    def _predicted(
+        self, state: Orientation, stretch: Stretch, turn: Turned
+    ) -> tuple[Orientation, Array]:
+        imu, length = self.site.platform.imu, float(np.sum(stretch.steps))
+        begin, whole = state.world_from_body, turn.attitude[-1]
+        gained = begin @ turn.push - np.array([0.0, 0.0, self.site.gravity]) * length
+        kept = float(np.exp(-length / (SETTLED if stretch.rests else MOVED)))
+        transition = np.eye(SIZE)
+        transition[TURN, GYRO_BIAS] = begin @ turn.by_bias
+        transition[TURN, GYRO_MATRIX] = begin @ turn.by_matrix
+        by_turn = -skew(begin @ turn.push)
+        transition[SPEED, TURN] = by_turn
+        for part in (GYRO_BIAS, GYRO_MATRIX):  # on average half of the turn tilts the force
+            transition[SPEED, part] = 0.5 * by_turn @ transition[TURN, part]
+        transition[SPEED, ACCEL_BIAS] = -begin @ turn.by_force
+        transition[OFFSET, OFFSET] = begin @ whole @ begin.T
+        transition[NEAR, NEAR] = kept * np.eye(3)
+        noise = np.zeros(SIZE)
+        noise[TURN], noise[SPEED] = imu.gyro_noise**2 * length, imu.accel_noise**2 * length
+        noise[GYRO_BIAS] = imu.gyro_bias_walk**2 * length
+        noise[ACCEL_BIAS] = imu.accel_bias_walk**2 * length
+        noise[OFFSET] = OFFSET_WALK**2 * length
+        noise[NEAR] = (1.0 - kept**2) * max(self._deviation, self._least)
+        if np.isnan(stretch.begin):
+            transition[TURN, :] = transition[SPEED, :] = 0.0
+            noise[TURN], noise[SPEED] = np.diag(state.cov)[TURN], np.diag(state.cov)[SPEED]
+            transition[:, TURN] = transition[:, SPEED] = 0.0
+        self._leaky = np.exp(-length / LEAKAGE) * self._leaky + gained
+        share = min(1.0, length / MEMORY)
+        self._speed += share * (float(self._leaky @ self._leaky) / 3.0 - self._speed)
+        predicted = replace(
+            state,
+            time=float(stretch.time[-1]),
+            world_from_body=begin @ whole,
+            velocity_world=state.velocity_world + gained,
+            near=kept * state.near,
+            cov=transition @ state.cov @ transition.T + np.diag(noise),
+        )
+        return predicted, transition
+
+    def _of_speed(self, state: Orientation, stretch: Stretch) -> tuple[Array, Array, Array]:
+        by_state = np.zeros((3, SIZE))
+        by_state[:, SPEED] = np.eye(3)
+        if stretch.rests:
+            variance = self.site.platform.motion.rest_speed_sigma**2
+        else:
+            length = max(float(np.sum(stretch.steps)), 1e-3)
+            variance = max(self._speed, LEAST_SPEED**2) * max(1.0, SPEED_TIME / length)
+        return by_state, -state.velocity_world, np.full(3, variance)
+
+    def _may_rest(self, state: Orientation, turn: Turned) -> bool:
+        """Tell a bias from a slow and even turn: no larger one is likely."""
+        sigma = np.sqrt(np.diag(state.cov)[GYRO_BIAS]) + self.site.platform.imu.gyro_bias_walk
+        return bool(np.all(np.abs(np.mean(turn.rate, axis=0)) < 4.0 * sigma + 3.0 * REST_RATE))
+
+    def _of_rest(self, state: Orientation, stretch: Stretch) -> tuple[Array, Array, Array]:
+        rate = np.mean(stretch.gyro_body, axis=0)
+        by_state = np.zeros((3, SIZE))
+        by_state[:, GYRO_BIAS] = -np.eye(3)
+        by_state[:, GYRO_MATRIX] = np.kron(np.eye(3), rate)
+        still = rate @ (np.eye(3) + state.gyro_matrix).T - state.gyro_bias
+        length = max(float(np.sum(stretch.steps)), 1e-3)
+        return by_state, -still, np.full(3, REST_RATE**2 / length)
+
+    def _of_field(
+        self, state: Orientation, stretch: Stretch, turn: Turned
+    ) -> tuple[tuple[Array, Array, Array], bool, Orientation]:
+        mean, by_lag = body_from_end(stretch, turn, state.lag)
+        world_from_seen = state.world_from_body @ mean.T
+        declared = self.earth + state.far
+        world = declared + state.near
+        sensor = replace(self.sensor, matrix=state.matrix, offset=state.offset)
+        seen = observe_earth(sensor, world_from_seen, world)
+        by_state = np.zeros((3, SIZE))
+        by_state[:, TURN] = seen.earth_world @ skew(world)
+        by_state[:, OFFSET] = self.measured_from_body @ state.world_from_body.T
+        by_state[:, NEAR] = by_state[:, FAR] = seen.earth_world
+        by_state[:, MATRIX] = seen.matrix
+        measured_from_seen = state.matrix @ self.sensor.body_from_sensor.T
+        in_body = state.world_from_body.T @ world
+        by_state[:, LAG] = (measured_from_seen @ by_lag @ in_body)[:, None]
+        error = np.mean(stretch.field, axis=0) - seen.measured_sensor
+        variance = self._field_variance(stretch, turn)
+        innovation = by_state @ state.cov @ by_state.T + variance * np.eye(3)
+        apart = float(error @ np.linalg.solve(innovation, error))
+        off_world = world_from_seen @ np.linalg.solve(
+            measured_from_seen, error + seen.earth_world @ state.near
+        )
+        self._learn_deviation(off_world, variance, stretch)
+        if apart <= GATE:
+            return (by_state, error, np.full(3, variance)), False, state
+        change = max(float(error @ error), LEAST_CHANGE**2)
+        self._deviation = max(self._deviation, change)
+        cov = state.cov.copy()
+        cov[OFFSET, OFFSET] += FREED * change * np.eye(3)
+        cov[NEAR, NEAR] += FREED * change * np.eye(3)
+        return (by_state, error, np.full(3, variance)), True, replace(state, cov=cov)
+
+    def _field_variance(self, stretch: Stretch, turn: Turned) -> float:
+        """Return the variance of a component of the mean field, as it scatters (uT^2)."""
+        length = max(float(np.sum(stretch.steps)), 1e-3)
+        now = turn.attitude[-1] @ (self.sensor.body_from_sensor @ np.mean(stretch.field, axis=0))
+        if self._noise is None and len(stretch.field) > 3:  # of samples: more than of their mean
+            self._noise = float(np.mean(np.var(stretch.field, axis=0)))
+        if self._before is not None:
+            found = float(np.sum((now - self._before) ** 2)) / 6.0
+            share = min(1.0, length / NOISE_MEMORY)
+            old = found if self._noise is None else self._noise
+            self._noise = old + share * (min(found, 9.0 * max(old, 1e-8)) - old)
+        self._before = self.sensor.body_from_sensor @ np.mean(stretch.field, axis=0)
+        declared = (self.sensor.noise_density / MICROTESLA) ** 2 / (2.0 * length)
+        rate = float(np.linalg.norm(np.mean(turn.rate, axis=0)))
+        skewed = SYNCHRONY * rate * float(np.linalg.norm(self.earth))
+        return NOISE_FACTOR * max(declared, self._noise or 0.0) + skewed**2
+
+    def _learn_deviation(self, off_world: Array, variance: float, stretch: Stretch) -> None:
+        """Learn how much the field is disturbed from what no heading changes: size and dip."""
+        if self._begun is None:
+            self._begun = stretch.time[0]
+        if stretch.rests and stretch.time[-1] - self._begun > 1.0:
+            return
+        field = self.earth
+        north = field[:2] / max(float(np.hypot(field[0], field[1])), 1e-9)
+        found = (float(off_world[:2] @ north) ** 2 + float(off_world[2]) ** 2) / 2.0
+        share = min(1.0, float(np.sum(stretch.steps)) / MEMORY)
+        found = max(0.0, found - variance)
+        self._deviation += share * (found - self._deviation)
+
+
+def _updated(
+    state: Orientation, rows: list[tuple[Array, Array, Array]], measured_from_body: Array
+) -> Orientation:
+    by_state, error, variance = (np.concatenate(part) for part in zip(*rows, strict=True))
+    cross = by_state @ state.cov
+    gain = np.linalg.solve(cross @ by_state.T + np.diag(variance), cross).T
+    kept = np.eye(SIZE) - gain @ by_state
+    cov = kept @ state.cov @ kept.T + (gain * variance) @ gain.T
+    return replace(state.moved(gain @ error, measured_from_body), cov=0.5 * (cov + cov.T))

@@ -1,0 +1,99 @@
+"""What an orientation without beacons is estimated with, and the tangent of its covariance.
+
+Errors of attitude and offset are in world axes, that of the offset turned with the attitude (the
+two-frame group of Barrau and Bonnabel): what the data leave open, the heading at rest with an
+unknown offset, then lies in one direction whatever the estimate is, and nothing seems to be learnt
+of it where nothing is.  Fields are in microtesla, so that the covariance stays well conditioned.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.units import Array
+
+MICROTESLA = 1e-6  # T
+
+TURN, SPEED = slice(0, 3), slice(3, 6)
+GYRO_BIAS, ACCEL_BIAS, GYRO_MATRIX = slice(6, 9), slice(9, 12), slice(12, 21)
+OFFSET, NEAR, MATRIX = slice(21, 24), slice(24, 27), slice(27, 36)
+LAG, FAR = slice(36, 37), slice(37, 40)
+SIZE = 40
+
+
+@dataclass(frozen=True, eq=False)
+class Orientation:
+    """Attitude and what was found with it, at one time.
+
+    Parameters
+    ----------
+    time : float
+        (s)
+    world_from_body : ndarray, shape (3, 3)
+    velocity_world : ndarray, shape (3,)
+        Held near zero by what is usual of the motion, no more (m/s).
+    gyro_bias, accel_bias : ndarray, shape (3,)
+        Body axes (rad/s, m/s^2).
+    gyro_matrix : ndarray, shape (3, 3)
+        True rate = (1 + matrix) measured rate - bias.
+    offset : ndarray, shape (3,)
+        Of the magnetometer, measured axes (uT).
+    matrix : ndarray, shape (3, 3)
+        Of the magnetometer.
+    near, far : ndarray, shape (3,)
+        What the field deviates from the declared one by, world axes (uT): here and now, and
+        everywhere.
+    lag : float
+        So much later than the inertial samples are those of the field (s).
+    cov : ndarray, shape (40, 40)
+    """
+
+    time: float
+    world_from_body: Array
+    velocity_world: Array
+    gyro_bias: Array
+    accel_bias: Array
+    gyro_matrix: Array
+    offset: Array
+    near: Array
+    matrix: Array
+    lag: float
+    far: Array
+    cov: Array
+
+    def moved(self, step: Array, measured_from_body: Array) -> "Orientation":
+        """Return it moved by a tangent vector; the covariance stays."""
+        attitude = Rotation.from_rotvec(step[TURN]).as_matrix() @ self.world_from_body
+        return replace(
+            self,
+            world_from_body=attitude,
+            velocity_world=self.velocity_world + step[SPEED],
+            gyro_bias=self.gyro_bias + step[GYRO_BIAS],
+            accel_bias=self.accel_bias + step[ACCEL_BIAS],
+            gyro_matrix=self.gyro_matrix + step[GYRO_MATRIX].reshape(3, 3),
+            offset=self.offset + measured_from_body @ attitude.T @ step[OFFSET],
+            near=self.near + step[NEAR],
+            matrix=self.matrix + step[MATRIX].reshape(3, 3),
+            lag=self.lag + float(step[LAG][0]),
+            far=self.far + step[FAR],
+        )
+
+    def step_to(self, other: "Orientation", measured_from_body: Array) -> Array:
+        """Return the tangent vector that leads to another: the inverse of `moved`."""
+        turn = other.world_from_body @ self.world_from_body.T
+        offset = np.linalg.solve(measured_from_body, other.offset - self.offset)
+        return np.concatenate(
+            [
+                Rotation.from_matrix(turn).as_rotvec(),
+                other.velocity_world - self.velocity_world,
+                other.gyro_bias - self.gyro_bias,
+                other.accel_bias - self.accel_bias,
+                (other.gyro_matrix - self.gyro_matrix).ravel(),
+                other.world_from_body @ offset,
+                other.near - self.near,
+                (other.matrix - self.matrix).ravel(),
+                [other.lag - self.lag],
+                other.far - self.far,
+            ]
+        )

@@ -1,0 +1,162 @@
+"""Orientation by all that was measured, before and after: the filter, and back again."""
+
+import copy
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.estimation.orientation.filter import OrientationFilter, Update
+from magfusion.estimation.orientation.layout import SIZE, Orientation
+from magfusion.estimation.orientation.stretch import Stretch, stretches
+from magfusion.model.progress import Report, quiet
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.strapdown import resting
+from magfusion.units import Array
+
+PIECE = 1500  # stretches whose matrices are in memory at once
+
+
+@dataclass(frozen=True, eq=False)
+class Oriented:
+    """Orientation of a log.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Of the inertial samples (s).
+    world_from_body : ndarray, shape (n, 3, 3)
+        At each.
+    states : tuple of Orientation
+        At the ends of the stretches.
+    disturbance : ndarray, shape (stretches,)
+        Usual deviation of the field then (uT).
+    changed : ndarray, shape (m,)
+        When the field changed so that nothing known explained it (s).
+    """
+
+    time: Array
+    world_from_body: Array
+    states: tuple[Orientation, ...]
+    disturbance: Array
+    changed: Array
+
+    @property
+    def ends(self) -> Array:
+        """Times of the states (s)."""
+        return np.array([state.time for state in self.states])
+
+
+def pieces(log: Log, site: Site) -> list[Stretch]:
+    """Return the stretches of a log, on its clock.
+
+    Raises
+    ------
+    InputError
+        Where it has no samples of the magnetometer, or hardly any of the IMU.
+    """
+    imu, wave = log.imu, log.waveform
+    if wave is None or len(wave) == 0:
+        raise InputError(
+            "holds only phasors, which know nothing of the Earth field; give the log with"
+            " magnetometer.parquet"
+        )
+    if len(imu) < 3:
+        raise InputError(f"holds {len(imu)} inertial samples; orientation needs the gyroscope")
+    time = imu.time + site.platform.imu.time_offset
+    rests = resting(time, imu.gyro_body, imu.accel_body, motion=site.platform.motion)
+    streams = (time, imu.gyro_body, imu.accel_body, rests, wave.time, wave.measured_sensor)
+    return list(stretches(*streams, float("nan")))
+
+
+def oriented(log: Log, site: Site, *, back: bool = True, report: Report = quiet) -> Oriented:
+    """Find the orientation of a log at every inertial sample.
+
+    Parameters
+    ----------
+    back : bool
+        Whether later samples count too; otherwise it is as it was known online.
+
+    Raises
+    ------
+    InputError
+    """
+    cut = pieces(log, site)
+    estimator, snapshots, last = OrientationFilter(site), [], None
+    samples = np.cumsum([0, *(len(s.time) for s in cut)])
+    attitude = np.empty((samples[-1], 3, 3))
+    disturbance, changed, states = np.empty(len(cut)), [], []
+    for k, stretch in enumerate(cut):
+        if k % PIECE == 0:
+            snapshots.append(copy.deepcopy(estimator))
+            report("orientation", k, len(cut) * (2 if back else 1))
+        last = estimator.take(stretch)
+        disturbance[k] = last.disturbance
+        if last.changed:
+            changed.append(last.state.time)
+        if not back:
+            own = slice(samples[k], samples[k + 1])
+            begin = last.predicted.world_from_body @ last.attitude[-1].T
+            attitude[own] = begin @ last.attitude[1:]
+            attitude[samples[k + 1] - 1] = last.state.world_from_body
+            states.append(last.state)
+    if back:
+        assert last is not None
+        found = _smoothed(cut, snapshots, estimator.measured_from_body)
+        states = [None] * len(cut)  # type: ignore[list-item]
+        for k, state, turned in found:
+            states[k] = state
+            own = slice(samples[k], samples[k + 1])
+            attitude[own] = turned
+    time = np.concatenate([s.time for s in cut])
+    return Oriented(time, attitude, tuple(states), disturbance, np.array(changed))
+
+
+def _smoothed(
+    cut: list[Stretch], snapshots: list[OrientationFilter], measured_from_body: Array
+) -> Iterator[tuple[int, Orientation, Array]]:
+    """Yield the stretches from the last to the first: state at the end, attitudes at samples."""
+    after: Orientation | None = None
+    later: Update | None = None
+    for piece in reversed(range(len(snapshots))):
+        estimator, first = snapshots[piece], piece * PIECE
+        updates = [estimator.take(stretch) for stretch in cut[first : first + PIECE]]
+        for k in reversed(range(len(updates))):
+            own = updates[k]
+            if after is None or later is None:
+                state = own.state
+            else:
+                state = _one_back(own.state, later, after, measured_from_body)
+            if later is not None and after is not None:
+                yield first + k + 1, after, _between(state, later, after)
+            after, later = state, own
+    if after is not None and later is not None:
+        yield 0, after, _between(None, later, after)
+
+
+def _one_back(
+    state: Orientation, later: Update, after: Orientation, measured_from_body: Array
+) -> Orientation:
+    """Return a state with what was measured after it (Rauch, Tung and Striebel)."""
+    cross = later.transition @ state.cov
+    gain = np.linalg.solve(later.predicted.cov, cross).T
+    step = gain @ later.predicted.step_to(after, measured_from_body)
+    cov = state.cov + gain @ (after.cov - later.predicted.cov) @ gain.T
+    floor = 1e-3 * np.diag(state.cov)
+    cov[np.arange(SIZE), np.arange(SIZE)] = np.maximum(np.diag(cov), floor)
+    return replace(state.moved(step, measured_from_body), cov=0.5 * (cov + cov.T))
+
+
+def _between(before: Orientation | None, update: Update, after: Orientation) -> Array:
+    """Return the attitudes at a stretch's samples, its turn fitted to its ends."""
+    count = len(update.stretch.time)
+    if before is None or np.isnan(update.stretch.begin):
+        begin = after.world_from_body @ update.attitude[-1].T
+        return np.asarray(begin @ update.attitude[1:])
+    carried = before.world_from_body @ update.attitude
+    missed = Rotation.from_matrix(carried[-1].T @ after.world_from_body).as_rotvec()
+    share = np.arange(1, count + 1)[:, None] / count
+    return np.asarray(carried[1:] @ Rotation.from_rotvec(share * missed).as_matrix())

@@ -1,0 +1,164 @@
+"""A tenth of a second of inertial samples, with the field samples that fell into it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.orientation.layout import MICROTESLA, Orientation
+from magfusion.model.field import skew
+from magfusion.units import Array, BoolArray
+
+STEP = 0.1  # s; of a stretch
+GAP = 0.5  # s; across a longer pause of the inertial samples nothing is carried
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Samples after one time, up to another.
+
+    A sample is taken for the mean over the step that ends at its stamp: an instrument that averages
+    gives it so, and one that filters is later still.
+
+    Parameters
+    ----------
+    begin : float
+        (s); NaN after a gap, and at first: nothing is carried into it.
+    time : ndarray, shape (n,)
+        Of the inertial samples (s).
+    gyro_body, accel_body : ndarray, shape (n, 3)
+        (rad/s, m/s^2)
+    field_time : ndarray, shape (m,)
+        (s)
+    field : ndarray, shape (m, 3)
+        Measured axes (uT).
+    rests : bool
+        Whether the platform stands still.
+    """
+
+    begin: float
+    time: Array
+    gyro_body: Array
+    accel_body: Array
+    field_time: Array
+    field: Array
+    rests: bool
+
+    @property
+    def steps(self) -> Array:
+        """Duration of each step (s), shape (n,)."""
+        first = 0.0 if np.isnan(self.begin) else self.time[0] - self.begin
+        return np.diff(self.time, prepend=self.time[0] - first)
+
+
+@dataclass(frozen=True, eq=False)
+class Turned:
+    """How a stretch turns and pushes the platform, by an estimate of the instruments' errors.
+
+    Parameters
+    ----------
+    attitude : ndarray, shape (n + 1, 3, 3)
+        ``begin_from_then``: at the beginning, and at every sample.
+    by_bias, by_matrix : ndarray, shape (3, 3), (3, 9)
+        Derivatives of the whole turn, axes of the beginning.
+    push : ndarray, shape (3,)
+        Integral of the specific force, axes of the beginning (m/s).
+    by_force : ndarray, shape (3, 3)
+        Its derivative by the specific force.
+    rate : ndarray, shape (n, 3)
+        Corrected (rad/s).
+    """
+
+    attitude: Array
+    by_bias: Array
+    by_matrix: Array
+    push: Array
+    by_force: Array
+    rate: Array
+
+
+def turned(stretch: Stretch, state: Orientation) -> Turned:
+    """Integrate a stretch."""
+    dt = stretch.steps
+    rate = stretch.gyro_body @ (np.eye(3) + state.gyro_matrix).T - state.gyro_bias
+    steps = Rotation.from_rotvec(rate * dt[:, None]).as_matrix()
+    attitude = np.empty((len(dt) + 1, 3, 3))
+    attitude[0] = np.eye(3)
+    for i, step in enumerate(steps):
+        attitude[i + 1] = attitude[i] @ step
+    middle = 0.5 * (attitude[1:] + attitude[:-1])
+    weighted = middle * dt[:, None, None]
+    return Turned(
+        attitude=attitude,
+        by_bias=-np.sum(weighted, axis=0),
+        by_matrix=np.einsum("nij,nk->ijk", weighted, stretch.gyro_body).reshape(3, 9),
+        push=np.einsum("nij,nj->i", weighted, stretch.accel_body - state.accel_bias),
+        by_force=np.sum(weighted, axis=0),
+        rate=rate,
+    )
+
+
+def body_from_end(stretch: Stretch, turn: Turned, lag: float) -> tuple[Array, Array]:
+    """Return how the axes of the field samples lie to those of the end, on average.
+
+    Parameters
+    ----------
+    lag : float
+        The samples show the platform as it was so much before their stamp (s).
+
+    Returns
+    -------
+    mean, by_lag : ndarray, shape (3, 3)
+        Mean of ``sample_from_end``, and its derivative (1/s).
+    """
+    shown = stretch.field_time - lag
+    stamps = np.concatenate([stretch.time[:1] - stretch.steps[:1], stretch.time])
+    index = np.clip(np.searchsorted(stamps, shown, side="right") - 1, 0, len(stamps) - 1)
+    rate = turn.rate[np.minimum(index, len(turn.rate) - 1)]
+    ahead = Rotation.from_rotvec(rate * (shown - stamps[index])[:, None]).as_matrix()
+    sample_from_end = np.swapaxes(turn.attitude[index] @ ahead, 1, 2) @ turn.attitude[-1]
+    return np.mean(sample_from_end, axis=0), np.mean(skew(rate) @ sample_from_end, axis=0)
+
+
+def stretches(
+    time: Array,
+    gyro_body: Array,
+    accel_body: Array,
+    rests: BoolArray,
+    field_time: Array,
+    field_t: Array,
+    begin: float,
+) -> Iterator[Stretch]:
+    """Cut streams into stretches; what does not fill one at the end is a shorter one.
+
+    Parameters
+    ----------
+    begin : float
+        Time of the sample before the first (s); NaN where there is none.
+    """
+    first, edge = 0, begin
+    while first < len(time):
+        if np.isnan(edge) or time[first] - edge > GAP:
+            edge = np.nan
+        start = time[first] if np.isnan(edge) else edge
+        last = int(np.searchsorted(time, start + STEP + 1e-9, side="right"))
+        last = max(last, first + 1)
+        if len(time) - last < 2:
+            last = len(time)
+        jumps = np.flatnonzero(np.diff(time[first:last]) > GAP)
+        if len(jumps):
+            last = first + int(jumps[0]) + 1
+        own = slice(first, last)
+        end = time[last - 1]
+        lo, hi = np.searchsorted(field_time, [start, end], side="right")
+        yield Stretch(
+            edge,
+            time[own],
+            gyro_body[own],
+            accel_body[own],
+            field_time[lo:hi],
+            field_t[lo:hi] / MICROTESLA,
+            bool(np.all(rests[own])),
+        )
+        first, edge = last, float(end)

@@ -1,0 +1,267 @@
+"""What smooth and navigate do with a site without beacons: the orientation, at the IMU's rate."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.estimation.integrity.stamps import uneven_stamps
+from magfusion.estimation.orientation.layout import LAG, MICROTESLA, OFFSET, Orientation
+from magfusion.estimation.orientation.online import ANYWHERE, TIMING, OrientationNavigator
+from magfusion.estimation.orientation.remarks import doubts, remarks
+from magfusion.estimation.orientation.smoother import Oriented, oriented
+from magfusion.estimation.state import GYRO_BIAS, ROTATION
+from magfusion.files.site import load_site, save_site
+from magfusion.files.stream import json_line, read_records, whole_rows
+from magfusion.files.trajectory_table import write_trajectory
+from magfusion.files.tum import write_tum
+from magfusion.jobs.inputs import Job, claim, named, read_job, require_imu
+from magfusion.model.progress import Report
+from magfusion.model.samples import Log
+from magfusion.model.site import Magnetometer, Site
+from magfusion.model.trajectory import Trajectory, interpolate
+from magfusion.model.trust import Trust, alike
+from magfusion.results.figures import Figure, Figures, Section, heading
+from magfusion.results.page_motion import Motion
+from magfusion.results.recording import write_recording
+from magfusion.results.report import write_report
+from magfusion.results.verdict import trust_figures
+from magfusion.units import DEGREE, Array, Rate
+
+if TYPE_CHECKING:
+    from magfusion.estimation.integrity.judgement import JudgedState
+
+LONGEST_STEP = 0.1  # s; of a truth that is compared with
+_PLACE = {"json": "line", "msgpack": "record"}
+
+
+def without_beacons(job: Job) -> bool:
+    """Tell whether a job's site has no beacon, so that only the orientation can be found."""
+    if not job.declared_path.is_file():
+        return False
+    return not load_site(job.declared_path, unknown=True, without=True).beacons
+
+
+def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Report) -> Figures:
+    """Find the orientation of a log: trajectory, report, recording, and the site as found.
+
+    Parameters
+    ----------
+    name : {'smooth', 'navigate'}
+    rate : 'field', 'imu' or float
+        Without beacons there are no field epochs: states are at every inertial sample, or so many
+        a second (Hz).
+    back : bool
+        Whether later samples count too.
+
+    Raises
+    ------
+    InputError
+    """
+    claimed = claim(job.output, name)
+    log, site = read_job(job, without=True, report=report)
+    require_imu(job, log, "without beacons only the gyroscope tells how it turns")
+    began = time.perf_counter()
+    with named(job.log_path):
+        found = oriented(log, site, back=back, report=report)
+    elapsed = time.perf_counter() - began
+    states = _thinned(_trajectory(found, log, site), rate)
+    assert site.earth_field_world is not None
+    assert states.pose_cov is not None
+    said = remarks(
+        found.states, found.disturbance, found.changed, site.earth_field_world / MICROTESLA
+    )
+    open_heading = np.array([s.cov[2, 2] for s in found.states])
+    usual = found.states[int(np.argsort(open_heading)[len(open_heading) // 2])]
+    said += doubts(usual.cov[:3, :3], np.eye(3))
+    trust = Trust((*log.noticed, *uneven_stamps(log, site), *said))
+    figures = heading(name, log.name) | trust_figures(trust) | _figures(found, states, elapsed)
+    figures |= _errors(states, log)
+    by_state = alike(len(states), trust.verdict)
+    refined = _refined(site, found.states[-1])
+    with claimed as whole:
+        write_tum(states, whole / "trajectory.tum", log.epoch_ns)
+        write_trajectory(states, whole / "trajectory.parquet", log.epoch_ns, by_state)
+        save_site(refined, whole / "site.yaml")
+        write_recording(whole / "run.rrd", refined, states, trust=trust, states=by_state)
+        write_report(whole, figures, Motion(refined, states, trust=by_state))
+    return figures
+
+
+def _trajectory(found: Oriented, log: Log, site: Site) -> Trajectory:
+    """Return the states at the inertial samples; the position is not known."""
+    ends, time = found.ends, found.time
+    index = np.clip(np.searchsorted(ends, time), 0, len(ends) - 1)
+    noise = site.platform.imu.gyro_noise
+    pose = np.empty((len(time), 6, 6))
+    pose[:] = np.diag([0.0, 0.0, 0.0, *[ANYWHERE**2] * 3])
+    turn = np.stack([state.cov[:3, :3] for state in found.states])[index]
+    attitude = found.world_from_body
+    rate = np.linalg.norm(log.imu.gyro_body[: len(time)], axis=1)
+    floor = (noise**2 * 0.1 + (TIMING * rate) ** 2)[:, None, None] * np.eye(3)
+    pose[:, :3, :3] = np.swapaxes(attitude, 1, 2) @ turn @ attitude + floor
+    part = {
+        "velocity_world": np.stack([s.velocity_world for s in found.states])[index],
+        "gyro_bias_body": np.stack([s.gyro_bias for s in found.states])[index],
+        "accel_bias_body": np.stack([s.accel_bias for s in found.states])[index],
+    }
+    return Trajectory(time, attitude, np.zeros((len(time), 3)), **part, pose_cov=pose)
+
+
+def _thinned(states: Trajectory, rate: Rate) -> Trajectory:
+    if isinstance(rate, str):
+        return states
+    wanted = np.arange(states.time[0], states.time[-1], 1.0 / rate)
+    rows = np.unique(np.clip(np.searchsorted(states.time, wanted), 0, len(states) - 1))
+    parts: dict[str, Any] = {
+        key: None if value is None else value[rows] for key, value in vars(states).items()
+    }
+    return Trajectory(**parts)
+
+
+def _figures(found: Oriented, states: Trajectory, elapsed: float) -> Figures:
+    last, cov = found.states[-1], states.pose_cov
+    assert cov is not None
+    turn = states.world_from_body @ cov[:, :3, :3] @ np.swapaxes(states.world_from_body, 1, 2)
+    sigma = np.sqrt(np.diagonal(turn, axis1=1, axis2=2)) / DEGREE
+    offset_sigma = np.sqrt(np.diagonal(last.cov[OFFSET, OFFSET]))
+    return Figures(
+        Figure("states", len(states)),
+        Figure("duration_s", float(states.time[-1] - states.time[0]), "s"),
+        Figure("heading_sigma_median_deg", float(np.median(sigma[:, 2])), "deg"),
+        Figure("tilt_sigma_median_deg", float(np.median(np.hypot(*sigma[:, :2].T))), "deg"),
+        Figure("field_changes", len(found.changed)),
+        Figure("field_disturbance_max_ut", float(np.max(found.disturbance)), "uT"),
+        Figure("field_lag_ms", 1e3 * last.lag, "ms"),
+        Figure("field_lag_sigma_ms", 1e3 * float(np.sqrt(last.cov[LAG, LAG][0, 0])), "ms"),
+        Figure("offset_ut", last.offset.tolist(), "uT", section=Section.REPORT),
+        Figure("offset_sigma_ut", offset_sigma.tolist(), "uT", section=Section.REPORT),
+        Figure("elapsed_s", elapsed, "s"),
+    )
+
+
+def _errors(states: Trajectory, log: Log) -> Figures:
+    """Return the errors of heading and tilt against the truth, where the log has one."""
+    if log.truth is None or len(log.truth) == 0:
+        return Figures()
+    truth, exists = interpolate(log.truth, states.time, LONGEST_STEP)
+    if not np.any(exists):
+        return Figures()
+    assert states.pose_cov is not None
+    attitude, cov = states.world_from_body[exists], states.pose_cov[exists, :3, :3]
+    off = Rotation.from_matrix(attitude @ np.swapaxes(truth.world_from_body, 1, 2))
+    x, y, z, w = off.as_quat().T
+    head = 2.0 * np.arctan2(z, w)
+    head = (head + np.pi) % (2.0 * np.pi) - np.pi
+    tilt = 2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w))
+    body = Rotation.from_matrix(np.swapaxes(truth.world_from_body, 1, 2) @ attitude).as_rotvec()
+    nees = np.einsum("ni,nij,nj->n", body, np.linalg.inv(cov), body)
+    inside = np.abs(body) <= 3.0 * np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
+    return Figures(
+        Figure("attitude_rmse_deg", _rms(off.magnitude()) / DEGREE, "deg"),
+        Figure("heading_rmse_deg", _rms(head) / DEGREE, "deg"),
+        Figure("tilt_rmse_deg", _rms(tilt) / DEGREE, "deg"),
+        Figure("attitude_nees_mean", float(np.mean(nees)), label="mean NEES (3 expected)"),
+        Figure("attitude_inside_3_sigma", float(np.mean(inside)), label="share within 3 sigma"),
+        Figure("compared_epochs", int(np.sum(exists))),
+    )
+
+
+def _rms(value: Array) -> float:
+    return float(np.sqrt(np.mean(value**2)))
+
+
+def _refined(site: Site, last: Orientation) -> Site:
+    """Return the site with the magnetometer's offset as it was in the end."""
+    old: Magnetometer = site.platform.magnetometer
+    turn = old.matrix @ old.body_from_sensor.T @ last.world_from_body.T
+    cov = turn @ last.cov[OFFSET, OFFSET] @ turn.T
+    sigma = np.sqrt(np.diagonal(cov)) * MICROTESLA
+    found = replace(old, offset=last.offset * MICROTESLA, sigma=replace(old.sigma, offset=sigma))
+    return replace(site, platform=replace(site.platform, magnetometer=found))
+
+
+def run_orientation_stream(
+    site: Site, form: str, keep_going: bool, source: BinaryIO, sink: BinaryIO, messages: TextIO
+) -> int:
+    """Tell the orientation by the records of a stream; one line of JSON for each inertial sample.
+
+    Returns
+    -------
+    int
+        How many records were passed over.
+
+    Raises
+    ------
+    InputError
+        Where a record is none and ``keep_going`` is not set.
+    """
+    navigator, refused = OrientationNavigator(site), 0
+    for numbered in read_records(source, form):  # type: ignore[arg-type]
+        try:
+            if numbered.record is None:
+                raise InputError(numbered.refusal)
+            _take_in(navigator, numbered.record)
+        except InputError as error:
+            sentence = f"standard input, {_PLACE[form]} {numbered.number}: {error}"
+            if not keep_going:
+                raise InputError(sentence) from error
+            refused += 1
+            messages.write(f"magfusion: {sentence} (passed over)\n")
+            continue
+        for state in navigator.take():
+            sink.write(json_line(_told(navigator, state)))
+        sink.flush()
+    return refused
+
+
+def _take_in(navigator: OrientationNavigator, record: Any) -> None:
+    if record.imu is not None:
+        time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
+        if len(time):
+            navigator.add_imu(time, gyro, accel)
+    if record.magnetometer is not None:
+        time, field = whole_rows(record.magnetometer.time, record.magnetometer.field)
+        if len(time):
+            navigator.add_magnetometer(time, field)
+    if record.fields is not None:
+        raise InputError("phasors of beacons that the site does not have; describe them in it")
+
+
+def _told(navigator: OrientationNavigator, state: JudgedState) -> dict[str, Any]:
+    """Return a state as it is written; what is not known is null."""
+    sigma = np.sqrt(np.diagonal(state.cov))
+    quaternion = Rotation.from_matrix(state.world_from_body).as_quat(scalar_first=True)
+    judgement = state.judgement
+    return {
+        "time": state.time,
+        "started": True,
+        "lost": False,
+        "reset_counter": 0,
+        "verdict": str(state.verdict),
+        "reasons": [{"code": f.code, "text": f.text} for f in judgement.reasons],
+        "remarks": [{"code": f.code, "text": f.text} for f in judgement.remarks],
+        "excluded": [],
+        "protection_level_m": None,
+        "protection_level_deg": None,
+        "ambiguous": False,
+        "position": None,
+        "quaternion": quaternion.tolist(),
+        "velocity": None,
+        "gyro_bias": state.gyro_bias_body.tolist(),
+        "accel_bias": state.accel_bias_body.tolist(),
+        "sigma": {
+            "position": None,
+            "rotation_body": sigma[ROTATION].tolist(),
+            "velocity": None,
+            "gyro_bias": sigma[GYRO_BIAS].tolist(),
+            "accel_bias": sigma[9:12].tolist(),
+        },
+        "distortion": {},
+        "field_disturbance_t": navigator.filter.disturbance * MICROTESLA,
+    }

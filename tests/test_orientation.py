@@ -1,0 +1,171 @@
+"""Orientation without beacons, against a truth that knows nothing of the estimator."""
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import earth_alone as scenario
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.estimation.orientation.filter import OrientationFilter
+from magfusion.estimation.orientation.layout import SIZE, SPEED
+from magfusion.estimation.orientation.remarks import remarks
+from magfusion.estimation.orientation.smoother import oriented, pieces
+from magfusion.files.log import write_log
+from magfusion.files.site import save_site
+from magfusion.files.stream import imu_content, magnetometer_content, write_record
+from magfusion.jobs.inputs import Job
+from magfusion.jobs.orientation import run_orientation, run_orientation_stream, without_beacons
+from magfusion.model.progress import quiet
+from magfusion.model.samples import ImuSamples, Waveform
+
+
+@pytest.fixture(scope="module")
+def attached():
+    return scenario.simulated("attached magnet", 3, duration=30.0, rate=50.0)
+
+
+@pytest.fixture(scope="module")
+def smoothed(attached):
+    return oriented(*attached)
+
+
+def test_the_errors_are_as_large_as_is_claimed(attached, smoothed):
+    log, _ = attached
+    heading, tilt = scenario.errors(smoothed.time, smoothed.world_from_body, log.truth)
+    claimed = np.rad2deg(
+        np.sqrt([np.mean([s.cov[k, k] for s in smoothed.states]) for k in range(3)])
+    )
+    assert heading < 3.0 * claimed[2]
+    assert tilt < 3.0 * np.hypot(*claimed[:2])
+    assert tilt < 0.5
+
+
+def test_an_attached_magnet_is_found_and_said(attached, smoothed):
+    log, site = attached
+    before, after = (smoothed.states[k].offset for k in (50, -1))
+    true = np.diff([log.waveform.measured_sensor[k] - seen(log, k) for k in (200, 1400)], axis=0)
+    np.testing.assert_allclose(after - before, 1e6 * true[0], atol=2.5)
+    assert 11.5 < smoothed.changed[0] < 14.0
+    said = remarks(
+        smoothed.states, smoothed.disturbance, smoothed.changed, np.array([0, 16.4, -41.4])
+    )
+    assert {"geometry", "body_iron"} <= {finding.code for finding in said}
+    assert site.beacons == ()
+
+
+def seen(log, k):
+    return log.truth.world_from_body[k].T @ scenario.EARTH_WORLD
+
+
+def test_what_moves_a_state_is_measured_by_what_leads_there(smoothed):
+    rng = np.random.default_rng(1)
+    state, matrix = smoothed.states[100], np.eye(3) + 0.01 * rng.normal(size=(3, 3))
+    step = 0.01 * rng.normal(size=SIZE)
+    moved = state.moved(step, matrix)
+    np.testing.assert_allclose(state.step_to(moved, matrix), step, rtol=0, atol=1e-12)
+
+
+def test_the_prediction_of_a_stretch_has_its_derivative(attached):
+    log, site = attached
+    estimator, cut = OrientationFilter(site), pieces(log, site)
+    for stretch in cut[:150]:
+        estimator.take(stretch)
+    state, matrix = estimator.state, estimator.measured_from_body
+    update = estimator.take(cut[150])
+    other = OrientationFilter(site)
+    for k in (0, 1, 2, 4, 6, 7, 9, 11, 12, 15, 20, 21, 23, 25, 30, 36, 39):
+        ends = []
+        for sign in (1.0, -1.0):
+            step = np.zeros(SIZE)
+            step[k] = sign * 1e-5
+            other.state = state.moved(step, matrix)
+            ends.append(update.predicted.step_to(other.take(cut[150]).predicted, matrix))
+        off = (ends[0] - ends[1]) / 2e-5 - update.transition[:, k]
+        # What the turn does to the force on the way is worked out at the middle of the stretch.
+        assert np.max(np.abs(off[SPEED])) < 6e-3
+        off[SPEED] = 0.0
+        assert np.max(np.abs(off)) < 1e-4 + 1e-3 * np.max(np.abs(update.transition[:, k]))
+
+
+def test_a_site_without_a_field_is_refused(attached):
+    _, site = attached
+    with pytest.raises(InputError, match="needs the Earth's field"):
+        OrientationFilter(replace(site, earth_field_world=None))
+
+
+def test_a_gap_is_bridged_by_gravity_and_field(attached):
+    log, site = attached
+    kept = (log.imu.time < 14.0) | (log.imu.time > 18.0)
+    imu = ImuSamples(*(getattr(log.imu, n)[kept] for n in ("time", "gyro_body", "accel_body")))
+    found = oriented(replace(log, imu=imu), site)
+    late = found.time > 22.0
+    assert scenario.errors(found.time[late], found.world_from_body[late], log.truth)[1] < 1.5
+
+
+@pytest.mark.parametrize("name", ["smooth", "navigate"])
+def test_the_jobs_write_an_orientation_and_say_that_there_is_no_position(attached, tmp_path, name):
+    log, site = attached
+    short = replace(
+        log,
+        imu=ImuSamples(*(getattr(log.imu, n)[:500] for n in ("time", "gyro_body", "accel_body"))),
+        waveform=Waveform(log.waveform.time[:500], log.waveform.measured_sensor[:500]),
+    )
+    write_log(short, tmp_path / "log")
+    save_site(site, tmp_path / "log" / "site.yaml")
+    job = Job(tmp_path / "log", None, tmp_path / "out")
+    assert without_beacons(job)
+    figures = dict(run_orientation(name, job, "field", back=name == "smooth", report=quiet))
+    written = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert written["verdict"] == "trustworthy"
+    assert "undetermined" in " ".join(r["text"] for r in written["remarks"])
+    assert figures["states"] == 500
+    assert figures["tilt_rmse_deg"] < 1.0
+    assert {p.name for p in Path(tmp_path / "out").iterdir()} >= {"trajectory.parquet", "run.rrd"}
+
+
+def test_the_pipe_tells_an_orientation_for_each_sample_and_no_position(attached):
+    log, site = attached
+    source, sink = io.BytesIO(), io.BytesIO()
+    for k in range(0, 800, 5):
+        own = slice(k, k + 5)
+        imu, wave = log.imu, log.waveform
+        write_record(
+            imu_content(ImuSamples(imu.time[own], imu.gyro_body[own], imu.accel_body[own])),
+            source,
+            "json",
+        )
+        write_record(
+            magnetometer_content(Waveform(wave.time[own], wave.measured_sensor[own])),
+            source,
+            "json",
+        )
+    source.seek(0)
+    assert run_orientation_stream(site, "json", False, source, sink, io.StringIO()) == 0
+    told = [json.loads(line) for line in sink.getvalue().splitlines()]
+    assert len(told) > 780
+    assert {t["position"] for t in told} == {None}
+    time = np.array([t["time"] for t in told])
+    assert np.all(np.diff(time) > 0.0)
+    turn = Rotation.from_quat([t["quaternion"] for t in told], scalar_first=True).as_matrix()
+    heading, tilt = scenario.errors(time, turn, log.truth)
+    assert tilt < 1.0
+    assert heading < 8.0
+
+
+@pytest.mark.slow
+def test_in_the_mean_it_is_better_than_vqf():
+    pytest.importorskip("vqf")
+    rows = []
+    for kind in scenario.KINDS:
+        rows += scenario.rows_of(*scenario.simulated(kind, 1, duration=40.0, rate=100.0))
+    for way in ("online", "offline"):
+        ours, theirs = (
+            [np.hypot(r.heading_deg, r.tilt_deg) for r in rows if r.way == w]
+            for w in (way, f"VQF {way}")
+        )
+        assert np.mean(ours) < np.mean(theirs)
