@@ -2,8 +2,8 @@
 
 Raw samples at 20 kHz come from code that shares nothing with the estimators: every turn of every
 winding by elliptic integrals, a drive that drifts, steps of a 16-bit converter, mains, the Earth
-field, and a head that rests and then turns at 100 deg/s.  `magfusion navigate -` reads them with an
-inertial stream as records of 10 ms, and the scenario tells
+field, and a head that turns at 100 deg/s, rests and turns again.  `magfusion navigate -` reads
+them with an inertial stream as records of 10 ms, and the scenario tells
 
 1. how far its states are from the truth at rest and turning, and how many there are a second;
 2. how far those are that it predicts to the instant of a display, 20 ms ahead of the samples;
@@ -30,14 +30,17 @@ from scipy.special import ellipe, ellipk
 from magfusion.units import DEGREE, Array
 
 CARRIER_HZ, RATE_HZ, FIELD_KNOTS_HZ = 6000.0, 20e3, 1000.0
-SLOT, SLOTS = 1.0 / 360.0, 3  # s; 120 cycles a second
+CYCLE = 1.0 / 120.0  # s
 LAYERS, ROWS, WIRE, CURRENT = 8, 20, 5e-4, 1.0  # m, A
 FORMERS = (0.020, 0.026, 0.032)  # m; of the coils, one about the other
 EARTH_WORLD = np.array([0.0, 2e-5, -4.5e-5])  # T
 GRAVITY = 9.80665
 BITS, RANGE = 16, 100e-6  # T
 PIECE = 0.01  # s
-BEGUN, TURNING = 7.0, 8.5  # s; from when states are compared, at rest and turning
+SOURCE_PPM = 20.0  # of a crystal
+UNKNOWN = 0.0123  # s; when a cycle of a clock of its own begins
+RESTING, TURNING = 5.0, 8.5  # s; it turns at its full rate until a second before, and from then
+CHANGE, BEGUN = 1.0, 6.5  # s; from rest to the full rate, and from when states are compared
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,9 @@ class Config:
     imu_rate_hz : float
     ahead : float
         Of the display's instant (s).
+    source_ppm : float, optional
+        By how much the clock of the source runs fast, which is then its own: when a cycle begins
+        the site does not say, a fourth slot is silent, and the stream must tell.
     """
 
     duration: float = 16.0
@@ -68,7 +74,13 @@ class Config:
     drive_drift: float = 1e-3
     imu_rate_hz: float = 500.0
     ahead: float = 0.02
+    source_ppm: float | None = None
     seed: int = 0
+
+    @property
+    def slots(self) -> int:
+        """Of a cycle."""
+        return 3 if self.source_ppm is None else 4
 
 
 @dataclass(frozen=True)
@@ -113,37 +125,57 @@ def winding_field(former: float, axis: int, place: Array) -> Array:
 
 
 class Head:
-    """Rests, then turns without pause while it sways by centimetres."""
+    """Turns while it sways by centimetres, rests, and turns again."""
 
     def __init__(self, config: Config) -> None:
         rng = np.random.default_rng(config.seed)
         knots = np.arange(0.0, config.duration + 3.0, 0.5)
         turn, axis = [Rotation.random(rng=rng)], rng.standard_normal(3)
-        sway = [np.array([0.45, 0.0, -0.05])]
-        for time_s in knots[1:]:
-            moves = time_s > TURNING - 1.0
+        for _ in knots[1:]:
             axis = axis / np.linalg.norm(axis) + 0.3 * rng.standard_normal(3)
             step = config.rate_deg_s * DEGREE * 0.5 * axis / np.linalg.norm(axis)
-            turn.append(turn[-1] * Rotation.from_rotvec(moves * step))
-            middle = np.array([0.45, 0.0, -0.05])
-            sway.append(middle + moves * rng.uniform(-0.08, 0.08, 3) if moves else middle)
+            turn.append(turn[-1] * Rotation.from_rotvec(step))
+        sway = np.array([0.45, 0.0, -0.05]) + rng.uniform(-0.08, 0.08, (len(knots), 3))
         self._turn = RotationSpline(knots, Rotation.concatenate(turn))
-        self._place = make_interp_spline(knots, np.array(sway), 5)
+        self._place = make_interp_spline(knots, sway, 5)
+
+    @staticmethod
+    def _run(time: Array) -> tuple[Array, Array, Array]:
+        """Return how far along its path it is (s), how fast that grows, and how fast this does."""
+        far, speed, growth = time.copy(), np.ones(len(time)), np.zeros(len(time))
+        for sign, begin in ((-1.0, RESTING - CHANGE), (1.0, TURNING - CHANGE)):
+            share = np.clip((time - begin) / CHANGE, 0.0, 1.0)
+            beyond = np.maximum(time - begin - CHANGE, 0.0)
+            far += sign * (CHANGE * (share**3 - 0.5 * share**4) + beyond)
+            speed += sign * (3.0 * share**2 - 2.0 * share**3)
+            growth += sign * 6.0 * (share - share**2) / CHANGE
+        return far, speed, growth
 
     def place(self, time: Array) -> Array:
         """Return the position (n, 3) (m)."""
-        return np.asarray(self._place(time))
+        return np.asarray(self._place(self._run(time)[0]))
 
     def turn(self, time: Array) -> Rotation:
         """Return world_from_body."""
-        return self._turn(time)
+        return self._turn(self._run(time)[0])
+
+    def rate_body(self, time: Array) -> Array:
+        """Return the angular rate (n, 3) (rad/s)."""
+        far, speed, _ = self._run(time)
+        return np.asarray(self._turn(far, 1) * speed[:, None])
+
+    def accel_world(self, time: Array) -> Array:
+        """Return the acceleration (n, 3) (m/s^2)."""
+        far, speed, growth = self._run(time)
+        own = self._place(far, 2) * speed[:, None] ** 2 + self._place(far, 1) * growth[:, None]
+        return np.asarray(own)
 
     def imu(self, config: Config, rng: np.random.Generator) -> tuple[Array, Array, Array]:
         """Return stamps, rates and specific forces of a good consumer's IMU."""
         step = 1.0 / config.imu_rate_hz
         time = np.arange(0.0, config.duration, step)
-        gyro = np.asarray(self._turn(time, 1))
-        force_world = np.asarray(self._place(time, 2)) + np.array([0.0, 0.0, GRAVITY])
+        gyro = self.rate_body(time)
+        force_world = self.accel_world(time) + np.array([0.0, 0.0, GRAVITY])
         accel = self.turn(time).inv().apply(force_world)
         white = np.sqrt(config.imu_rate_hz)
         gyro = gyro + 2e-3 * rng.standard_normal(3) + 1e-4 * white * rng.standard_normal(gyro.shape)
@@ -155,8 +187,12 @@ def waveform(config: Config, head: Head, rng: np.random.Generator) -> tuple[Arra
     """Return stamps and what the converter gives of three axes (T)."""
     time = np.arange(int(config.duration * RATE_HZ)) / RATE_HZ
     knots = np.arange(0.0, config.duration + 2.0 / FIELD_KNOTS_HZ, 1.0 / FIELD_KNOTS_HZ)
-    slot = np.floor(time / SLOT + 1e-9).astype(int) % SLOTS
-    current = (1.0 - config.drive_drift * time / 60.0) * np.cos(2.0 * np.pi * CARRIER_HZ * time)
+    own_clock = (
+        time if config.source_ppm is None else (time - UNKNOWN) * (1 + 1e-6 * config.source_ppm)
+    )
+    slot = np.floor(own_clock / CYCLE * config.slots + 1e-9).astype(int) % config.slots
+    current = np.cos(2.0 * np.pi * CARRIER_HZ * own_clock)
+    current *= 1.0 - config.drive_drift * time / 60.0
     world_from_body = head.turn(knots)
     body = CubicSpline(knots, world_from_body.inv().apply(EARTH_WORLD))(time)
     for axis, former in enumerate(FORMERS):
@@ -174,7 +210,7 @@ def waveform(config: Config, head: Head, rng: np.random.Generator) -> tuple[Arra
     return time, step * np.round(body / step)
 
 
-def site_text() -> str:
+def site_text(config: Config) -> str:
     """Return the site as its owner would write it."""
     coils = "".join(
         f"""
@@ -198,8 +234,8 @@ beacons:
     position_m: [0, 0, 0]
     rpy_deg: [0, 0, 0]
     frequency_hz: {CARRIER_HZ}
-    slots: {{duration_s: {SLOT!r}, count: {SLOTS}, start_s: 0}}
-    synchronised: true
+    slots: {{duration_s: {CYCLE / config.slots!r}, count: {config.slots}}}
+    synchronised: {"true" if config.source_ppm is None else "false"}
     coils:{coils}
 region:
   half_space: {{normal: [1, 0, 0]}}
@@ -256,7 +292,9 @@ def piped(site: Path, given: bytes, *options: str) -> tuple[list[dict[str, Any]]
 
 def errors(states: list[dict[str, Any]], head: Head, begin: float, end: float) -> Array:
     """Return the RMS errors of the states of a stretch: position (mm), attitude (deg)."""
-    some = [s for s in states if begin <= s["time"] < end]
+    some = [s for s in states if begin <= s["time"] < end and not s["lost"]]
+    if not some:
+        return np.full(2, np.inf)
     time = np.array([s["time"] for s in some])
     place = np.array([s["position"] for s in some]) - head.place(time)
     quaternion = np.array([s["quaternion"] for s in some])
@@ -277,7 +315,7 @@ def run(config: Config) -> Figures:
     given, head = records(config), Head(config)
     with tempfile.TemporaryDirectory() as directory:
         site = Path(directory) / "site.yaml"
-        site.write_text(site_text())
+        site.write_text(site_text(config))
         beginning = b"\n".join(given.splitlines()[: int(BEGUN / PIECE)]) + b"\n"
         _, startup = piped(site, beginning)
         speed = python_ms()
@@ -285,11 +323,11 @@ def run(config: Config) -> Figures:
         speed = 0.5 * (speed + python_ms())
         carried, _ = piped(site, given, "--rate", "120", "--horizon", str(config.ahead))
     end = config.duration
-    turned = np.linalg.norm(head._turn(np.arange(TURNING, end, 0.01), 1), axis=1)
-    told = [s for s in states if s["time"] >= BEGUN]
+    turned = np.linalg.norm(head.rate_body(np.arange(TURNING, end, 0.01)), axis=1)
+    told = [s for s in states if s["time"] >= BEGUN and not s["lost"]]
     return Figures(
         len(told) / (end - BEGUN),
-        *errors(states, head, BEGUN, TURNING - 1.0),
+        *errors(states, head, BEGUN, TURNING - CHANGE),
         *errors(states, head, TURNING, end),
         *errors(carried, head, TURNING, end),
         rms(turned) / DEGREE,
@@ -302,7 +340,7 @@ def report(found: Figures) -> str:
     """Return the table that a reader sees."""
     return "\n".join(
         [
-            f"three wound coils, {1.0 / SLOT / SLOTS:.0f} cycles a second; 0.3 to 0.6 m",
+            f"three wound coils, {1.0 / CYCLE:.0f} cycles a second; 0.3 to 0.6 m",
             f"{'states a second':<32}{found.states_per_s:8.1f}",
             f"{'at rest':<32}{found.rest_mm:8.3f} mm {found.rest_deg:7.3f} deg",
             f"{'turning, ' + format(found.turned_deg_s, '.0f') + ' deg/s':<32}"
@@ -320,8 +358,9 @@ def main() -> None:
     config = Config(seed=given.seed)
     if given.quick:
         config = replace(config, duration=TURNING + 4.0)
-    found = run(config)
-    conclude(report(found), {"figures": found})
+    known, searched = run(config), run(replace(config, source_ppm=SOURCE_PPM))
+    told = [report(known), "a clock of its own, slots found in the stream:", report(searched)]
+    conclude("\n".join(told), {"known": known, "searched": searched})
 
 
 if __name__ == "__main__":

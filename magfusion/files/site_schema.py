@@ -259,10 +259,24 @@ class BeaconEntry(StrictModel):
             if coil.slot is None or coil.slot >= self.slots.count:
                 remedy = f"give one of the beacon's {self.slots.count} slots, counted from 0"
                 raise refusal_at(("coils", i, "slot"), coil.slot, remedy)
-        if not self.synchronised:
-            remedy = "write true: slots are counted on the log's clock, which the drive must keep"
+        if not self.synchronised and not self._slots_tell():
+            remedy = (
+                "write true, which counts slots on the log's clock; for slots to be found in the"
+                " stream drive the coils with a carrier and leave one slot silent"
+            )
             raise refusal_at(("synchronised",), False, remedy)
         return self
+
+    def _slots_tell(self) -> bool:
+        """Return whether a stream can tell when a cycle begins."""
+        assert self.slots is not None
+        driven = {coil.slot for coil in self.coils}
+        count = self.slots.count
+        turned = (
+            {(slot + k) % count for slot in driven if slot is not None} for k in range(1, count)
+        )
+        carrier = all((coil.frequency_hz or self.frequency_hz) > 0.0 for coil in self.coils)
+        return carrier and len(driven) < count and all(other != driven for other in turned)
 
     @model_validator(mode="after")
     def _one_sigma_per_coil(self) -> Self:

@@ -6,6 +6,7 @@ used `magfusion.receiver.admission` says, for both and whatever the size of the 
 
 from abc import ABC, abstractmethod
 from collections import Counter
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -28,6 +29,7 @@ from magfusion.receiver.cycles import cycles, joins
 from magfusion.receiver.design import Designs, separable, variance_growth
 from magfusion.receiver.lockin import WindowOperator, designs_of, window_operator
 from magfusion.receiver.slot_phasors import SlotValues, demodulate_slots, slot_values
+from magfusion.receiver.slot_timing import is_searched, slot_start, with_start
 from magfusion.receiver.slots import (
     SlotSettings,
     check_carriers,
@@ -46,6 +48,7 @@ from magfusion.units import Array, BoolArray, IntArray
 NO_SILENT_SLOT = "no silent slot beside it"
 # Of the samples of a window: its design tells whether they suffice; of a slot: it has few columns.
 LEAST_SHARE, LEAST_SHARE_OF_SLOT = 0.5, 0.9
+FOLLOWED_EVERY = 0.2  # s; clocks that are 100 ppm apart drift by 20 us
 INERTIAL_MARGIN = 0.1  # s; by which their clocks may be apart, and before a window
 BEFORE = 256  # samples before a window, among which an axis that keeps one value is seen to
 
@@ -101,6 +104,11 @@ class Receiver(ABC):
         if isinstance(settings, SlotSettings) or has_schedule(site):
             return SlotReceiver(site, settings)
         return LockinReceiver(site, settings)
+
+    @property
+    def timed(self) -> Site:
+        """The site with the schedule as it was found in the stream."""
+        return self.site
 
     @property
     @abstractmethod
@@ -176,6 +184,9 @@ class Receiver(ABC):
         found = found.rows(number >= since)
         return found, len(found)
 
+    def _follow(self, waveform: Waveform) -> None:  # noqa: B027
+        """Bring the grid to where the stream shows it."""
+
     @abstractmethod
     def _driven(self, number: IntArray) -> BoolArray:
         """Tell which windows lead to a row of phasors."""
@@ -206,6 +217,7 @@ class Receiver(ABC):
             As of `magfusion.receiver.turn.on_clock`; the offset is the site's where none is given.
         """
         assert self.grid is not None
+        self._follow(waveform)
         waveform, imu = self._since(waveform, imu, time_offset)
         new = self.admit(waveform, imu, until).number
         expected = int(np.sum(self._driven(new)))
@@ -410,10 +422,12 @@ class SlotReceiver(Receiver):
     """Of coils driven in turn: each slot a row at its own time, judged by whole cycles."""
 
     _values: SlotValues  # of those that the phasors of later ones need
+    _followed: float  # when the grid was last compared with the stream (s)
 
     def __init__(self, site: Site, settings: LockinSettings | SlotSettings | None = None) -> None:
         super().__init__(site)
         self._given, self._values = settings, SlotValues.none()
+        self._followed = -np.inf
 
     @cached_property
     def settings(self) -> SlotSettings:
@@ -436,6 +450,14 @@ class SlotReceiver(Receiver):
         slots = schedule(self.site)
         rate_hz = sample_rate_hz(waveform)
         check_carriers(self.site, rate_hz, self.settings)
+        if is_searched(self.site):
+            start = slot_start(waveform, self.site, rate_hz)
+            if start is None:
+                raise InputError(
+                    "magnetometer: the time slots are not found in the stream; bring the sensor"
+                    " nearer, or give the log's clock (synchronised: true, with start_s)"
+                )
+            slots, self._followed = replace(slots, start=start), float(waveform.time[-1])
         grid = Grid(
             centre=slots.start + 0.5 * slots.duration,
             step=slots.duration,
@@ -470,8 +492,30 @@ class SlotReceiver(Receiver):
         found = found.rows(number >= since)
         seen = len(found)
         if seen and self.joined and joins(self.site):
-            found = cycles(found, turn, self.site)
+            found = cycles(found, turn, self.timed)
         return found, seen
+
+    @property
+    def timed(self) -> Site:
+        """The site with the schedule as it was found in the stream."""
+        if self.grid is None or not is_searched(self.site):
+            return self.site
+        return with_start(self.site, self.grid.centre - 0.5 * self.grid.step)
+
+    def _follow(self, waveform: Waveform) -> None:
+        """Bring the slots to where the stream shows them, half the way: a look is noisy."""
+        newest = float(waveform.time[-1])
+        if newest < self._followed + FOLLOWED_EVERY or not is_searched(self.site):
+            return
+        assert self.grid is not None
+        assert self.admission is not None
+        self._followed = newest
+        start = slot_start(waveform, self.site, 1.0 / self.admission.magnetometer_step)
+        if start is not None:
+            cycle, centre = self.grid.step * self.grid.together, self.grid.centre
+            late = (start + 0.5 * self.grid.step - centre + 0.5 * cycle) % cycle - 0.5 * cycle
+            if abs(late) < 0.5 * self.grid.step:
+                self.grid = replace(self.grid, centre=centre + 0.5 * late)
 
     def _held(self, waveform: Waveform, turn: Turn, windows: Windows, site: Site) -> SlotValues:
         assert self.admission is not None

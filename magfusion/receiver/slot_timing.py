@@ -1,0 +1,113 @@
+"""When the slots of a tracker begin whose clock nobody knows, by what the stream shows of them.
+
+Folded at the cycle, the size of the carrier is a step in each slot: the slots begin where steps fit
+best, and the silent ones say which is which.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.model.samples import Waveform
+from magfusion.model.site import Site, Slots
+from magfusion.receiver.slots import carriers_hz, is_pulsed, owners, schedule
+from magfusion.units import AnyArray, Array
+
+BINS = 32  # of a slot
+FEWEST_CYCLES = 4
+LONGEST_FOLD = 0.3  # s; clocks that are 100 ppm apart drift by 30 us
+STEADY_CYCLES = 4  # of the carrier, over which the mean is the steady field
+LOUDEST_SILENCE = 0.4  # of the weakest driven slot
+
+
+def is_searched(site: Site) -> bool:
+    """Return whether the stream is to tell when a cycle begins.
+
+    The schedule's clock is then not the log's, and the silent slots, beside a carrier, are told
+    from each other by their places.
+    """
+    if is_pulsed(site) or all(beacon.synchronised for beacon in site.beacons):
+        return False
+    slots = schedule(site)
+    silent = owners(site, slots) < 0
+    alike = [np.array_equal(np.roll(silent, k), silent) for k in range(1, slots.count)]
+    return not any(alike)
+
+
+def with_start(site: Site, start: float) -> Site:
+    """Return a site whose schedule begins at a time (s)."""
+    beacons = tuple(
+        b if b.slots is None else replace(b, slots=replace(b.slots, start=start))
+        for b in site.beacons
+    )
+    return replace(site, beacons=beacons)
+
+
+def slot_start(waveform: Waveform, site: Site, rate_hz: float) -> float | None:
+    """Return when a cycle begins (s), the first in the samples; None where they do not tell.
+
+    Parameters
+    ----------
+    waveform : Waveform
+        Its end counts.
+    rate_hz : float
+        Usual sampling rate.
+    """
+    slots = schedule(site)
+    longest = max(LONGEST_FOLD, 2.0 * FEWEST_CYCLES * slots.cycle)
+    part = waveform.time >= waveform.time[-1] - longest
+    time, measured = waveform.time[part], waveform.measured_sensor[part]
+    if time[-1] - time[0] < FEWEST_CYCLES * slots.cycle:
+        return None
+    folded = _folded(time, measured, site, slots, rate_hz)
+    if folded is None:
+        return None
+    n = len(folded)
+    total = np.concatenate([[0.0], np.cumsum(np.concatenate([folded, folded]))])
+    window = total[BINS : BINS + n] - total[:n]  # sum of a slot that begins in each bin
+    steps = np.add.reduce([np.roll(window, -k * BINS)[:BINS] ** 2 for k in range(slots.count)])
+    best = int(np.argmax(steps))
+    level = window[best::BINS][: slots.count] / BINS
+    silent = owners(site, slots) < 0
+    fits = []
+    for k in range(slots.count):
+        turned = np.roll(level, -k)
+        fits.append(float(np.max(turned[silent]) / np.min(turned[~silent])))
+    first = int(np.argmin(fits))
+    if fits[first] > LOUDEST_SILENCE:
+        return None
+    before, here, after = (steps[(best + k) % BINS] for k in (-1, 0, 1))
+    bend = before - 2.0 * here + after
+    fraction = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+    phase = (first * BINS + best + fraction) / n * slots.cycle
+    return float(time[0] + phase)
+
+
+def _folded(time: Array, measured: Array, site: Site, slots: Slots, rate_hz: float) -> Array | None:
+    """Return the mean size of the carriers in each bin of the cycle, from the first sample on."""
+    size = np.zeros(len(time))
+    for carrier_hz in np.unique(carriers_hz(site, slots)):
+        carried = _alone(measured, round(rate_hz * STEADY_CYCLES / carrier_hz))
+        carried = carried * np.exp(-2j * np.pi * carrier_hz * time)[:, None]
+        length = max(2, round(rate_hz * max(2.0 / carrier_hz, slots.duration / 16.0)))
+        size += np.linalg.norm(_mean_about(carried, length), axis=1)
+    bins = np.floor((time - time[0]) / slots.cycle % 1.0 * slots.count * BINS).astype(np.int64)
+    bins = np.minimum(bins, slots.count * BINS - 1)
+    count = np.bincount(bins, minlength=slots.count * BINS)
+    if np.any(count == 0):
+        return None
+    return np.asarray(np.bincount(bins, size, minlength=slots.count * BINS) / count)
+
+
+def _alone(measured: Array, length: int) -> Array:
+    """Return samples without what is steady over so many of them."""
+    return np.asarray(measured - _mean_about(measured, length))
+
+
+def _mean_about(values: AnyArray, length: int) -> AnyArray:
+    """Return the mean of an odd number of samples about each, of fewer at the ends."""
+    half, count = length // 2, len(values)
+    total = np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
+    index = np.arange(count)
+    low, high = np.maximum(index - half, 0), np.minimum(index + half + 1, count)
+    return np.asarray((total[high] - total[low]) / (high - low)[:, None])

@@ -1,0 +1,89 @@
+"""Slots of a clock of its own, found in the stream and followed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from time_slots_and_mains import tracker
+
+from magfusion.model.samples import ImuSamples, Waveform
+from magfusion.model.site import Site, Slots
+from magfusion.receiver.receiver import SlotReceiver
+from magfusion.receiver.slot_timing import is_searched, slot_start
+
+SLOTS = Slots(1.0 / 480.0, 4)
+RATE_HZ = 20e3
+
+
+def _free(carrier_hz: float, slots: Slots = SLOTS) -> Site:
+    site = tracker(carrier_hz, slots)
+    return replace(site, beacons=(replace(site.beacons[0], synchronised=False),))
+
+
+def _stream(
+    carrier_hz: float, start: float, ppm: float, duration: float, signal: float = 1e-7
+) -> Waveform:
+    """Return coils that are driven by a clock of their own, in the Earth field and hum."""
+    rng = np.random.default_rng(4)
+    time = 1.0 + np.arange(int(duration * RATE_HZ)) / RATE_HZ
+    own = (time - start) * (1.0 + 1e-6 * ppm)
+    slot = np.floor(own / SLOTS.duration).astype(int) % 4
+    field = signal * np.vstack([rng.standard_normal((3, 3)), np.zeros((1, 3))])
+    driven = field[slot] * np.cos(2.0 * np.pi * carrier_hz * own)[:, None]
+    hum = 1.5e-7 * np.cos(2.0 * np.pi * 50.0 * time)[:, None] * [0.6, 0.0, 0.8]
+    noise = 3e-9 * rng.standard_normal((len(time), 3))
+    return Waveform(time, driven + hum + noise + [2e-5, 1e-5, 4e-5])
+
+
+def _late(found: float, start: float) -> float:
+    """Return by how much a cycle is found late (s)."""
+    return (found - start + 0.5 * SLOTS.cycle) % SLOTS.cycle - 0.5 * SLOTS.cycle
+
+
+@pytest.mark.parametrize("start", [0.0, 1.3e-3, 5.1e-3, 7.7e-3])
+@pytest.mark.parametrize("carrier_hz", [2e3, 6e3])
+def test_a_cycle_is_found_under_hum_in_the_earth_field(carrier_hz: float, start: float) -> None:
+    found = slot_start(_stream(carrier_hz, start, 0.0, 0.3), _free(carrier_hz), RATE_HZ)
+    assert found is not None
+    # A quarter of a carrier's cycle, and a sample.
+    assert abs(_late(found, start)) < 0.25 / carrier_hz + 1.0 / RATE_HZ
+
+
+def test_where_no_coil_is_driven_none_is_found() -> None:
+    assert slot_start(_stream(6e3, 0.0, 0.0, 0.3, signal=0.0), _free(6e3), RATE_HZ) is None
+
+
+@pytest.mark.parametrize(
+    ("site", "searched"),
+    [
+        (tracker(6e3, SLOTS), False),
+        (_free(6e3), True),
+        (_free(0.0), False),  # pulses have no carrier
+        (_free(6e3, Slots(1e-3, 3)), False),  # none is silent
+        (_free(6e3, Slots(1e-3, 6)), True),
+    ],
+)
+def test_only_what_a_stream_can_tell_is_searched(site: Site, searched: bool) -> None:
+    assert is_searched(site) is searched
+
+
+def test_a_clock_that_runs_away_is_followed() -> None:
+    site, ppm = _free(6e3), 100.0
+    waveform = _stream(6e3, 2.2e-3, ppm, 4.0)
+    time = np.arange(0.9, 5.2, 2e-3)
+    imu = ImuSamples(time, np.zeros((len(time), 3)), np.zeros((len(time), 3)))
+    receiver, late, parts = SlotReceiver(site), [], []
+    receiver.begin(Waveform(waveform.time[:8000], waveform.measured_sensor[:8000]), imu)
+    for end in range(8000, len(waveform), 2000):
+        come = Waveform(waveform.time[:end], waveform.measured_sensor[:end])
+        parts.append(receiver.push(come, imu, float(come.time[-1])))
+        assert receiver.grid is not None
+        begin = receiver.grid.centre - 0.5 * SLOTS.duration
+        now = float(come.time[-1])
+        begin += np.round((now - begin) / SLOTS.cycle) * SLOTS.cycle
+        own = (begin - 2.2e-3) * (1.0 + 1e-6 * ppm)
+        late.append(_late(own, 0.0))
+    # In four seconds the clock runs a fifth of a slot away.
+    assert np.max(np.abs(late)) < 0.05 * SLOTS.duration
+    size = np.concatenate([np.linalg.norm(p.phasor_sensor, axis=2) for p in parts])
+    assert np.nanmax(np.nanstd(size, axis=0) / np.nanmean(size, axis=0)) < 0.02
