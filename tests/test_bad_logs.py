@@ -11,10 +11,12 @@ import pytest
 from example_log import EPOCH_NS, example_log
 
 from magfusion.errors import InputError
+from magfusion.files.fields import read_fields, write_fields
 from magfusion.files.log import read_log, write_log
 from magfusion.files.parquet_bounds import MOST_ROWS
 from magfusion.files.plausible import check_imu
-from magfusion.model.samples import ImuSamples
+from magfusion.files.table import Span
+from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.units import Array
 
 
@@ -194,6 +196,27 @@ def test_a_bad_directory_is_refused_by_name(
     with pytest.raises(InputError, match=rf"walk.*{sentence}") as caught:
         read_log(tmp_path / "walk")
     assert str(caught.value).count("\n") == 0
+
+
+@pytest.mark.parametrize("value", [0.0, float("nan")])
+def test_a_component_that_measured_nothing_is_no_zero(tmp_path: Path, value: float) -> None:
+    """The receive coil of one axis: what it leaves open must not be taken for a field."""
+    log = example_log()
+    assert log.fields is not None
+    phasor = np.resize(log.fields.phasor_sensor.ravel(), (20, 1, 3)) + (1.0 + 2.0j) * 1e-9
+    cov = np.broadcast_to(1e-20 * np.eye(3), (20, 1, 3, 3)).copy()
+    time, window, channels = np.arange(20.0), np.full(20, 0.5), (("A", 0),)
+    fields = FieldSamples(time, window, channels, np.nan_to_num(phasor, nan=1e-9), cov)
+    write_fields(fields, tmp_path / "fields.parquet", 0)
+    assert len(read_fields(tmp_path / "fields.parquet", Span(0))) == 20
+
+    def one_axis(columns: dict[str, Any]) -> None:
+        for name in ("re_y", "re_z", "im_y", "im_z"):
+            columns[name] = [value] * 20
+
+    _rewrite(tmp_path / "fields.parquet", one_axis)
+    with pytest.raises(InputError, match="re_y, im_y, re_z, im_z measured nothing"):
+        read_fields(tmp_path / "fields.parquet", Span(0))
 
 
 def test_a_path_that_is_no_directory_is_refused(tmp_path: Path) -> None:

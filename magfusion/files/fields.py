@@ -17,6 +17,7 @@ _REAL = ("re_x", "re_y", "re_z")
 _IMAGINARY = ("im_x", "im_y", "im_z")
 _UPPER = np.triu_indices(3)
 _COV = tuple(f"cov_{'xyz'[i]}{'xyz'[j]}" for i, j in zip(*_UPPER, strict=True))
+LEAST_ROWS = 8  # fewer may be zero in a component by their pose
 _LAYOUT = Layout(
     numbers=(*_REAL, *_IMAGINARY, "sigma", "window"),
     integers=(TIME, "tone"),
@@ -52,10 +53,11 @@ def read_fields(path: Path, span: Span) -> FieldSamples:
     ------
     InputError
         As `read_table`; or where a number is not finite, a channel has two rows in one window,
-        the rows of one window differ in its length, or a sigma, window or covariance is not
-        positive.
+        the rows of one window differ in its length, a sigma, window or covariance is not
+        positive, or a component measured nothing in any row.
     """
     table = read_table(path, _LAYOUT, span)
+    _refuse_blind(table, path)
     channels, column = _channels(table)
     time_ns, first, row = np.unique(table.time_ns, return_index=True, return_inverse=True)
     cell = row * len(channels) + column
@@ -96,6 +98,21 @@ def order_channels(fields: FieldSamples, site: Site) -> FieldSamples:
     phasor[:, present] = fields.phasor_sensor[:, source]
     cov[:, present] = fields.phasor_cov[:, source]
     return replace(fields, channels=site.channels, phasor_sensor=phasor, phasor_cov=cov)
+
+
+def _refuse_blind(table: Table, path: Path) -> None:
+    """Refuse what a receiver of one or two axes leaves: no number, or a zero that is none."""
+    parts = np.stack([table.numbers(names, nan=True) for names in (_REAL, _IMAGINARY)])
+    blind = np.all((parts == 0.0) | np.isnan(parts), axis=(0, 1))
+    if len(table) < LEAST_ROWS or not np.any(blind) or np.all(blind):
+        return
+    axes = [axis for axis, none in zip("xyz", blind, strict=True) if none]
+    names = ", ".join(f"re_{axis}, im_{axis}" for axis in axes)
+    raise InputError(
+        f"{path}: {names} measured nothing (zero or NaN in every row): no pose is found by a"
+        " receiver of one or two axes, and zeros would be taken for fields; give all three"
+        " components."
+    )
 
 
 def _channels(table: Table) -> tuple[tuple[tuple[str, int], ...], IntArray]:
