@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.estimation.integrity.held import COVERED, Freed, finding_of, freed_by
+from magfusion.estimation.integrity.held import COVERED, Freed, finding_of, freed_by, gains
 from magfusion.estimation.integrity.judgement import Judgement
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.statistics import SURE
@@ -74,6 +74,10 @@ class OnlineScore:
     ) -> None:
         self.site, self.held = site, held_blocks(site, estimated, steady=steady)
         self.suspects = tuple(suspects(site, self.held))
+        most = max((one.combine.shape[1] for one in self.suspects), default=0)
+        self._combine = np.zeros((len(self.suspects), dimension(self.held), most))
+        for room, one in zip(self._combine, self.suspects, strict=True):
+            room[:, : one.combine.shape[1]] = one.combine
         self.unit, self.size = prior_sigma(self.held), MOTION + dimension(estimated)
         at = MOTION + dimension((*estimated, *considered))
         self.blocks = tuple(
@@ -199,7 +203,11 @@ class OnlineScore:
             self.held, information, sums.gradient, self.spread, by[None, :MOTION], by[MOTION:]
         )
         information, gradient = score.with_declared()
-        found = (freed_by(pose_cov, score, s, information, gradient) for s in self.suspects)
+        asked = np.flatnonzero(gains(self._combine, information, gradient) > 0.0)
+        found = (
+            freed_by(pose_cov, score, self.suspects[k], information, gradient)
+            for k in asked.tolist()
+        )
         likely = [one for one in found if one is not None and _speaks(one)]
         if not likely:
             return Judgement()
