@@ -32,11 +32,13 @@ from magfusion.estimation.propagation import Propagated, propagate
 from magfusion.estimation.state import State
 from magfusion.estimation.state_of_now import CarriedState, Said, StateOfNow
 from magfusion.estimation.still_samples import StillSamples
+from magfusion.estimation.warming import heard_at_reference, heard_fields_at_reference
 from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
 from magfusion.model.parameters import dimension, placed
 from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.samples import FieldSamples, SteadyFields
 from magfusion.model.site import Site
+from magfusion.model.temperature import Temperatures
 from magfusion.model.without_imu import on_motion_prior, require_motion_prior
 from magfusion.receiver.receiver import Receiver
 from magfusion.units import Array
@@ -70,6 +72,8 @@ class Navigator:
         if site.platform.imu == NO_IMU:
             site = on_motion_prior(site)
         require_motion_prior(site)
+        if site.temperatures is None:
+            site = replace(site, temperatures=Temperatures())
         self.site, self._still = site, StillSamples()
         self.settings = NavigatorSettings() if settings is None else settings
         if self.settings.earth:
@@ -130,9 +134,16 @@ class Navigator:
         InputError
             Where a number is not finite or the clock jumped.
         """
-        self._arrived.add_magnetometer(time, measured_sensor)
+        known, sensor = self.site.temperatures, self.site.platform.magnetometer
+        samples = heard_at_reference(known, sensor, time, measured_sensor)
+        self._arrived.add_magnetometer(time, samples)
         self._stand_still(np.atleast_1d(time), raw=True)
         self.advance()
+
+    def add_temperature(self, part: str, time: float, degc: float) -> None:
+        """Take the temperature of a beacon, or of the ``magnetometer``: of what comes after it."""
+        assert self.site.temperatures is not None
+        self.site.temperatures.hear(part, time, degc)
 
     def add_fields(self, samples: FieldSamples, steady: SteadyFields | None = None) -> None:
         """Take demodulated phasors, channels in the site's order, and the steady fields with them.
@@ -142,6 +153,8 @@ class Navigator:
         InputError
             Where the clock jumped.
         """
+        known, sensor = self.site.temperatures, self.site.platform.magnetometer
+        samples = heard_fields_at_reference(known, sensor, samples)
         after = -np.inf if self._estimator is None else self._estimator.state.time
         late = self._arrived.add_fields(samples, steady if self.settings.earth else None, after)
         if late:

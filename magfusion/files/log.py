@@ -18,6 +18,7 @@ from magfusion.files.inertial_tables import (
     write_waveform,
 )
 from magfusion.files.table import LARGEST_TIME_NS, Span, find_table
+from magfusion.files.temperature_table import read_temperatures, write_temperatures
 from magfusion.files.trajectory_table import read_trajectory, write_trajectory
 from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
 from magfusion.model.samples import ImuSamples, Log
@@ -26,7 +27,7 @@ from magfusion.model.trust import Finding
 
 HEADER = "log.yaml"
 _NOTHING: tuple[Finding, ...] = ()
-STREAMS = ("imu", "magnetometer", "fields", "truth")
+STREAMS = ("imu", "magnetometer", "fields", "truth", "temperature")
 
 
 class LogHeader(StrictModel):
@@ -90,6 +91,7 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
         fields=read_if_there(tables["fields"], read_fields, span),
         truth=read_if_there(tables["truth"], _read_truth, span),
         noticed=(*of_imu, *of_waveform),
+        temperatures=read_temperatures(tables["temperature"], header.epoch_ns),
     )
     if log.waveform is None and log.fields is None:
         raise InputError(f"{path}: holds no field {span}; choose a span that the log covers.")
@@ -121,6 +123,9 @@ def write_log(log: Log, path: Path) -> None:
             write_fields(log.fields, unfinished / "fields.parquet", log.epoch_ns)
         if log.truth is not None:
             write_trajectory(log.truth, unfinished / "truth.parquet", log.epoch_ns)
+        if log.temperatures is not None and log.temperatures.readings:
+            known = log.temperatures
+            write_temperatures(known, unfinished / "temperature.parquet", log.epoch_ns)
 
 
 def _keep_others(former: Path, directory: Path) -> None:

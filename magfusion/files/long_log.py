@@ -14,8 +14,10 @@ from magfusion.files.log import HEADER, LogHeader, is_log
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.table import LONGEST_GAP, Span, find_table
 from magfusion.files.table_stream import Piece, pieces
+from magfusion.files.temperature_table import read_temperatures
 from magfusion.files.yaml_files import read_yaml
 from magfusion.model.samples import FieldSamples, ImuSamples
+from magfusion.model.temperature import Temperatures
 from magfusion.units import Array
 
 LONG = 1 << 20  # rows; a shorter stream is read whole
@@ -105,11 +107,13 @@ class LongLog:
     ----------
     fields : FieldSamples, optional
         Phasors of a table of them, which are few.
+    temperatures : Temperatures, optional
     """
 
     path: Path
     span: Span
     fields: FieldSamples | None
+    temperatures: Temperatures | None = None
 
     def imu(self) -> Samples:
         """Return the inertial stream from its beginning: rate, then specific force."""
@@ -145,7 +149,8 @@ def long_log(path: Path, start: float | None = None, end: float | None = None) -
         return None  # which is refused where it is read whole
     span = Span(read_yaml(path / HEADER, LogHeader).epoch_ns, start, end)
     fields = read_if_there(tables["fields"], read_fields, span)
-    return LongLog(path, span, fields)
+    temperatures = read_temperatures(find_table(path, "temperature"), span.epoch_ns)
+    return LongLog(path, span, fields, temperatures)
 
 
 def _rows(path: Path, stream: str) -> int:

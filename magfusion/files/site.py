@@ -21,6 +21,7 @@ from magfusion.files.site_schema import (
     MagnetometerEntry,
     SiteEntry,
 )
+from magfusion.files.site_warming import warming_entry
 from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
 from magfusion.model.field_map import FieldMap
 from magfusion.model.physics.earth import earth_field_world
@@ -200,6 +201,7 @@ def _beacon(entry: BeaconEntry) -> Beacon:
         model_error=entry.model_error,
         noise_factor=entry.noise_factor,
         hemisphere_beacon=entry.hemisphere,
+        warming=None if entry.warming is None else entry.warming.warming(),
         sigma=BeaconSigma(
             position_world=sigma.position_m,
             rotation_beacon=sigma.rotation_deg * DEGREE,
@@ -219,6 +221,7 @@ def _magnetometer(entry: MagnetometerEntry) -> Magnetometer:
         coil_centres_sensor=entry.coil_centres_m,
         offset_walk=entry.offset_walk_t,
         coil_kappa=entry.coil_kappa_m2,
+        warming=None if entry.warming is None else entry.warming.warming(),
     )
 
 
@@ -330,7 +333,7 @@ def _noise_entry(beacon: Beacon) -> dict[str, Any]:
         entry["noise_factor"] = float(beacon.noise_factor)
     if beacon.hemisphere_beacon is not None:
         entry["hemisphere"] = _plain(beacon.hemisphere_beacon)
-    return entry
+    return entry | warming_entry(beacon.warming)
 
 
 def _slots_entry(beacon: Beacon) -> dict[str, Any]:
@@ -364,18 +367,22 @@ def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
         own["coil_kappa_m2"] = float(magnetometer.coil_kappa)
     if magnetometer.offset_walk != Magnetometer.offset_walk:
         own["offset_walk_t"] = float(magnetometer.offset_walk)
-    return own | {
-        "body_from_sensor": {
-            "position_m": _plain(magnetometer.position_body),
-            "rpy_deg": _rpy_deg(magnetometer.body_from_sensor),
-        },
-        "noise_density_t_rthz": float(magnetometer.noise_density),
-        "matrix": _plain(magnetometer.matrix),
-        "offset_t": _plain(magnetometer.offset),
-        "sigma": {
-            "matrix": _sigma_entry(sigma.matrix),
-            "offset_t": _sigma_entry(sigma.offset),
-            "rotation_deg": _degree_sigma_entry(sigma.rotation_sensor),
-            "position_m": _sigma_entry(sigma.position_body),
-        },
-    }
+    return (
+        own
+        | warming_entry(magnetometer.warming)
+        | {
+            "body_from_sensor": {
+                "position_m": _plain(magnetometer.position_body),
+                "rpy_deg": _rpy_deg(magnetometer.body_from_sensor),
+            },
+            "noise_density_t_rthz": float(magnetometer.noise_density),
+            "matrix": _plain(magnetometer.matrix),
+            "offset_t": _plain(magnetometer.offset),
+            "sigma": {
+                "matrix": _sigma_entry(sigma.matrix),
+                "offset_t": _sigma_entry(sigma.offset),
+                "rotation_deg": _degree_sigma_entry(sigma.rotation_sensor),
+                "position_m": _sigma_entry(sigma.position_body),
+            },
+        }
+    )

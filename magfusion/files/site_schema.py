@@ -40,6 +40,7 @@ from magfusion.files.site_values import (
     sigma_array,
     tesla,
 )
+from magfusion.files.site_warming import SensorWarmingEntry, WarmingEntry
 from magfusion.files.yaml_files import StrictModel
 from magfusion.model.physics.winding import Winding, WoundCoil, wound_coil
 from magfusion.model.site import (
@@ -237,6 +238,7 @@ class BeaconEntry(StrictModel):
     model_error: _Share | None = None
     noise_factor: _Positive = Beacon.noise_factor
     hemisphere: Annotated[Array, array(3), AfterValidator(a_direction)] | None = None
+    warming: WarmingEntry | None = None
     sigma: BeaconSigmaEntry = Field(default_factory=BeaconSigmaEntry)
 
     @model_validator(mode="after")
@@ -323,6 +325,7 @@ class MagnetometerEntry(StrictModel):
     coil_centres_m: Annotated[Array, array(3, 3, largest=10.0, unit="m")] | None = None
     coil_kappa_m2: Annotated[float, between(-1.0, 1.0)] = Magnetometer.coil_kappa
     offset_walk_t: Annotated[_NotNegative, tesla(LARGEST_OFFSET)] = 2e-8  # gained in an hour
+    warming: SensorWarmingEntry | None = None
     sigma: MagnetometerSigmaEntry = Field(default_factory=MagnetometerSigmaEntry)
 
 

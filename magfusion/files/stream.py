@@ -13,6 +13,7 @@ from pydantic import ConfigDict, Field, PlainValidator, ValidationError, model_v
 from pydantic_core import PydanticCustomError
 
 from magfusion.errors import InputError
+from magfusion.files.site_warming import COLDEST, HOTTEST
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS
 from magfusion.files.yaml_files import StrictModel, sentence
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
@@ -146,17 +147,28 @@ class FieldsRecord(_Arrays):
         return self
 
 
+class TemperatureRecord(StrictModel):
+    """Temperatures (degrees Celsius) of beacons, or of the ``magnetometer``, from a time on."""
+
+    time: float = Field(ge=-LATEST, le=LATEST)
+    degc: dict[str, Annotated[float, Field(ge=COLDEST, le=HOTTEST)]]
+
+
 class Record(StrictModel):
     """One line of the stream; it may hold several kinds of samples."""
 
     imu: ImuRecord | None = None
     magnetometer: MagnetometerRecord | None = None
     fields: FieldsRecord | None = None
+    temperature: TemperatureRecord | None = None
 
     @model_validator(mode="after")
     def _not_empty(self) -> "Record":
-        if self.imu is None and self.magnetometer is None and self.fields is None:
-            raise PydanticCustomError("empty", "it should hold imu, magnetometer or fields")
+        if all(
+            part is None for part in (self.imu, self.magnetometer, self.fields, self.temperature)
+        ):
+            kinds = "imu, magnetometer, fields or temperature"
+            raise PydanticCustomError("empty", "it should hold {kinds}", {"kinds": kinds})
         return self
 
 
@@ -305,6 +317,11 @@ def magnetometer_content(waveform: Waveform) -> dict[str, Any]:
     """Return raw samples of the magnetometer as a record."""
     field = waveform.measured_sensor.tolist()
     return {"magnetometer": {"time": waveform.time.tolist(), "field": field}}
+
+
+def temperature_content(time: float, part: str, degc: float) -> dict[str, Any]:
+    """Return a temperature as a record."""
+    return {"temperature": {"time": time, "degc": {part: degc}}}
 
 
 def fields_content(samples: FieldSamples) -> dict[str, Any]:

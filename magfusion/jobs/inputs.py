@@ -10,6 +10,7 @@ from pathlib import Path
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.integrity.mending import mended
+from magfusion.estimation.warming import at_reference
 from magfusion.files.atomic import (
     abandoned_pattern,
     real,
@@ -263,7 +264,7 @@ def read_job(
     if log.fields is not None:
         with named(job.log_path):
             log = replace(log, fields=order_channels(log.fields, site))
-    return log, site
+    return at_reference(log, site)
 
 
 def require_imu(job: Job, log: Log, what: str) -> None:

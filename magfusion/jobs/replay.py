@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, BinaryIO
@@ -154,11 +155,17 @@ def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool)
         fields_content,
         imu_content,
         magnetometer_content,
+        temperature_content,
         write_record,
     )
+    from magfusion.model.temperature import Temperatures
 
     pieces = _of_long(log) if isinstance(log, LongLog) else Replay(log).pieces()
+    degrees = log.temperatures or Temperatures()
+    readings = deque(sorted(degrees.each()))
     for _, piece in paced(pieces, realtime):
+        while readings and readings[0][0] < piece.arrival:
+            write_record(temperature_content(*readings.popleft()), sink, form)
         if len(piece.imu):
             write_record(imu_content(piece.imu), sink, form)
         if piece.waveform is not None and len(piece.waveform):

@@ -177,6 +177,9 @@ def _take_in(
     if numbered.record is None:
         raise InputError(numbered.refusal)
     record, newest = numbered.record, -np.inf
+    if record.temperature is not None:
+        for part, degc in record.temperature.degc.items():
+            navigator.add_temperature(part, record.temperature.time, degc)
     if record.imu is not None:
         time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
         if len(time):

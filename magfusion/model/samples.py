@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from magfusion.model.temperature import Temperatures
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
@@ -202,7 +203,7 @@ class Log:
     ``steady`` goes with ``fields``, at the same times; no file holds it.  ``clocks`` says of which
     streams the stamps scatter, ``noticed`` what else was mended in it.  Where not ``inertial``, the
     samples of the IMU are those of a motion prior (`magfusion.model.without_imu`), and measured
-    nothing.
+    nothing.  ``temperatures`` are those of whatever the samples are not yet freed of.
     """
 
     name: str
@@ -216,3 +217,4 @@ class Log:
     clocks: Mapping[str, StreamClock] = field(default_factory=dict)
     noticed: tuple[Finding, ...] = ()
     inertial: bool = True
+    temperatures: Temperatures | None = None

@@ -13,6 +13,7 @@ from magfusion.model.platform_motion import A_HAND, MotionPrior, Replaced
 from magfusion.model.platform_motion import ImuModel as ImuModel
 from magfusion.model.platform_motion import MotionModel as MotionModel
 from magfusion.model.region import Bounds, Region, bounds_of
+from magfusion.model.temperature import SensorWarming, Temperatures, Warming
 from magfusion.units import Array, ComplexArray, IntArray
 
 Unknown = Literal["pose", "position", "attitude"]
@@ -121,6 +122,8 @@ class Beacon:
         Of its own field; the site's where it is None.
     noise_factor : float
         Noise of its phasors in units of what the receiver measures beside its tones.
+    warming : Warming, optional
+        How its moments change with temperature.
     hemisphere_beacon : ndarray, shape (3,), optional
         Direction, of any length, in front of which the magnetometer always is.
     """
@@ -138,6 +141,7 @@ class Beacon:
     model_error: float | None = None
     noise_factor: float = 1.0
     hemisphere_beacon: Array | None = None
+    warming: Warming | None = None
 
     @cached_property
     def tones(self) -> tuple[tuple[float, int | None], ...]:
@@ -256,6 +260,8 @@ class Magnetometer:
         Standard deviation that the offset gains in an hour (T).
     coil_kappa : float
         Finite size of each axis's coil (m^2, `magfusion.model.receive_coils`); zero for a point.
+    warming : SensorWarming, optional
+        How matrix and offset change with temperature.
     """
 
     position_body: Array
@@ -267,6 +273,7 @@ class Magnetometer:
     coil_centres_sensor: Array | None = None
     offset_walk: float = 2e-8
     coil_kappa: float = 0.0
+    warming: SensorWarming | None = None
 
 
 @dataclass(frozen=True)
@@ -325,6 +332,8 @@ class Site:
         Of the errors that the sigmas stand for; None where all are independent.
     region : Region, optional
         Where the magnetometer is, whatever the fields say.
+    temperatures : Temperatures, optional
+        Of its beacons, as a log or a stream has them.
     """
 
     gravity: float
@@ -339,6 +348,32 @@ class Site:
     earth: EarthModel = EarthModel()
     model_error_length: float = 0.5
     region: Region | None = None
+    temperatures: Temperatures | None = None
+
+    def warmed(self, time: Array) -> Array | None:
+        """Return by how much temperature raises the logarithm of each channel's moments.
+
+        Parameters
+        ----------
+        time : ndarray, shape (...)
+            (s)
+
+        Returns
+        -------
+        ndarray or None, shape (..., channels)
+            None where nothing is declared of it, or nothing measured.
+        """
+        known = self.temperatures
+        if known is None or all(beacon.warming is None for beacon in self.beacons):
+            return None
+        parts = []
+        for beacon in self.beacons:
+            degc = None if beacon.warming is None else known.at(beacon.name, time)
+            own = np.zeros(np.shape(time))
+            if beacon.warming is not None and degc is not None:
+                own = beacon.warming.log_moment_per_k * (degc - beacon.warming.reference_degc)
+            parts += [own] * len(beacon.tones)
+        return np.stack(parts, axis=-1)
 
     @cached_property
     def bounds(self) -> Bounds | None:

@@ -104,6 +104,7 @@ CODES = {
     "stuck_axis": "an axis stands still",
     "survey_axes": "the survey's axes are not those declared",
     "survey_overconfident": "the survey of the beacons is worse than its sigmas",
+    "temperature_missing": "what is declared to change with temperature has none recorded",
     "time_offset": "the IMU's time offset is not as declared",
     "transfer": "a calibration does not hold where it was not made",
     "undeclared_line": "something transmits that the site does not declare",

@@ -85,7 +85,7 @@ def _currents(calibration: Calibration, time: Array, carrier: ComplexArray) -> l
     """
     still = not np.any(calibration.drift)
     phase = calibration.phase if still else calibration.drive_phase(time)
-    drive = carrier * (np.exp(calibration.log_gain) * np.exp(1j * phase))
+    drive = carrier * (calibration.gain_at(time) * np.exp(1j * phase))
     of_beacon, start = [], 0
     for beacon in calibration.site.beacons:
         tones = slice(start, start + len(beacon.tones))

@@ -106,7 +106,7 @@ def _starts(problem: Problem) -> tuple[State, int]:
     site = problem.calibration.site
     sensor = site.platform.magnetometer
     raw = problem.measured[..., :3] + 1j * problem.measured[..., 3:]
-    raw = raw * np.exp(-problem.calibration.log_gain)[..., None]
+    raw = raw / problem.calibration.gain_at(problem.time)[..., None]
     phasor = raw @ np.linalg.inv(sensor.matrix).T
     weight = np.sum(problem.sqrt_information**2, axis=(-1, -2)) / 3.0
     beacons = {b.name: b.synchronised for b in site.beacons}

@@ -75,7 +75,7 @@ def predict_channels(
         phasor = predict(group.source, site.platform.magnetometer, *poses, group.of(phase))
         for tones, own in zip(group.tones, group.parted(phasor), strict=True):
             out[..., tones, :] = own
-    return np.asarray(np.exp(calibration.log_gain)[..., None] * out)
+    return np.asarray(calibration.gain_at(time)[..., None] * out)
 
 
 def linearize_channels(
@@ -130,9 +130,9 @@ def linearize_channels(
                 part = block.parameter.phasor_jacobian(view, block.owner)
                 if part is not None:
                     by_calibration[:, tones, :, block.columns] = _stacked(part)
-    if not np.any(calibration.log_gain):
+    gain = calibration.gain_at(time)[..., None]
+    if np.all(gain == 1.0):
         return value, by_pose, by_calibration
-    gain = np.exp(calibration.log_gain)[..., None]
     return gain * value, gain[..., None] * by_pose, gain[..., None] * by_calibration
 
 

@@ -64,6 +64,14 @@ class Calibration:
             return imu
         return replace(imu, time=imu.time + self.clock_rate * (imu.time - self.imu_begin))
 
+    def gain_at(self, time: Array) -> Array:
+        """Return what phasors are larger by than those of the site, shape (..., channels).
+
+        With what temperature does to the moments.
+        """
+        warmed = self.site.warmed(time)
+        return np.asarray(np.exp(self.log_gain if warmed is None else self.log_gain + warmed))
+
     def drive_phase(self, time: Array) -> Array:
         """Return the phase of every channel at the given times, shape (..., channels) (rad)."""
         owner = [i for i, b in enumerate(self.site.beacons) for _ in b.tones]

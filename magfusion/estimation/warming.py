@@ -1,0 +1,120 @@
+"""Logs and streams freed of what temperature does to them, as far as a site declares it.
+
+The magnetometer's samples are brought to the temperature for which its matrix and offset are
+declared; how the moments of beacons change is a part of the model.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.site import Magnetometer, Site
+from magfusion.model.temperature import MAGNETOMETER, Temperatures
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import Array
+
+AT_ONCE = 1 << 14  # samples whose matrix is made at a time
+
+
+def at_reference(log: Log, site: Site) -> tuple[Log, Site]:
+    """Return a log whose magnetometer was at its reference temperature, and the site with the rest.
+
+    A site that declares what a temperature changes and a log without it are noticed: the reference
+    is taken for it.
+    """
+    known = Temperatures() if log.temperatures is None else log.temperatures
+    log = replace(log, noticed=(*log.noticed, *_missing(known, site)))
+    site = replace(site, temperatures=known)
+    if MAGNETOMETER not in known.readings or site.platform.magnetometer.warming is None:
+        return log, site
+    wave, fields, sensor = log.waveform, log.fields, site.platform.magnetometer
+    if wave is not None:
+        samples = heard_at_reference(known, sensor, wave.time, wave.measured_sensor)
+        wave = replace(wave, measured_sensor=samples)
+    if fields is not None:
+        fields = heard_fields_at_reference(known, sensor, fields)
+    beacons = known.without(MAGNETOMETER)
+    log = replace(log, waveform=wave, fields=fields, temperatures=beacons)
+    return log, replace(site, temperatures=beacons)
+
+
+def _missing(known: Temperatures, site: Site) -> Iterator[Finding]:
+    declared = {b.name: f"beacon {b.name}" for b in site.beacons if b.warming is not None}
+    if site.platform.magnetometer.warming is not None:
+        declared[MAGNETOMETER] = "the magnetometer"
+    parts = [what for name, what in declared.items() if name not in known.readings]
+    if parts:
+        yield Finding(
+            "temperature_missing",
+            f"The site declares how {', '.join(parts)} changes with temperature, and nothing was"
+            " recorded of that: the temperature is taken for the one of reference. Record it in"
+            " temperature.parquet.",
+            Verdict.TRUSTWORTHY,
+        )
+
+
+def heard_at_reference(
+    known: Temperatures | None, magnetometer: Magnetometer, time: Array, measured: Array
+) -> Array:
+    """Return samples of a stream as of `samples_at_reference`, as far as its temperature is known.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    measured : ndarray, shape (n, 3)
+        (T)
+    """
+    if magnetometer.warming is None or known is None:
+        return measured
+    degc = known.at(MAGNETOMETER, time)
+    return measured if degc is None else samples_at_reference(measured, degc, magnetometer)
+
+
+def heard_fields_at_reference(
+    known: Temperatures | None, magnetometer: Magnetometer, fields: FieldSamples
+) -> FieldSamples:
+    """Return phasors of a stream as of `phasors_at_reference`, as `heard_at_reference`."""
+    if magnetometer.warming is None or known is None:
+        return fields
+    degc = known.at(MAGNETOMETER, fields.time)
+    return fields if degc is None else phasors_at_reference(fields, degc, magnetometer)
+
+
+def samples_at_reference(measured: Array, degc: Array, magnetometer: Magnetometer) -> Array:
+    """Return samples as the magnetometer would have taken them at its reference temperature.
+
+    Parameters
+    ----------
+    measured : ndarray, shape (n, 3)
+        (T)
+    degc : ndarray, shape (n,)
+    """
+    assert magnetometer.warming is not None
+    out = np.empty_like(measured)
+    for begin in range(0, len(measured), AT_ONCE):
+        rows = slice(begin, begin + AT_ONCE)
+        back, more = magnetometer.warming.to_reference(magnetometer.matrix, degc[rows])
+        beyond = measured[rows] - magnetometer.offset - more
+        out[rows] = (back @ beyond[..., None])[..., 0] + magnetometer.offset
+    return out
+
+
+def phasors_at_reference(
+    fields: FieldSamples, degc: Array, magnetometer: Magnetometer
+) -> FieldSamples:
+    """Return phasors as they would have been measured at the magnetometer's reference temperature.
+
+    Parameters
+    ----------
+    degc : ndarray, shape (n,)
+    """
+    assert magnetometer.warming is not None
+    back = magnetometer.warming.to_reference(magnetometer.matrix, degc)[0][:, None]
+    return replace(
+        fields,
+        phasor_sensor=(back @ fields.phasor_sensor[..., None])[..., 0],
+        phasor_cov=back @ fields.phasor_cov @ np.swapaxes(back, -1, -2),
+    )

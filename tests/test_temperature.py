@@ -1,0 +1,147 @@
+"""Coils and a magnetometer that warm up: declared, recorded, and taken off."""
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from warming import (
+    EVERY,
+    MATRIX_PER_K,
+    OFFSET_PER_K,
+    PER_K,
+    REFERENCE,
+    Config,
+    run,
+    warm_log,
+    warmer,
+    warming_site,
+)
+
+from magfusion.errors import InputError
+from magfusion.estimation.navigator import NavigatorSettings
+from magfusion.estimation.warming import at_reference, samples_at_reference
+from magfusion.files.log import read_log, write_log
+from magfusion.files.site import load_site, save_site
+from magfusion.jobs.replay import run_replay
+from magfusion.jobs.stream import StreamSettings, run_stream
+from magfusion.model.parameters import initial_calibration, predict_channels
+from magfusion.model.samples import Log
+from magfusion.model.temperature import Temperatures
+
+DURATION = 24.0  # s
+READINGS = np.arange(0.0, DURATION + EVERY, EVERY)  # s
+
+
+def warmth(time: np.ndarray) -> np.ndarray:
+    return REFERENCE + warmer(time)
+
+
+@pytest.fixture(scope="module")
+def warm() -> Log:
+    return warm_log(DURATION, 3)
+
+
+def test_a_warm_beacon_is_one_of_other_moments() -> None:
+    degrees = Temperatures({name: (READINGS, warmth(READINGS)) for name in "ABCD"})
+    site, time = replace(warming_site(), temperatures=degrees), np.array([7.25])
+    more = np.interp(7.25, READINGS, warmer(READINGS))
+    scaled = tuple(
+        replace(
+            b,
+            warming=None,
+            coils=tuple(
+                replace(c, moment_beacon=np.exp(PER_K * more) * c.moment_beacon) for c in b.coils
+            ),
+        )
+        for b in site.beacons
+    )
+    pose = np.eye(3)[None], np.array([[3.0, 2.0, 1.0]])
+    found, expected = (
+        predict_channels(initial_calibration(known, 0.0), time, *pose)
+        for known in (site, replace(site, beacons=scaled))
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert np.max(np.abs(np.exp(PER_K * more) - 1.0)) > 0.05
+
+
+def test_samples_are_those_of_the_reference() -> None:
+    rng, sensor = np.random.default_rng(1), warming_site().platform.magnetometer
+    sensor = replace(
+        sensor, matrix=np.eye(3) + 0.1 * rng.standard_normal((3, 3)), offset=np.full(3, 3e-6)
+    )
+    field, degc = 5e-5 * rng.standard_normal((40, 3)), rng.uniform(-20.0, 60.0, 40)
+    above = (degc - REFERENCE)[:, None]
+    matrix = sensor.matrix + above[..., None] * MATRIX_PER_K
+    measured = (matrix @ field[..., None])[..., 0] + sensor.offset + above * OFFSET_PER_K
+    found = samples_at_reference(measured, degc, sensor)
+    np.testing.assert_allclose(found, field @ sensor.matrix.T + sensor.offset, atol=1e-17)
+
+
+def test_log_and_site_keep_what_they_say(warm: Log, tmp_path: Path) -> None:
+    site = warming_site()
+    write_log(warm, tmp_path / "log")
+    save_site(site, tmp_path / "site.yaml")
+    known, log = load_site(tmp_path / "site.yaml"), read_log(tmp_path / "log", 5.0, 9.0)
+    assert known.beacons[1].warming == site.beacons[1].warming
+    assert known.platform.magnetometer.warming is not None
+    np.testing.assert_array_equal(known.platform.magnetometer.warming.matrix_per_k, MATRIX_PER_K)
+    assert log.temperatures is not None
+    assert set(log.temperatures.readings) == {"A", "B", "C", "D", "magnetometer"}
+    np.testing.assert_allclose(log.temperatures.readings["B"][1], warmth(READINGS))
+
+
+def test_a_temperature_in_kelvin_is_refused(tmp_path: Path, warm: Log) -> None:
+    write_log(replace(warm, temperatures=None), tmp_path / "log")
+    table = tmp_path / "log" / "temperature.csv"
+    begin = warm.epoch_ns
+    rows = f"{begin},A,20.5\n{begin + 10**9},A,-293.0\n"
+    table.write_text(f"time_ns,part,temperature_degc\n{rows}", encoding="utf-8")
+    with pytest.raises(InputError, match=r"temperature.csv: .*row 1 .*-293.*degrees Celsius"):
+        read_log(tmp_path / "log")
+
+
+def test_what_is_declared_and_not_recorded_is_said(warm: Log) -> None:
+    log, _ = at_reference(replace(warm, temperatures=None), warming_site())
+    (finding,) = [f for f in log.noticed if f.code == "temperature_missing"]
+    assert "beacon A" in finding.text
+    assert "the magnetometer" in finding.text
+    log, _ = at_reference(warm, warming_site())
+    assert not [f for f in log.noticed if f.code == "temperature_missing"]
+
+
+@pytest.mark.slow
+def test_a_warm_log_is_as_good_as_a_cold_one() -> None:
+    rows = {(row.site, row.estimator): row for row in run(Config(DURATION))}
+    smooth, online = (rows["declared", name] for name in ("smooth", "navigate (ekf)"))
+    assert smooth.verdict == online.verdict == "trustworthy"
+    assert smooth.position_mm < 2.0
+    assert online.position_mm < 5.0
+    for row in (rows["not declared", name] for name in ("smooth", "navigate (ekf)")):
+        assert row.verdict != "trustworthy"
+        assert row.position_mm > 50.0
+
+
+@pytest.mark.slow
+def test_the_pipe_hears_what_the_log_has(warm: Log, tmp_path: Path) -> None:
+    save_site(warming_site(), tmp_path / "site.yaml")
+    write_log(warm, tmp_path / "log")
+    given, told = io.BytesIO(), io.StringIO()
+    run_replay(read_log(tmp_path / "log", None, 9.0), given, "json", realtime=False)
+    assert given.getvalue().count(b'"temperature"') > 10
+    states = {}
+    for name, records in (
+        ("heard", given.getvalue()),
+        ("deaf", b"".join(r for r in given.getvalue().splitlines(True) if b"degc" not in r)),
+    ):
+        sink = io.BytesIO()
+        settings = StreamSettings(NavigatorSettings("ekf"))
+        run_stream(tmp_path / "site.yaml", settings, io.BytesIO(records), sink, told)
+        lines = [json.loads(line) for line in sink.getvalue().splitlines()]
+        last = [line for line in lines if line["started"]][-1]
+        where = warm.truth.position_world[np.argmin(np.abs(warm.truth.time - last["time"]))]
+        states[name] = float(np.linalg.norm(np.array(last["position"]) - where))
+    assert states["heard"] < 0.005  # m
+    assert states["deaf"] > 0.02  # m
