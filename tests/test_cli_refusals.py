@@ -71,7 +71,7 @@ def test_a_truncated_or_empty_table_is_refused_by_name(
 
 
 @pytest.mark.parametrize("job", JOBS)
-@pytest.mark.parametrize("missing", ["", "log.yaml", "imu.parquet", "magnetometer.parquet"])
+@pytest.mark.parametrize("missing", ["", "log.yaml", "magnetometer.parquet"])
 def test_a_missing_file_is_refused_by_name(
     job: str, missing: str, log: Path, tmp_path: Path, refuse: Refuse
 ) -> None:
@@ -82,6 +82,16 @@ def test_a_missing_file_is_refused_by_name(
     sentence = refuse(job, log, "-o", tmp_path / "run")
     assert str(log) in sentence
     assert missing in sentence
+
+
+def test_a_missing_inertial_stream_is_refused_where_it_is_needed(
+    log: Path, tmp_path: Path, refuse: Refuse
+) -> None:
+    (log / "imu.parquet").unlink()
+    sentence = refuse("smooth", log, "-o", tmp_path / "run")
+    assert str(log) in sentence
+    assert "inertial samples (imu.parquet)" in sentence
+    assert "motion_prior" in sentence
 
 
 @pytest.mark.parametrize("job", JOBS)

@@ -98,6 +98,15 @@ def test_a_site_without_a_field_is_refused(attached):
         OrientationFilter(replace(site, earth_field_world=None))
 
 
+def test_what_needs_a_position_is_refused(attached, tmp_path, refuse):
+    log, site = attached
+    write_log(log, tmp_path / "log")
+    save_site(site, tmp_path / "log" / "site.yaml")
+    ahead = "--rate", "imu", "--horizon", "0.1"
+    sentence = refuse("navigate", tmp_path / "log", *ahead, "-o", tmp_path / "run")
+    assert "--horizon is not for a site without beacons" in sentence
+
+
 def test_a_gap_is_bridged_by_gravity_and_field(attached):
     log, site = attached
     kept = (log.imu.time < 14.0) | (log.imu.time > 18.0)

@@ -134,7 +134,17 @@ def run(
     return run_navigate(settings, output, report)
 
 
-OF_BEACONS = {"checkpoint", "resume", "mavlink", "foxglove", "ros2", "live", "realtime", "blend"}
+OF_BEACONS = {
+    "blend",
+    "checkpoint",
+    "foxglove",
+    "horizon",
+    "live",
+    "mavlink",
+    "realtime",
+    "resume",
+    "ros2",
+}
 
 
 def _refuse_without_beacons(given: set[str]) -> None:

@@ -103,6 +103,7 @@ def require_motion_prior(site: Site) -> None:
     """
     if not site.platform.inertial and site.platform.motion_prior is None:
         raise InputError(
-            "holds no inertial samples, and its site no platform.motion_prior to smooth by; record"
-            f" the IMU, or declare how the platform moves: motion_prior: {EXAMPLE} is a hand's"
+            "holds no inertial samples (imu.parquet), and its site no platform.motion_prior to"
+            " smooth by; record the IMU, or declare how the platform moves:"
+            f" motion_prior: {EXAMPLE} is a hand's"
         )
