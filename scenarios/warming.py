@@ -76,7 +76,7 @@ def warm_log(duration: float, seed: int) -> Log:
     wave = replace(waves[0], measured_sensor=grown + sensor.offset + more * OFFSET_PER_K)
     read = np.arange(0.0, duration + EVERY, EVERY)
     parts = [*(beacon.name for beacon in site.beacons), MAGNETOMETER]
-    degrees = Temperatures({part: (read, REFERENCE + warmer(read)) for part in parts})
+    degrees = Temperatures({part: np.stack([read, REFERENCE + warmer(read)]) for part in parts})
     return replace(logs[0], waveform=wave, temperatures=degrees)
 
 

@@ -21,7 +21,8 @@ from warming import (
 )
 
 from magfusion.errors import InputError
-from magfusion.estimation.navigator import NavigatorSettings
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.restored import restored
 from magfusion.estimation.warming import at_reference, samples_at_reference
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import load_site, save_site
@@ -45,7 +46,7 @@ def warm() -> Log:
 
 
 def test_a_warm_beacon_is_one_of_other_moments() -> None:
-    degrees = Temperatures({name: (READINGS, warmth(READINGS)) for name in "ABCD"})
+    degrees = Temperatures({name: np.stack([READINGS, warmth(READINGS)]) for name in "ABCD"})
     site, time = replace(warming_site(), temperatures=degrees), np.array([7.25])
     more = np.interp(7.25, READINGS, warmer(READINGS))
     scaled = tuple(
@@ -110,6 +111,20 @@ def test_what_is_declared_and_not_recorded_is_said(warm: Log) -> None:
     assert "the magnetometer" in finding.text
     log, _ = at_reference(warm, warming_site())
     assert not [f for f in log.noticed if f.code == "temperature_missing"]
+
+
+def test_a_run_that_goes_on_knows_how_warm_it_is() -> None:
+    site = warming_site()
+    first = Navigator(site)
+    for when in (1.0, 2.0, 2.0):  # the last is passed over
+        first.add_temperature("B", when, 30.0 + when)
+    second = restored(site, NavigatorSettings(), first.checkpoint())
+    assert second.site.temperatures is not None
+    known = second.site.temperatures.readings
+    np.testing.assert_array_equal(known["B"], [[1.0, 2.0], [31.0, 32.0]])
+    second.add_temperature("B", 3.0, 50.0)
+    warm = second.site.warmed(np.array([2.5]))[0]
+    assert warm[[c[0] for c in site.channels].index("B")] == pytest.approx(PER_K * 21.0)
 
 
 @pytest.mark.slow

@@ -64,6 +64,7 @@ class Navigator:
     _resets: Resets
     _now: StateOfNow
     _still: StillSamples
+    _degrees: Temperatures
     summary: Summary
     why_no_start: NoStart
     rival_chi_square: float | None
@@ -72,8 +73,10 @@ class Navigator:
         if site.platform.imu == NO_IMU:
             site = on_motion_prior(site)
         require_motion_prior(site)
-        if site.temperatures is None:
-            site = replace(site, temperatures=Temperatures())
+        # Readings of its own: those to come are no other navigator's.
+        known = site.temperatures
+        self._degrees = Temperatures(None if known is None else known.readings)
+        site = replace(site, temperatures=self._degrees)
         self.site, self._still = site, StillSamples()
         self.settings = NavigatorSettings() if settings is None else settings
         if self.settings.earth:
@@ -142,8 +145,7 @@ class Navigator:
 
     def add_temperature(self, part: str, time: float, degc: float) -> None:
         """Take the temperature of a beacon, or of the ``magnetometer``: of what comes after it."""
-        assert self.site.temperatures is not None
-        self.site.temperatures.hear(part, time, degc)
+        self._degrees.hear(part, time, degc)
 
     def add_fields(self, samples: FieldSamples, steady: SteadyFields | None = None) -> None:
         """Take demodulated phasors, channels in the site's order, and the steady fields with them.

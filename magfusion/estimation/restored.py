@@ -35,7 +35,7 @@ def restored(
         Where it is none, or does not fit the site.
     """
     navigator = Navigator(site, settings)
-    rules = navigator_rules(site, navigator.blocks, measurements)
+    rules = navigator_rules(navigator.site, navigator.blocks, measurements)
     try:
         navigator.go_on_from(checkpoint, rules)
     except np.linalg.LinAlgError as error:

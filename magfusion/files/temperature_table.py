@@ -35,7 +35,7 @@ def read_temperatures(path: Path | None, epoch_ns: int) -> Temperatures | None:
         twice[own[1:]] = np.diff(table.time[own]) == 0.0
         remedy = f"the time of another reading of {name}: remove one of the two"
         table.refuse(twice, TIME, table.time_ns, remedy)
-        readings[name] = (table.time[own], degc[own])
+        readings[name] = np.stack([table.time[own], degc[own]])
     return Temperatures(readings)
 
 

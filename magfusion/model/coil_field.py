@@ -7,15 +7,15 @@ is below 1e-9 from half a length off the axis, and below 1e-6 from three tenths 
 """
 
 from dataclasses import replace
-from functools import lru_cache
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from magfusion.model.field_map import FieldMap
 from magfusion.model.physics.dipole import dipole_field, dipole_field_along, dipole_gradient
 from magfusion.model.physics.loop import loop_field, loop_field_and_gradient
-from magfusion.model.site import Beacon, Coil
+from magfusion.model.site import Beacon, Coil, Site
 from magfusion.units import Array, ComplexArray
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
@@ -55,9 +55,21 @@ class Sources(NamedTuple):
     field_map: FieldMap | None = None
 
 
-@lru_cache(maxsize=256)
+# As long as beacon and site live: an estimator makes others at every step.
+_ALONE: WeakKeyDictionary[Beacon, Sources] = WeakKeyDictionary()
+_BESIDE: WeakKeyDictionary[Site, "Groups"] = WeakKeyDictionary()
+Groups = tuple[tuple[tuple[int, ...], Sources], ...]
+
+
 def alone(beacon: Beacon) -> Sources:
     """Return a beacon as the source that it is."""
+    known = _ALONE.get(beacon)
+    if known is None:
+        known = _ALONE[beacon] = _source(beacon)
+    return known
+
+
+def _source(beacon: Beacon) -> Sources:
     return Sources(
         position_world=beacon.position_world,
         world_from_beacon=beacon.world_from_beacon,
@@ -68,9 +80,8 @@ def alone(beacon: Beacon) -> Sources:
     )
 
 
-@lru_cache(maxsize=64)
-def side_by_side(beacons: tuple[Beacon, ...]) -> tuple[tuple[tuple[int, ...], Sources], ...]:
-    """Return beacons as few sources: those of one form together, one that has a map alone.
+def side_by_side(site: Site) -> Groups:
+    """Return a site's beacons as few sources: those of one form together, one with a map alone.
 
     A field is evaluated of several at once at the cost of one where the points are few.
 
@@ -79,8 +90,14 @@ def side_by_side(beacons: tuple[Beacon, ...]) -> tuple[tuple[tuple[int, ...], So
     tuple
         Of the numbers of beacons, and their source.
     """
+    known = _BESIDE.get(site)
+    if known is None:
+        known = _BESIDE[site] = _grouped([alone(beacon) for beacon in site.beacons])
+    return known
+
+
+def _grouped(sources: list[Sources]) -> Groups:
     of_form: dict[object, list[int]] = {}
-    sources = [alone(beacon) for beacon in beacons]
     for k, source in enumerate(sources):
         loops, mapped = source.loops, k if source.field_map is not None else None
         shape = source.excitation.shape, loops.first, loops.centre.shape, loops.radius is None

@@ -3,7 +3,7 @@
 A reading holds for its time; in between it is linear, and beyond the first and the last it is held.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import repeat
 
@@ -75,20 +75,20 @@ class Temperatures:
 
     Parameters
     ----------
-    readings : mapping of str to tuple of ndarray, optional
-        Of each part the times, increasing (s), and temperatures (degrees Celsius), shape (n,).
+    readings : mapping of str to ndarray, optional
+        Of each part, shape (2, n): times, increasing (s), and temperatures (degrees Celsius).
     """
 
-    def __init__(self, readings: dict[str, tuple[Array, Array]] | None = None) -> None:
+    readings: dict[str, Array]  # what a checkpoint holds
+
+    def __init__(self, readings: Mapping[str, Array] | None = None) -> None:
         self.readings = {} if readings is None else dict(readings)
 
     def hear(self, part: str, time: float, degc: float) -> None:
         """Take a reading; one that is older than the last is passed over."""
-        known = self.readings.get(part, (np.zeros(0), np.zeros(0)))
-        if len(known[0]) and time <= known[0][-1]:
-            return
-        longer = (np.append(a[-REMEMBERED:], b) for a, b in zip(known, (time, degc), strict=True))
-        self.readings[part] = (next(longer), next(longer))
+        known = self.readings.get(part, np.zeros((2, 0)))
+        if known.shape[1] == 0 or time > known[0, -1]:
+            self.readings[part] = np.column_stack([known[:, -REMEMBERED:], [time, degc]])
 
     def at(self, part: str, time: Array) -> Array | None:
         """Return temperatures of a part at some times, of their shape; None without a reading."""

@@ -93,7 +93,7 @@ def _currents(calibration: Calibration, time: Array, carrier: ComplexArray) -> l
         start = tones.stop
     return [
         np.stack([of_beacon[k] for k in rows]) if len(rows) > 1 else of_beacon[rows[0]]
-        for rows, _ in side_by_side(calibration.site.beacons)
+        for rows, _ in side_by_side(calibration.site)
     ]
 
 
@@ -112,7 +112,7 @@ def _at_point(
     if change is not None:
         along = change.position_world + np.cross(change.rotation_world, lever)
     field, by = np.tile(earth_field_world, (len(rotation), 1)), np.zeros((len(rotation), 3))
-    for (_, source), current in zip(side_by_side(site.beacons), currents, strict=True):
+    for (_, source), current in zip(side_by_side(site), currents, strict=True):
         driven = driven_field(source, motion.position_world + lever, current, along)
         field += np.sum(driven.field.reshape(-1, *field.shape), axis=0)
         if driven.along is not None:

@@ -50,7 +50,7 @@ def _groups(site: Site, *, beside: bool = True) -> list[_Group]:
     end = np.cumsum([len(beacon.tones) for beacon in site.beacons]).tolist()
     tones = [slice(*ends) for ends in pairwise([0, *end])]
     sources = (
-        side_by_side(site.beacons)
+        side_by_side(site)
         if beside
         else [((k,), alone(beacon)) for k, beacon in enumerate(site.beacons)]
     )
