@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from harness import conclude, scenario_parser
+from harness import conclude, rms, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.orientation.smoother import oriented
@@ -31,7 +31,7 @@ from magfusion.model.site import (
     Site,
 )
 from magfusion.model.trajectory import Trajectory, interpolate
-from magfusion.units import Array
+from magfusion.units import DEGREE, Array
 
 LOGS = Path(__file__).parents[2] / "shared" / "logs"
 EARTH_WORLD = np.array([0.0, 1.64e-5, -4.14e-5])  # T
@@ -124,7 +124,7 @@ def errors(time: Array, attitude: Array, truth: Trajectory) -> tuple[float, floa
     x, y, z, w = off.as_quat().T
     head = 2.0 * np.arctan(z / w)
     tilt = 2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w))
-    return tuple(float(np.rad2deg(np.sqrt(np.mean(v**2)))) for v in (head, tilt))  # type: ignore[return-value]
+    return rms(head) / DEGREE, rms(tilt) / DEGREE
 
 
 def vqf(log: Log, site: Site, *, back: bool) -> Array:

@@ -17,7 +17,7 @@ from magfusion.estimation.orientation.remarks import doubts, remarks
 from magfusion.estimation.orientation.smoother import Oriented, oriented
 from magfusion.estimation.state import GYRO_BIAS, ROTATION
 from magfusion.files.site import load_site, save_site
-from magfusion.files.stream import json_line, read_records, whole_rows
+from magfusion.files.stream import Format, json_line, read_records, whole_rows
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
 from magfusion.jobs.inputs import Job, claim, named, read_job, require_imu
@@ -187,7 +187,7 @@ def _refined(site: Site, last: Orientation) -> Site:
 
 
 def run_orientation_stream(
-    site: Site, form: str, keep_going: bool, source: BinaryIO, sink: BinaryIO, messages: TextIO
+    site: Site, form: Format, keep_going: bool, source: BinaryIO, sink: BinaryIO, messages: TextIO
 ) -> int:
     """Tell the orientation by the records of a stream; one line of JSON for each inertial sample.
 
@@ -202,7 +202,7 @@ def run_orientation_stream(
         Where a record is none and ``keep_going`` is not set.
     """
     navigator, refused = OrientationNavigator(site), 0
-    for numbered in read_records(source, form):  # type: ignore[arg-type]
+    for numbered in read_records(source, form):
         try:
             if numbered.record is None:
                 raise InputError(numbered.refusal)

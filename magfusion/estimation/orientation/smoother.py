@@ -105,12 +105,12 @@ def oriented(log: Log, site: Site, *, back: bool = True, report: Report = quiet)
             states.append(last.state)
     if back:
         assert last is not None
-        found = _smoothed(cut, snapshots, estimator.measured_from_body)
-        states = [None] * len(cut)  # type: ignore[list-item]
-        for k, state, turned in found:
-            states[k] = state
+        states = []
+        for k, state, turned in _smoothed(cut, snapshots, estimator.measured_from_body):
+            states.append(state)
             own = slice(samples[k], samples[k + 1])
             attitude[own] = turned
+        states.reverse()
     time = np.concatenate([s.time for s in cut])
     return Oriented(time, attitude, tuple(states), disturbance, np.array(changed))
 
