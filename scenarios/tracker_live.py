@@ -258,7 +258,7 @@ def records(config: Config) -> bytes:
     rng = np.random.default_rng(config.seed + 1)
     head = Head(config)
     wave, imu = waveform(config, head, rng), head.imu(config, rng)
-    lines, edges = [], np.arange(0.0, config.duration + PIECE, PIECE)
+    lines, edges = [], PIECE * np.arange(round(config.duration / PIECE) + 1)
     for begin, end in pairwise(edges.tolist()):
         own = slice(*np.searchsorted(imu[0], [begin - 1e-9, end - 1e-9]))
         rows = slice(*np.searchsorted(wave[0], [begin - 1e-9, end - 1e-9]))
