@@ -34,12 +34,14 @@ from magfusion.estimation.state_of_now import CarriedState, Said, StateOfNow
 from magfusion.estimation.still_samples import StillSamples
 from magfusion.estimation.warming import heard_at_reference, heard_fields_at_reference
 from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
+from magfusion.model.drive import DriveSamples, DriveShares
 from magfusion.model.parameters import dimension, placed
 from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.samples import FieldSamples, SteadyFields
 from magfusion.model.site import Site
 from magfusion.model.temperature import Temperatures
 from magfusion.model.without_imu import on_motion_prior, require_motion_prior
+from magfusion.receiver.drive import DriveReceiver
 from magfusion.receiver.receiver import Receiver
 from magfusion.units import Array
 
@@ -65,6 +67,8 @@ class Navigator:
     _now: StateOfNow
     _still: StillSamples
     _degrees: Temperatures
+    _drives: DriveShares
+    _currents: DriveReceiver
     summary: Summary
     why_no_start: NoStart
     rival_chi_square: float | None
@@ -76,7 +80,10 @@ class Navigator:
         # Readings of its own: those to come are no other navigator's.
         known = site.temperatures
         self._degrees = Temperatures(None if known is None else known.readings)
-        site = replace(site, temperatures=self._degrees)
+        currents = None if site.drives is None else site.drives.readings
+        self._drives = DriveShares(currents)
+        site = replace(site, temperatures=self._degrees, drives=self._drives)
+        self._currents = DriveReceiver(site, self._drives)
         self.site, self._still = site, StillSamples()
         self.settings = NavigatorSettings() if settings is None else settings
         if self.settings.earth:
@@ -142,6 +149,17 @@ class Navigator:
         self._arrived.add_magnetometer(time, samples)
         self._stand_still(np.atleast_1d(time), raw=True)
         self.advance()
+
+    def add_drive(self, samples: DriveSamples) -> None:
+        """Take currents of coils, before the samples of the magnetometer that they go with.
+
+        Raises
+        ------
+        InputError
+            As `magfusion.receiver.drive.DriveReceiver`.
+        """
+        self._currents.push(samples)
+        self._drives.forget()
 
     def add_temperature(self, part: str, time: float, degc: float) -> None:
         """Take the temperature of a beacon, or of the ``magnetometer``: of what comes after it."""

@@ -7,9 +7,11 @@ from typing import TypeVar
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.files.drive_columns import columns_beside
 from magfusion.files.lost_rows import LostRows
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.table import TIME, Layout, Span, Table, read_table, write_table
+from magfusion.model.drive import DriveSamples
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
@@ -97,10 +99,13 @@ def _measured(
     return table.time[lost.kept], values[lost.kept], lost.told(stream)
 
 
-def write_waveform(waveform: Waveform, path: Path, epoch_ns: int) -> None:
-    """Write magnetometer samples as Parquet."""
+def write_waveform(
+    waveform: Waveform, path: Path, epoch_ns: int, drive: DriveSamples | None = None
+) -> None:
+    """Write magnetometer samples, and the currents beside them, as Parquet."""
     columns: dict[str, object] = {TIME: Span(epoch_ns).stamps(waveform.time)}
     columns |= dict(zip(_FIELD, waveform.measured_sensor.T, strict=True))
+    columns |= {} if drive is None else columns_beside(drive, waveform)
     write_table(columns, path)
 
 

@@ -9,6 +9,7 @@ from pydantic import Field
 
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_directory
+from magfusion.files.drive_columns import read_drive
 from magfusion.files.fields import read_fields, write_fields
 from magfusion.files.inertial_tables import (
     read_if_there,
@@ -92,6 +93,7 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
         truth=read_if_there(tables["truth"], _read_truth, span),
         noticed=(*of_imu, *of_waveform),
         temperatures=read_temperatures(tables["temperature"], header.epoch_ns),
+        drive=read_drive(tables["magnetometer"], span),
     )
     if log.waveform is None and log.fields is None:
         raise InputError(f"{path}: holds no field {span}; choose a span that the log covers.")
@@ -118,7 +120,8 @@ def write_log(log: Log, path: Path) -> None:
         if log.inertial and len(log.imu):
             write_imu(log.imu, unfinished / "imu.parquet", log.epoch_ns)
         if log.waveform is not None:
-            write_waveform(log.waveform, unfinished / "magnetometer.parquet", log.epoch_ns)
+            table = unfinished / "magnetometer.parquet"
+            write_waveform(log.waveform, table, log.epoch_ns, log.drive)
         if log.fields is not None:
             write_fields(log.fields, unfinished / "fields.parquet", log.epoch_ns)
         if log.truth is not None:

@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow.parquet
 
 from magfusion.errors import InputError
+from magfusion.files.drive_columns import drive_columns
 from magfusion.files.fields import read_fields
 from magfusion.files.inertial_tables import read_if_there
 from magfusion.files.log import HEADER, LogHeader, is_log
@@ -147,6 +148,8 @@ def long_log(path: Path, start: float | None = None, end: float | None = None) -
     tables = {name: find_table(path, name) for name in (*_COLUMNS, "fields")}
     if tables["imu"] is None or tables["magnetometer"] is tables["fields"] is None:
         return None  # which is refused where it is read whole
+    if tables["magnetometer"] is not None and drive_columns(tables["magnetometer"]):
+        return None
     span = Span(read_yaml(path / HEADER, LogHeader).epoch_ns, start, end)
     fields = read_if_there(tables["fields"], read_fields, span)
     temperatures = read_temperatures(find_table(path, "temperature"), span.epoch_ns)

@@ -356,6 +356,7 @@ def _coil_entry(coil: Coil) -> dict[str, Any]:
         "length_m": coil.length,
         "frequency_hz": coil.frequency_hz,
         "slot": coil.slot,
+        "current_a": coil.current,
     }
     return entry | {k: _plain(v) for k, v in options.items() if v is not None}
 

@@ -159,6 +159,7 @@ class CoilEntry(StrictModel):
     length_m: _Length | None = None
     frequency_hz: _Frequency | None = None
     slot: Annotated[int, Field(ge=0)] | None = None
+    current_a: Annotated[_AboveZero, between(1e-12, 1e6)] | None = None
 
     @model_validator(mode="after")
     def _moment_or_winding(self) -> Self:
@@ -167,7 +168,7 @@ class CoilEntry(StrictModel):
                 detail = InitErrorDetails(type="missing", loc=("moment_a_m2",), input=None)
                 raise ValidationError.from_exception_data("site", [detail])
             return self
-        for key in ("moment_a_m2", "radius_m", "length_m"):
+        for key in ("moment_a_m2", "radius_m", "length_m", "current_a"):
             if getattr(self, key) is not None:
                 remedy = "remove it or winding, of which it follows"
                 raise refusal_at((key,), np.asarray(getattr(self, key)).tolist(), remedy)
@@ -183,10 +184,12 @@ class CoilEntry(StrictModel):
     def coil(self) -> Coil:
         """Return the coil; of windings that which stands for them."""
         moment, radius, length = self.moment_a_m2, self.radius_m, self.length_m
+        current = self.current_a
         if moment is None:
             assert self.winding is not None
             size, radius, length = self.winding.coil()
             moment = size * self.winding.axis / np.linalg.norm(self.winding.axis)
+            current = self.winding.current_a
         return Coil(
             moment_beacon=moment,
             phase=self.phase_deg * DEGREE,
@@ -195,6 +198,7 @@ class CoilEntry(StrictModel):
             length=length,
             frequency_hz=self.frequency_hz,
             slot=self.slot,
+            current=current,
         )
 
 

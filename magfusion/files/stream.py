@@ -13,9 +13,11 @@ from pydantic import ConfigDict, Field, PlainValidator, ValidationError, model_v
 from pydantic_core import PydanticCustomError
 
 from magfusion.errors import InputError
+from magfusion.files.drive_columns import beacon_of, column_of
 from magfusion.files.site_warming import COLDEST, HOTTEST
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS
 from magfusion.files.yaml_files import StrictModel, sentence
+from magfusion.model.drive import DriveSamples
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.units import Array, ComplexArray
 
@@ -66,6 +68,14 @@ def _vectors(value: object) -> Array:
     found = np.atleast_2d(_numbers(value, "three numbers, or a list of such", missing=True))
     if found.ndim != 2 or found.shape[1] != 3:
         raise PydanticCustomError("vectors", "it should be three numbers, or a list of such")
+    return found
+
+
+def _series(value: object) -> Array:
+    what = "a number, or a list of them"
+    found = np.atleast_1d(_numbers(value, what, missing=True))
+    if found.ndim != 1:
+        raise PydanticCustomError("series", "it should be {what}", {"what": what})
     return found
 
 
@@ -154,6 +164,20 @@ class TemperatureRecord(StrictModel):
     degc: dict[str, Annotated[float, Field(ge=COLDEST, le=HOTTEST)]]
 
 
+class DriveRecord(_Arrays):
+    """Currents of coils: stamps (k,), and of each column, named as in a log's table, (k,) (A)."""
+
+    time: Annotated[Array, PlainValidator(_times)]
+    current: dict[
+        Annotated[str, Field(pattern=r"^drive(_.+)?$")], Annotated[Array, PlainValidator(_series)]
+    ] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _alike(self) -> "DriveRecord":
+        _check_lengths(self.time, **self.current)
+        return self
+
+
 class Record(StrictModel):
     """One line of the stream; it may hold several kinds of samples."""
 
@@ -161,13 +185,12 @@ class Record(StrictModel):
     magnetometer: MagnetometerRecord | None = None
     fields: FieldsRecord | None = None
     temperature: TemperatureRecord | None = None
+    drive: DriveRecord | None = None
 
     @model_validator(mode="after")
     def _not_empty(self) -> "Record":
-        if all(
-            part is None for part in (self.imu, self.magnetometer, self.fields, self.temperature)
-        ):
-            kinds = "imu, magnetometer, fields or temperature"
+        if all(getattr(self, kind) is None for kind in type(self).model_fields):
+            kinds = "imu, magnetometer, fields, temperature or drive"
             raise PydanticCustomError("empty", "it should hold {kinds}", {"kinds": kinds})
         return self
 
@@ -322,6 +345,19 @@ def magnetometer_content(waveform: Waveform) -> dict[str, Any]:
 def temperature_content(time: float, part: str, degc: float) -> dict[str, Any]:
     """Return a temperature as a record."""
     return {"temperature": {"time": time, "degc": {part: degc}}}
+
+
+def drive_content(drive: DriveSamples) -> dict[str, Any]:
+    """Return currents of coils as a record."""
+    current = {column_of(name): values.tolist() for name, values in drive.current.items()}
+    return {"drive": {"time": drive.time.tolist(), "current": current}}
+
+
+def drive_samples(entry: DriveRecord) -> DriveSamples:
+    """Return the currents of a record, without times at which one is missing."""
+    kept = np.all([np.isfinite(values) for values in entry.current.values()], axis=0)
+    own = {beacon_of(name): values[kept] for name, values in entry.current.items()}
+    return DriveSamples(entry.time[kept], own)
 
 
 def fields_content(samples: FieldSamples) -> dict[str, Any]:

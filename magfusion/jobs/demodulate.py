@@ -27,6 +27,7 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     import numpy as np
 
     from magfusion.estimation.demodulation import phasors
+    from magfusion.estimation.drive_reference import referred
     from magfusion.estimation.integrity.recording import passed_on
     from magfusion.files.log import write_log
     from magfusion.files.site import save_site
@@ -44,6 +45,7 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     report("demodulating", 0, 1)
     with named(job.log_path):
         samples, dropped = phasors(log, site, lockin)
+        samples = referred(samples, site)
     report("done", 1, 1)
     sigma = np.sqrt(np.trace(samples.phasor_cov, axis1=2, axis2=3) / 3.0)
     figures = (
@@ -66,7 +68,7 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     )
     figures |= dropped_figures(dropped)
     with claimed as directory:
-        write_log(replace(log, waveform=None, fields=samples), directory)
+        write_log(replace(log, waveform=None, fields=samples, drive=None), directory)
         save_site(site, directory / "site.yaml")
         write_report(directory, figures)
     return figures

@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.drive_reference import with_drives
 from magfusion.estimation.integrity.mending import mended
 from magfusion.estimation.warming import at_reference
 from magfusion.files.atomic import (
@@ -264,6 +265,8 @@ def read_job(
     if log.fields is not None:
         with named(job.log_path):
             log = replace(log, fields=order_channels(log.fields, site))
+    with named(job.log_path):
+        log, site = with_drives(log, site)
     return at_reference(log, site)
 
 

@@ -152,6 +152,7 @@ def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool)
     """Write a log as the records of a stream, in the order of their arrival."""
     from magfusion.files.long_log import LongLog
     from magfusion.files.stream import (
+        drive_content,
         fields_content,
         imu_content,
         magnetometer_content,
@@ -163,9 +164,15 @@ def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool)
     pieces = _of_long(log) if isinstance(log, LongLog) else Replay(log).pieces()
     degrees = log.temperatures or Temperatures()
     readings = deque(sorted(degrees.each()))
+    currents = None if isinstance(log, LongLog) else log.drive
     for _, piece in paced(pieces, realtime):
         while readings and readings[0][0] < piece.arrival:
             write_record(temperature_content(*readings.popleft()), sink, form)
+        if currents is not None:
+            due = int(np.searchsorted(currents.time, piece.arrival))
+            if due:
+                write_record(drive_content(currents.rows(slice(0, due))), sink, form)
+            currents = currents.rows(slice(due, None))
         if len(piece.imu):
             write_record(imu_content(piece.imu), sink, form)
         if piece.waveform is not None and len(piece.waveform):

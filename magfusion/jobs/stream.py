@@ -19,6 +19,7 @@ from magfusion.files.site import load_site
 from magfusion.files.stream import (
     Format,
     Numbered,
+    drive_samples,
     field_samples,
     json_line,
     read_records,
@@ -180,6 +181,8 @@ def _take_in(
     if record.temperature is not None:
         for part, degc in record.temperature.degc.items():
             navigator.add_temperature(part, record.temperature.time, degc)
+    if record.drive is not None:
+        navigator.add_drive(drive_samples(record.drive))
     if record.imu is not None:
         time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
         if len(time):

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from magfusion.model.drive import DriveSamples
 from magfusion.model.temperature import Temperatures
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
@@ -203,7 +204,8 @@ class Log:
     ``steady`` goes with ``fields``, at the same times; no file holds it.  ``clocks`` says of which
     streams the stamps scatter, ``noticed`` what else was mended in it.  Where not ``inertial``, the
     samples of the IMU are those of a motion prior (`magfusion.model.without_imu`), and measured
-    nothing.  ``temperatures`` are those of whatever the samples are not yet freed of.
+    nothing.  ``temperatures`` are those of whatever the samples are not yet freed of,
+    ``drive`` is what was recorded of the currents of coils beside the waveform.
     """
 
     name: str
@@ -218,3 +220,4 @@ class Log:
     noticed: tuple[Finding, ...] = ()
     inertial: bool = True
     temperatures: Temperatures | None = None
+    drive: DriveSamples | None = None

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from magfusion.model.correlation import Correlation
+from magfusion.model.drive import DriveShares
 from magfusion.model.field_map import FieldMap
 from magfusion.model.platform_motion import A_HAND, MotionPrior, Replaced
 from magfusion.model.platform_motion import ImuModel as ImuModel
@@ -37,6 +38,8 @@ class Coil:
         Drive frequency where it differs from the beacon's (frequency division).
     slot : int, optional
         Time slot, counted from 0, where coils are driven in turn (time division).
+    current : float, optional
+        Peak current for which the moment is declared (A).
     """
 
     moment_beacon: Array
@@ -46,6 +49,7 @@ class Coil:
     length: float | None = None
     frequency_hz: float | None = None
     slot: int | None = None
+    current: float | None = None
 
 
 @dataclass(frozen=True)
@@ -334,6 +338,8 @@ class Site:
         Where the magnetometer is, whatever the fields say.
     temperatures : Temperatures, optional
         Of its beacons, as a log or a stream has them.
+    drives : DriveShares, optional
+        Of its beacons' currents, likewise.
     """
 
     gravity: float
@@ -349,6 +355,34 @@ class Site:
     model_error_length: float = 0.5
     region: Region | None = None
     temperatures: Temperatures | None = None
+    drives: DriveShares | None = None
+
+    @property
+    def are_driven(self) -> bool:
+        """Whether anything is known of the currents of its beacons."""
+        return self.drives is not None and bool(self.drives.readings)
+
+    def driven(self, time: Array) -> tuple[Array, Array] | None:
+        """Return what recorded currents do to channels.
+
+        Parameters
+        ----------
+        time : ndarray, shape (...)
+            (s)
+
+        Returns
+        -------
+        tuple of ndarray, or None, each of shape (..., channels)
+            By how much they raise the logarithms of amplitudes, and by which phases they are
+            ahead of those declared (rad); None where no current was recorded.
+        """
+        if not self.are_driven:
+            return None
+        assert self.drives is not None
+        none = np.zeros(np.shape(time)), np.zeros(np.shape(time))
+        parts = [self.drives.at(name, tone, time) or none for name, tone in self.channels]
+        sizes, angles = zip(*parts, strict=True)
+        return np.stack(sizes, axis=-1), np.stack(angles, axis=-1)
 
     def warmed(self, time: Array) -> Array | None:
         """Return by how much temperature raises the logarithm of each channel's moments.

@@ -28,6 +28,7 @@ CODES = {
     "body_iron": "iron or a magnet on the body changes the field",
     "coil_reversed": "a coil of a beacon is wired in reverse, or exchanged for another",
     "coils_swapped": "the coils of every beacon are exchanged",
+    "drive_current": "the current recorded of a coil is not the one declared, or noisy",
     "diverged": "the estimator neither converged nor explains what was measured",
     "earth_field": "the steady field is not the Earth's as declared",
     "epoch_shift": "the stamps are shifted against the epoch of the drive phases",

@@ -83,7 +83,7 @@ def _currents(calibration: Calibration, time: Array, carrier: ComplexArray) -> l
 
     Shape (n, coils), or (beacons, n, coils) where it is several beacons.
     """
-    still = not np.any(calibration.drift)
+    still = not np.any(calibration.drift) and not calibration.site.are_driven
     phase = calibration.phase if still else calibration.drive_phase(time)
     drive = carrier * (calibration.gain_at(time) * np.exp(1j * phase))
     of_beacon, start = [], 0

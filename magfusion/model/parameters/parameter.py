@@ -67,17 +67,20 @@ class Calibration:
     def gain_at(self, time: Array) -> Array:
         """Return what phasors are larger by than those of the site, shape (..., channels).
 
-        With what temperature does to the moments.
+        With what temperature does to the moments, and what was recorded of the currents.
         """
-        warmed = self.site.warmed(time)
-        return np.asarray(np.exp(self.log_gain if warmed is None else self.log_gain + warmed))
+        warmed, driven = self.site.warmed(time), self.site.driven(time)
+        log_gain = self.log_gain if warmed is None else self.log_gain + warmed
+        return np.asarray(np.exp(log_gain if driven is None else log_gain + driven[0]))
 
     def drive_phase(self, time: Array) -> Array:
         """Return the phase of every channel at the given times, shape (..., channels) (rad)."""
         owner = [i for i, b in enumerate(self.site.beacons) for _ in b.tones]
         frequencies = np.concatenate([b.tone_frequencies_hz for b in self.site.beacons])
         rate = 2.0 * np.pi * frequencies * self.drift[owner]
-        return self.phase + (time[..., None] - self.reference_time) * rate
+        phase = self.phase + (time[..., None] - self.reference_time) * rate
+        driven = self.site.driven(time)
+        return phase if driven is None else phase + driven[1]
 
 
 class Unit(NamedTuple):
