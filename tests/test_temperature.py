@@ -26,6 +26,7 @@ from magfusion.estimation.restored import restored
 from magfusion.estimation.warming import at_reference, samples_at_reference
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import load_site, save_site
+from magfusion.jobs.demodulate import DemodulateSettings, run_demodulate
 from magfusion.jobs.replay import run_replay
 from magfusion.jobs.stream import StreamSettings, run_stream
 from magfusion.model.parameters import initial_calibration, predict_channels
@@ -160,3 +161,15 @@ def test_the_pipe_hears_what_the_log_has(warm: Log, tmp_path: Path) -> None:
         states[name] = float(np.linalg.norm(np.array(last["position"]) - where))
     assert states["heard"] < 0.005  # m
     assert states["deaf"] > 0.02  # m
+
+
+def test_demodulated_phasors_lack_no_temperature(warm: Log, tmp_path: Path) -> None:
+    write_log(warm, tmp_path / "log")
+    save_site(warming_site(), tmp_path / "log" / "site.yaml")
+    run_demodulate(DemodulateSettings(log=tmp_path / "log", end=8.0), tmp_path / "phasors")
+    log, site = at_reference(
+        read_log(tmp_path / "phasors"), load_site(tmp_path / "phasors" / "site.yaml")
+    )
+    assert site.platform.magnetometer.warming is None
+    assert all(beacon.warming is not None for beacon in site.beacons)
+    assert not [f for f in log.noticed if f.code == "temperature_missing"]

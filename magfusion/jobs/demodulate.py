@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from magfusion.errors import InputError
 from magfusion.jobs.settings import Command, LogSettings, WindowSettings
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figure, Figures, heading
+
+if TYPE_CHECKING:
+    from magfusion.model.samples import Log
+    from magfusion.model.site import Site
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,9 +74,19 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     figures |= dropped_figures(dropped)
     with claimed as directory:
         write_log(replace(log, waveform=None, fields=samples, drive=None), directory)
-        save_site(site, directory / "site.yaml")
+        save_site(_freed(log, site), directory / "site.yaml")
         write_report(directory, figures)
     return figures
+
+
+def _freed(log: Log, site: Site) -> Site:
+    """Return the site of phasors that the magnetometer's temperature has no part in any more."""
+    magnetometer = site.platform.magnetometer
+    missing = any(finding.code == "temperature_missing" for finding in log.noticed)
+    if magnetometer.warming is None or missing:
+        return site
+    at_reference = replace(magnetometer, warming=None)
+    return replace(site, platform=replace(site.platform, magnetometer=at_reference))
 
 
 COMMAND = Command(DemodulateSettings, run_demodulate, example="magfusion demodulate log -o phasors")
