@@ -18,6 +18,7 @@ from magfusion.files.log import read_log, write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.jobs.replay import run_replay
 from magfusion.jobs.stream import StreamSettings, run_stream
+from magfusion.model.channel_effects import driven
 from magfusion.model.drive import DriveSamples, DriveShares
 from magfusion.model.parameters import initial_calibration, predict_channels
 from magfusion.model.samples import Log
@@ -158,6 +159,6 @@ def test_a_run_goes_on_with_its_currents(wandering: Log) -> None:
     for navigator in (first, second):
         navigator.add_drive(wandering.drive.rows(slice(1000, 2000)))
     time = np.linspace(0.5, 4.5, 9)
-    found, expected = (navigator.site.driven(time) for navigator in (second, first))
+    found, expected = (driven(navigator.site, time) for navigator in (second, first))
     assert expected is not None
     np.testing.assert_array_equal(found, expected)

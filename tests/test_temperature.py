@@ -29,6 +29,7 @@ from magfusion.files.site import load_site, save_site
 from magfusion.jobs.demodulate import DemodulateSettings, run_demodulate
 from magfusion.jobs.replay import run_replay
 from magfusion.jobs.stream import StreamSettings, run_stream
+from magfusion.model.channel_effects import warmed
 from magfusion.model.parameters import initial_calibration, predict_channels
 from magfusion.model.samples import Log
 from magfusion.model.temperature import Temperatures
@@ -124,7 +125,7 @@ def test_a_run_that_goes_on_knows_how_warm_it_is() -> None:
     known = second.site.temperatures.readings
     np.testing.assert_array_equal(known["B"], [[1.0, 2.0], [31.0, 32.0]])
     second.add_temperature("B", 3.0, 50.0)
-    warm = second.site.warmed(np.array([2.5]))[0]
+    warm = warmed(second.site, np.array([2.5]))[0]
     assert warm[[c[0] for c in site.channels].index("B")] == pytest.approx(PER_K * 21.0)
 
 

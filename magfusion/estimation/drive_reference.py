@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from magfusion.model.channel_effects import driven
 from magfusion.model.drive import LEAST_ON, DriveSamples, DriveShares
 from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Site
@@ -69,11 +70,11 @@ def referred(fields: FieldSamples, site: Site) -> FieldSamples:
 
     Where a coil was off there is none.
     """
-    driven = site.driven(fields.time)
-    if driven is None:
+    known = driven(site, fields.time)
+    if known is None:
         return fields
-    share = np.exp(driven[0] + 1j * driven[1])
+    share = np.exp(known[0] + 1j * known[1])
     phasor = fields.phasor_sensor / share[..., None]
-    phasor[driven[0] < np.log(LEAST_ON)] = np.nan
-    cov = fields.phasor_cov * np.exp(-2.0 * driven[0])[..., None, None]
+    phasor[known[0] < np.log(LEAST_ON)] = np.nan
+    cov = fields.phasor_cov * np.exp(-2.0 * known[0])[..., None, None]
     return replace(fields, phasor_sensor=phasor, phasor_cov=cov)

@@ -14,6 +14,7 @@ from magfusion.files.field_map import read_field_maps, write_field_maps
 from magfusion.files.site_correlation import load_correlation, save_correlation
 from magfusion.files.site_motion import MILLION, MotionEntry, imu_entry, prior_entry
 from magfusion.files.site_region import region_entry
+from magfusion.files.site_response import response_entry, response_of
 from magfusion.files.site_schema import (
     BeaconEntry,
     ClockEntry,
@@ -222,6 +223,7 @@ def _magnetometer(entry: MagnetometerEntry) -> Magnetometer:
         offset_walk=entry.offset_walk_t,
         coil_kappa=entry.coil_kappa_m2,
         warming=None if entry.warming is None else entry.warming.warming(),
+        response=response_of(entry.response),
     )
 
 
@@ -371,6 +373,7 @@ def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
     return (
         own
         | warming_entry(magnetometer.warming)
+        | response_entry(magnetometer.response)
         | {
             "body_from_sensor": {
                 "position_m": _plain(magnetometer.position_body),

@@ -15,6 +15,7 @@ from pydantic_core import InitErrorDetails, PydanticKnownError
 
 from magfusion.files.site_motion import ImuEntry, MotionEntry, MotionPriorEntry
 from magfusion.files.site_region import RegionEntry
+from magfusion.files.site_response import ResponseEntry, check_response
 from magfusion.files.site_values import (
     HIGHEST_FREQUENCY,
     LARGEST_ANGLE,
@@ -330,6 +331,7 @@ class MagnetometerEntry(StrictModel):
     coil_kappa_m2: Annotated[float, between(-1.0, 1.0)] = Magnetometer.coil_kappa
     offset_walk_t: Annotated[_NotNegative, tesla(LARGEST_OFFSET)] = 2e-8  # gained in an hour
     warming: SensorWarmingEntry | None = None
+    response: Annotated[list[ResponseEntry], at_least_one("frequency")] | None = None
     sigma: MagnetometerSigmaEntry = Field(default_factory=MagnetometerSigmaEntry)
 
 
@@ -353,6 +355,14 @@ class SiteEntry(StrictModel):
     region: RegionEntry | None = None
     calibration: dict[str, Any] | None = None
     correlation: Annotated[str, Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _response_to_all_tones(self) -> Self:
+        response = self.platform.magnetometer.response
+        if response is not None:
+            tones = [c.frequency_hz or b.frequency_hz for b in self.beacons for c in b.coils]
+            check_response(response, np.array(tones))
+        return self
 
     @model_validator(mode="after")
     def _distinct_names(self) -> Self:

@@ -14,6 +14,7 @@ from magfusion.model.platform_motion import A_HAND, MotionPrior, Replaced
 from magfusion.model.platform_motion import ImuModel as ImuModel
 from magfusion.model.platform_motion import MotionModel as MotionModel
 from magfusion.model.region import Bounds, Region, bounds_of
+from magfusion.model.response import FrequencyResponse
 from magfusion.model.temperature import SensorWarming, Temperatures, Warming
 from magfusion.units import Array, ComplexArray, IntArray
 
@@ -266,6 +267,8 @@ class Magnetometer:
         Finite size of each axis's coil (m^2, `magfusion.model.receive_coils`); zero for a point.
     warming : SensorWarming, optional
         How matrix and offset change with temperature.
+    response : FrequencyResponse, optional
+        To fields that are not steady; None where they are measured as steady ones are.
     """
 
     position_body: Array
@@ -278,6 +281,7 @@ class Magnetometer:
     offset_walk: float = 2e-8
     coil_kappa: float = 0.0
     warming: SensorWarming | None = None
+    response: FrequencyResponse | None = None
 
 
 @dataclass(frozen=True)
@@ -356,58 +360,6 @@ class Site:
     region: Region | None = None
     temperatures: Temperatures | None = None
     drives: DriveShares | None = None
-
-    @property
-    def are_driven(self) -> bool:
-        """Whether anything is known of the currents of its beacons."""
-        return self.drives is not None and bool(self.drives.readings)
-
-    def driven(self, time: Array) -> tuple[Array, Array] | None:
-        """Return what recorded currents do to channels.
-
-        Parameters
-        ----------
-        time : ndarray, shape (...)
-            (s)
-
-        Returns
-        -------
-        tuple of ndarray, or None, each of shape (..., channels)
-            By how much they raise the logarithms of amplitudes, and by which phases they are
-            ahead of those declared (rad); None where no current was recorded.
-        """
-        if not self.are_driven:
-            return None
-        assert self.drives is not None
-        none = np.zeros(np.shape(time)), np.zeros(np.shape(time))
-        parts = [self.drives.at(name, tone, time) or none for name, tone in self.channels]
-        sizes, angles = zip(*parts, strict=True)
-        return np.stack(sizes, axis=-1), np.stack(angles, axis=-1)
-
-    def warmed(self, time: Array) -> Array | None:
-        """Return by how much temperature raises the logarithm of each channel's moments.
-
-        Parameters
-        ----------
-        time : ndarray, shape (...)
-            (s)
-
-        Returns
-        -------
-        ndarray or None, shape (..., channels)
-            None where nothing is declared of it, or nothing measured.
-        """
-        known = self.temperatures
-        if known is None or all(beacon.warming is None for beacon in self.beacons):
-            return None
-        parts = []
-        for beacon in self.beacons:
-            degc = None if beacon.warming is None else known.at(beacon.name, time)
-            own = np.zeros(np.shape(time))
-            if beacon.warming is not None and degc is not None:
-                own = beacon.warming.log_moment_per_k * (degc - beacon.warming.reference_degc)
-            parts += [own] * len(beacon.tones)
-        return np.stack(parts, axis=-1)
 
     @cached_property
     def bounds(self) -> Bounds | None:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.model.channel_effects import are_driven
 from magfusion.model.coil_field import side_by_side
 from magfusion.model.field import driven_field
 from magfusion.model.parameters import Calibration
@@ -83,8 +84,8 @@ def _currents(calibration: Calibration, time: Array, carrier: ComplexArray) -> l
 
     Shape (n, coils), or (beacons, n, coils) where it is several beacons.
     """
-    still = not np.any(calibration.drift) and not calibration.site.are_driven
-    phase = calibration.phase if still else calibration.drive_phase(time)
+    still = not np.any(calibration.drift) and not are_driven(calibration.site)
+    phase = calibration.drive_phase(time[:1] if still else time)
     drive = carrier * (calibration.gain_at(time) * np.exp(1j * phase))
     of_beacon, start = [], 0
     for beacon in calibration.site.beacons:

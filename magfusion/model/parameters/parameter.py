@@ -8,6 +8,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.model.channel_effects import driven, responded, warmed
 from magfusion.model.field import EarthObservation
 from magfusion.model.receive_coils import Observation
 from magfusion.model.samples import ImuSamples
@@ -67,20 +68,27 @@ class Calibration:
     def gain_at(self, time: Array) -> Array:
         """Return what phasors are larger by than those of the site, shape (..., channels).
 
-        With what temperature does to the moments, and what was recorded of the currents.
+        With what temperature does to the moments, what was recorded of the currents, and how the
+        magnetometer responds.
         """
-        warmed, driven = self.site.warmed(time), self.site.driven(time)
-        log_gain = self.log_gain if warmed is None else self.log_gain + warmed
-        return np.asarray(np.exp(log_gain if driven is None else log_gain + driven[0]))
+        warmth, current = warmed(self.site, time), driven(self.site, time)
+        response = responded(self.site)
+        log_gain = self.log_gain if warmth is None else self.log_gain + warmth
+        log_gain = log_gain if response is None else log_gain + response[0]
+        return np.asarray(np.exp(log_gain if current is None else log_gain + current[0]))
 
     def drive_phase(self, time: Array) -> Array:
-        """Return the phase of every channel at the given times, shape (..., channels) (rad)."""
+        """Return the phase of every channel at the given times, shape (..., channels) (rad).
+
+        As measured: with what was recorded of the currents, and the magnetometer's response.
+        """
         owner = [i for i, b in enumerate(self.site.beacons) for _ in b.tones]
         frequencies = np.concatenate([b.tone_frequencies_hz for b in self.site.beacons])
         rate = 2.0 * np.pi * frequencies * self.drift[owner]
         phase = self.phase + (time[..., None] - self.reference_time) * rate
-        driven = self.site.driven(time)
-        return phase if driven is None else phase + driven[1]
+        current, response = driven(self.site, time), responded(self.site)
+        phase = phase if response is None else phase + response[1]
+        return phase if current is None else phase + current[1]
 
 
 class Unit(NamedTuple):

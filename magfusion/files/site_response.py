@@ -1,0 +1,61 @@
+"""What a site's file says of a magnetometer's response by frequency."""
+
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from magfusion.files.site_values import (
+    HIGHEST_FREQUENCY,
+    LARGEST_ANGLE,
+    LOWEST_FREQUENCY,
+    between,
+    refusal_at,
+)
+from magfusion.files.yaml_files import StrictModel
+from magfusion.model.response import FrequencyResponse
+from magfusion.units import DEGREE, Array
+
+
+class ResponseEntry(StrictModel):
+    """The response at one frequency."""
+
+    frequency_hz: Annotated[float, between(LOWEST_FREQUENCY, HIGHEST_FREQUENCY)]
+    gain: Annotated[float, Field(gt=0.0), between(1e-6, 1e6)]
+    phase_deg: Annotated[float, between(-LARGEST_ANGLE, LARGEST_ANGLE)] = 0.0
+
+
+def response_of(entries: list[ResponseEntry] | None) -> FrequencyResponse | None:
+    """Return what entries say, in order of frequency."""
+    if not entries:
+        return None
+    rows = sorted((e.frequency_hz, e.gain, e.phase_deg * DEGREE) for e in entries)
+    return FrequencyResponse(*np.array(rows).T)
+
+
+def check_response(entries: list[ResponseEntry], tones_hz: Array) -> None:
+    """Refuse a frequency that stands twice, and tones beyond those that are given."""
+    given = [entry.frequency_hz for entry in entries]
+    for k, frequency in enumerate(given):
+        if frequency in given[:k]:
+            remedy = "give each frequency once"
+            raise refusal_at(
+                ("platform", "magnetometer", "response", k, "frequency_hz"), frequency, remedy
+            )
+    beyond = [f for f in tones_hz if f > 0.0 and not min(given) <= f <= max(given)]
+    if beyond:
+        remedy = f"give it as far as the tone at {beyond[0]:g} Hz, too"
+        raise refusal_at(("platform", "magnetometer", "response"), given, remedy)
+
+
+def response_entry(response: FrequencyResponse | None) -> dict[str, Any]:
+    """Return what a site's file says of it."""
+    if response is None:
+        return {}
+    rows = zip(response.frequency_hz, response.gain, response.phase / DEGREE, strict=True)
+    return {
+        "response": [
+            {"frequency_hz": float(f), "gain": float(g), "phase_deg": round(float(p), 12)}
+            for f, g, p in rows
+        ]
+    }

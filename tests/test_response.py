@@ -1,0 +1,128 @@
+"""A magnetometer that answers to a tone by less than to a steady field, and late."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import bilinear, freqz, lfilter
+
+from magfusion.errors import InputError
+from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.estimation.demodulation import phasors
+from magfusion.estimation.integrity.judge import judged
+from magfusion.files.site import load_site, save_site
+from magfusion.model.parameters import initial_calibration, predict_channels
+from magfusion.model.response import FrequencyResponse
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Verdict
+from magfusion.results.errors import trajectory_errors
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.log import SimulationConfig, simulate_log
+
+RATE, CUT_OFF, THINNED = 4000.0, 200.0, 8  # Hz, Hz, samples
+FREQUENCIES = np.linspace(10.0, 190.0, 40)  # Hz
+
+
+def low_pass() -> tuple[np.ndarray, np.ndarray]:
+    """Return a digital filter of first order, which is what a converter has before it."""
+    cut = 2.0 * np.pi * CUT_OFF
+    return bilinear([cut], [1.0, cut], RATE)
+
+
+def answering(site: Site) -> Site:
+    _, own = freqz(*low_pass(), FREQUENCIES, fs=RATE)
+    response = FrequencyResponse(FREQUENCIES, np.abs(own), np.angle(own))
+    magnetometer = replace(site.platform.magnetometer, response=response)
+    return replace(site, platform=replace(site.platform, magnetometer=magnetometer))
+
+
+@pytest.fixture(scope="module")
+def filtered() -> Log:
+    config = SimulationConfig(
+        DEMO_BOX_WORLD, duration=6.0, magnetometer_rate_hz=RATE, perturb=False, motion="static"
+    )
+    log = simulate_log(demo_site(), config, np.random.default_rng(2)).log
+    wave = log.waveform
+    assert wave is not None
+    first = wave.measured_sensor[0]
+    passed = first + lfilter(*low_pass(), wave.measured_sensor - first, axis=0)
+    wave = replace(wave, time=wave.time[::THINNED], measured_sensor=passed[::THINNED])
+    return replace(log, waveform=wave)
+
+
+def test_phasors_are_predicted_as_they_are_measured(filtered: Log) -> None:
+    truth = filtered.truth
+    assert truth is not None
+    site = answering(demo_site())
+    fields = phasors(filtered, site)[0].rows(slice(2, None))
+    pose = truth.world_from_body[:1], truth.position_world[:1]
+    time = fields.time[:1]
+    error = {}
+    for name, known in (("declared", site), ("not declared", demo_site())):
+        expected = predict_channels(initial_calibration(known, 0.0), time, *pose)[0]
+        found = np.mean(fields.phasor_sensor, axis=0)
+        error[name] = np.linalg.norm(found - expected, axis=1) / np.linalg.norm(expected, axis=1)
+    assert np.max(error["declared"]) < 0.003
+    assert np.min(error["not declared"]) > 0.05
+
+
+def test_a_site_keeps_the_response(tmp_path: Path) -> None:
+    site = answering(demo_site())
+    save_site(site, tmp_path / "site.yaml")
+    found = load_site(tmp_path / "site.yaml").platform.magnetometer.response
+    expected = site.platform.magnetometer.response
+    assert found is not None
+    assert expected is not None
+    for one, other in zip(vars(found).values(), vars(expected).values(), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("rows", "sentence"),
+    [
+        (
+            "{frequency_hz: 50.0, gain: 0.9}, {frequency_hz: 60.0, gain: 0.8}",
+            r"platform.magnetometer.response: found \[50.0, 60.0\]; give it as far as the tone at",
+        ),
+        (
+            "{frequency_hz: 5.0, gain: 0.9}, {frequency_hz: 5.0, gain: 0.8}",
+            r"response\[1\].frequency_hz: found 5.0; give each frequency once",
+        ),
+        ("{frequency_hz: 5.0, gain: 0.0}", r"response\[0\].gain"),
+    ],
+)
+def test_a_table_that_cannot_be_is_refused(tmp_path: Path, rows: str, sentence: str) -> None:
+    save_site(demo_site(), tmp_path / "site.yaml")
+    text = (tmp_path / "site.yaml").read_text(encoding="utf-8")
+    key = "    noise_density_t_rthz"
+    text = text.replace(key, f"    response: [{rows}]\n{key}", 1)
+    (tmp_path / "site.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=sentence):
+        load_site(tmp_path / "site.yaml")
+
+
+@pytest.mark.slow
+def test_a_filtered_log_smooths_like_any_other() -> None:
+    config = SimulationConfig(
+        DEMO_BOX_WORLD, duration=15.0, magnetometer_rate_hz=RATE, perturb=False
+    )
+    log = simulate_log(demo_site(), config, np.random.default_rng(2)).log
+    wave = log.waveform
+    assert wave is not None
+    first = wave.measured_sensor[0]
+    passed = first + lfilter(*low_pass(), wave.measured_sensor - first, axis=0)
+    wave = replace(wave, time=wave.time[::THINNED], measured_sensor=passed[::THINNED])
+    log = replace(log, waveform=wave)
+    assert log.truth is not None
+    size, verdict = {}, {}
+    for name, site in (("declared", answering(demo_site())), ("not declared", demo_site())):
+        result, trust = judged(smooth(log, site, SmootherSettings()), log)
+        found = trajectory_errors(result.states, log.truth)
+        error = np.linalg.norm(found.position_world, axis=1)
+        size[name], verdict[name] = float(np.sqrt(np.mean(error**2))), trust.verdict
+    assert size["declared"] < 0.003  # m
+    assert verdict["declared"] is Verdict.TRUSTWORTHY
+    assert size["not declared"] > 0.02  # m
+    assert verdict["not declared"] is not Verdict.TRUSTWORTHY
