@@ -1,11 +1,13 @@
 """EuRoC folders and ROS 2 bags give the samples that were put into them."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import run_command
 from example_bag import (
     ACCEL,
     BIASES,
@@ -127,6 +129,26 @@ def test_samples_that_were_not_taken_are_left_out_of_a_euroc_folder_and_said(
     log = open_log(tmp_path)
     np.testing.assert_array_equal(log.imu.gyro_body, np.delete(GYRO, 7, axis=0))
     assert [f.code for f in log.noticed] == ["repeated_stamps", "missing_samples"]
+
+
+@pytest.mark.parametrize("kind", ["bag", "EuRoC"])
+def test_a_recording_needs_no_inertial_sensor(tmp_path: Path, kind: str) -> None:
+    if kind == "bag":
+        place = write_bag(tmp_path / "run", {"/mag": (FIELD, field_message)})
+    else:
+        place = _euroc(tmp_path)
+        shutil.rmtree(place / "mav0" / "imu0")
+    log = open_log(place)
+    assert len(log.imu) == 0
+    assert log.waveform is not None
+    assert log.epoch_ns == START_NS
+    assert log.waveform.time[0] == 0.0
+    np.testing.assert_array_equal(log.waveform.measured_sensor, MEASURED)
+    run_command("import", place, "-o", tmp_path / "log")
+    again = read_log(tmp_path / "log")
+    assert len(again.imu) == 0
+    assert again.waveform is not None
+    np.testing.assert_array_equal(again.waveform.measured_sensor, MEASURED)
 
 
 def test_a_poses_only_ground_truth_is_read(tmp_path: Path) -> None:
@@ -269,8 +291,7 @@ def _spoil(part: str, name: str, value: float) -> Callable[[Any], object]:
 @pytest.mark.parametrize(
     ("topics", "sentence"),
     [
-        ({}, "holds no messages of sensor_msgs/msg/Imu"),
-        ({"/mag": (FIELD, field_message)}, "holds no messages of sensor_msgs/msg/Imu"),
+        ({}, "holds no messages of sensor_msgs/msg/Imu or sensor_msgs/msg/MagneticField"),
         (
             {"/imu": (IMU, _changed(imu_message, _spoil("angular_velocity", "y", float("inf"))))},
             f"topic /imu: the message stamped {STAMPS[7]} ns holds a number that is not finite",

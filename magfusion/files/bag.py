@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.files.bag_rows import Messages, Wanted, read_parts
 from magfusion.files.lost_rows import LostRows
-from magfusion.files.messages import IMU, ROWS, USUAL
+from magfusion.files.messages import FIELD, IMU, ROWS, USUAL
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.table import LARGEST_NUMBER, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
@@ -62,7 +62,8 @@ def read_bag(
 ) -> Log:
     """Read inertial samples, magnetometer and truth of a bag.
 
-    Times are those of the messages' headers, and the first inertial one is the log's epoch. Poses
+    Times are those of the messages' headers, and the first inertial one is the log's epoch, or the
+    first of the magnetometer where there is no inertial sensor. Poses
     are taken for those of the IMU's axes in the world; the twist of an odometry is in body axes.
 
     Parameters
@@ -83,7 +84,7 @@ def read_bag(
     Raises
     ------
     InputError
-        Where the bag cannot be read, has no inertial topic or several topics of one kind of which
+        Where the bag cannot be read, has no topic of a sensor or several of one kind of which
         none was named, or holds messages that no instrument gives.
     """
     chosen = topics or Topics()
@@ -96,20 +97,23 @@ def read_bag(
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{path}: cannot be read ({reason}); record the bag again.") from error
     imu, field, truth = (found.get(role) for role in ("imu", "magnetometer", "truth"))
-    if imu is None:
-        raise InputError(f"{path}: holds no messages of {IMU}; record the inertial sensor.")
-    span = Span(int(imu.time_ns[0]), start, end)
+    first = field if imu is None else imu
+    if first is None:
+        raise InputError(
+            f"{path}: holds no messages of {IMU} or {FIELD}; record the magnetometer, and the"
+            " inertial sensor beside it."
+        )
+    span = Span(int(first.time_ns[0]), start, end)
     told: list[Finding] = []
-    imu = _measured(imu.within(span), "IMU", told)
-    field, truth = (
+    imu, field, truth = (
         None if one is None else _measured(one.within(span), role, told)
-        for one, role in ((field, "magnetometer"), (truth, "truth"))
+        for one, role in ((imu, "IMU"), (field, "magnetometer"), (truth, "truth"))
     )
     return Log(
         name=path.resolve().stem,
         epoch_ns=span.epoch_ns,
         source="bag: " + ", ".join(s.place for s in (imu, field, truth) if s is not None),
-        imu=_imu(imu, span),
+        imu=ImuSamples.empty() if imu is None else _imu(imu, span),
         waveform=None if field is None else _waveform(field, span),
         truth=None if truth is None else _trajectory(truth, span),
         noticed=tuple(told),

@@ -12,7 +12,7 @@ from magfusion.errors import InputError
 from magfusion.files.inertial_tables import read_if_there, read_imu, read_waveform
 from magfusion.files.table import TIME, Span, find_table
 from magfusion.files.trajectory_table import read_trajectory
-from magfusion.model.samples import Log
+from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.trajectory import Trajectory
 
 _IMU = (TIME, "gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
@@ -27,13 +27,16 @@ _TRUTH = (
 
 def is_euroc(path: Path) -> bool:
     """Return whether a directory is a EuRoC folder."""
-    return (path / "mav0" / "imu0" / "data.csv").is_file()
+    streams = path / "mav0"
+    if not streams.is_dir():
+        return False
+    return (streams / "imu0" / "data.csv").is_file() or bool(_magnetometers(path))
 
 
 def read_euroc(path: Path, start: float | None = None, end: float | None = None) -> Log:
     """Read a EuRoC folder: inertial samples, and magnetometer and ground truth where they are.
 
-    The first inertial stamp is the log's epoch.
+    The first inertial stamp is the log's epoch, or the magnetometer's where there is no IMU.
 
     Parameters
     ----------
@@ -51,8 +54,9 @@ def read_euroc(path: Path, start: float | None = None, end: float | None = None)
     imu = streams / "imu0" / "data.csv"
     field = find_magnetometer(path)
     truth = find_table(streams / "state_groundtruth_estimate0", "data")
-    span = Span(_first_stamp(imu), start, end)
-    samples, of_imu = read_imu(imu, span, _IMU)
+    inertial = imu.is_file() or field is None
+    span = Span(_first_stamp(imu if inertial or field is None else field), start, end)
+    samples, of_imu = read_imu(imu, span, _IMU) if inertial else (ImuSamples.empty(), ())
     waveform, of_waveform = read_waveform(field, span, _FIELD)
     return Log(
         name=path.resolve().name,
@@ -73,16 +77,20 @@ def find_magnetometer(path: Path) -> Path | None:
     InputError
         Where there are several.
     """
-    found = [
+    found = _magnetometers(path)
+    if len(found) > 1:
+        names = ", ".join(table.parent.name for table in found)
+        raise InputError(f"{path / 'mav0'}: holds several magnetometers: {names}; keep one.")
+    return found[0] if found else None
+
+
+def _magnetometers(path: Path) -> list[Path]:
+    return [
         table
         for folder in sorted((path / "mav0").iterdir())
         if re.match(r"mag|compass|field|fluxgate", folder.name, re.I)
         and (table := find_table(folder, "data")) is not None
     ]
-    if len(found) > 1:
-        names = ", ".join(table.parent.name for table in found)
-        raise InputError(f"{path / 'mav0'}: holds several magnetometers: {names}; keep one.")
-    return found[0] if found else None
 
 
 def _read_truth(path: Path, span: Span) -> Trajectory:

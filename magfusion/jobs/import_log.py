@@ -143,7 +143,7 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
             counts["imu"], note = joined.counts, joined.note
         _refuse_apart(counts, told)
         _refuse(told)
-        epoch_ns = counts["imu"].first if epoch == FIRST else int(epoch)
+        epoch_ns = _first(counts) if epoch == FIRST else int(epoch)
         _write_header(directory, output, found, epoch_ns)
         report("checking", 0, 1)
         figures = _checked(directory, output, found, settings.site)
@@ -227,6 +227,11 @@ def _refuse_apart(counts: dict[str, Counts], told: Findings) -> None:
             )
 
 
+def _first(counts: dict[str, Counts]) -> int:
+    """Return the first inertial stamp (ns), or that of the magnetometer where there is none."""
+    return (counts["imu"] if "imu" in counts else counts["magnetometer"]).first
+
+
 def _write_header(directory: Path, output: Path, found: Gathered, epoch_ns: int) -> None:
     from magfusion.files.log import HEADER
     from magfusion.files.yaml_files import write_yaml
@@ -294,8 +299,8 @@ def _figures(
     )
     notes = [f"Passed over: {reason}" for reason in found.passed_over]
     notes += [note] if note else []
-    if not is_first and abs(counts["imu"].first - epoch_ns) * 1e-9 > LATE:
-        begin = (counts["imu"].first - epoch_ns) * 1e-9
+    begin = (_first(counts) - epoch_ns) * 1e-9
+    if not is_first and abs(begin) > LATE:
         notes.append(
             f"The log begins {begin:.9g} s after its epoch, to which the drive phases refer; if"
             " they refer to its first sample, import it with --epoch first."

@@ -156,7 +156,7 @@ def _chosen(
         told.proposals.append(f"{role}={fitting[0][0]}")
         return None
     if not fitting:
-        if role != "truth":
+        if role == "magnetometer":
             names = ", ".join(f"{name} ({kind})" for name, kind in found) or "none"
             kinds = " or ".join(ROW_OF[role])
             told.problems.append(f"{path}: no topic is of {kinds}, for {role} (found {names}).")

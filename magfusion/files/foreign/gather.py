@@ -78,9 +78,12 @@ def gather(paths: Sequence[Path], wanted: Asked, told: Findings) -> Gathered:
             told.problems.append(str(error))
             attempted |= set(STREAMS)
     attempted |= _halves(found, attempted, set(wanted.files))
-    for stream in ("imu", "magnetometer"):
-        if stream not in attempted:
-            told.problems.append(f"No table is given for the {stream}; give --{stream} FILE.")
+    if "magnetometer" not in attempted:
+        told.problems.append("No table is given for the magnetometer; give --magnetometer FILE.")
+    elif "magnetometer" in found.plans and not {"imu", "gyro", "accel"} & set(found.plans):
+        found.passed_over.append(
+            "the imu, of which no table is given (--imu FILE): the log has no inertial samples"
+        )
     _refuse_unused(found, wanted)
     told.problems += found.passed_over if told.problems else []  # what is lacking may be there
     for stream, plan in found.plans.items():
@@ -147,7 +150,7 @@ def _add(path: Path, wanted: Asked, found: Gathered) -> set[str]:
     files = _tables_in(path) if path.is_dir() else [path]
     if not files:
         raise InputError(
-            f"{path}: holds no table ({', '.join((*TEXTS, *ARRAYS))}), no bag and no mav0/imu0;"
+            f"{path}: holds no table ({', '.join((*TEXTS, *ARRAYS))}), no bag and no folder mav0;"
             " give the path of a source."
         )
     return {stream for file in files for stream in _add_table(file, wanted, found, path.is_dir())}
@@ -248,7 +251,9 @@ def _by_place(
 
 
 def _euroc_tables(path: Path) -> Iterator[tuple[str, Path]]:
-    yield "imu", path / "mav0" / "imu0" / "data.csv"
+    inertial = path / "mav0" / "imu0" / "data.csv"
+    if inertial.is_file():
+        yield "imu", inertial
     if (field := find_magnetometer(path)) is not None:
         yield "magnetometer", field
     truth = find_table(path / "mav0" / "state_groundtruth_estimate0", "data")
