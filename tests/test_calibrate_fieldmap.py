@@ -70,6 +70,7 @@ def test_the_cross_validated_error_falls_fivefold(fit: MapFit) -> None:
         assert fit.error_with[name] < fit.error_without[name] / 5.0
 
 
+@pytest.mark.slow
 def test_the_error_without_the_map_is_that_of_the_world(
     world: World, survey: Survey, fit: MapFit
 ) -> None:
@@ -79,6 +80,7 @@ def test_the_error_without_the_map_is_that_of_the_world(
         assert fit.error_without[name] == pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_map_is_the_gain_of_the_world_and_claims_its_own_error(
     world: World, fit: MapFit, targets: Array
 ) -> None:
@@ -100,6 +102,7 @@ def _position_error(site: Site, world: World, targets: Array) -> Array:
     return np.asarray(np.linalg.norm(best.position_world - targets, axis=1))
 
 
+@pytest.mark.slow
 def test_a_fix_with_the_map_is_better_than_without(
     world: World, fit: MapFit, targets: Array
 ) -> None:
@@ -173,6 +176,7 @@ def _figures(directory: Path) -> dict[str, Any]:
     return figures
 
 
+@pytest.mark.slow
 def test_a_survey_becomes_a_site_with_its_map(
     world: World, fit: MapFit, surveyed: Path, targets: Array, tmp_path: Path
 ) -> None:

@@ -67,6 +67,7 @@ def test_the_command_writes_its_files_and_no_others(calibrated: Path) -> None:
     assert (calibrated / "calibration.png").read_bytes()[:4] == b"\x89PNG"
 
 
+@pytest.mark.slow
 def test_the_refined_site_is_nearer_the_truth(
     calibrated: Path, recorded: tuple[Path, SimulatedLog]
 ) -> None:
@@ -81,6 +82,7 @@ def test_the_refined_site_is_nearer_the_truth(
     assert np.linalg.norm(after) < 0.4 * np.linalg.norm(before)
 
 
+@pytest.mark.slow
 def test_the_report_is_flat_and_tells_every_parameter(report: dict[str, Any]) -> None:
     plain = (bool, int, float, str, type(None))
     assert report["verdict"] == "trustworthy"
@@ -96,6 +98,7 @@ def test_the_report_is_flat_and_tells_every_parameter(report: dict[str, Any]) ->
     assert 0 < report["directions_determined"] < report["directions"]
 
 
+@pytest.mark.slow
 def test_the_gauge_is_told(report: dict[str, Any]) -> None:
     assert sum("all beacons shifted together" in text for text in report["gauge"]) == 3
     assert sum("about the vertical" in text for text in report["gauge"]) == 1
@@ -103,11 +106,13 @@ def test_the_gauge_is_told(report: dict[str, Any]) -> None:
     assert "A.position_x_m" in report["determined_but_for_gauge"]
 
 
+@pytest.mark.slow
 def test_the_missing_stops_are_told(report: dict[str, Any]) -> None:
     assert any("never stood still" in text for text in report["missing_motion"])
     assert report["motion_at_rest"] == 0.0
 
 
+@pytest.mark.slow
 def test_a_calibration_of_one_part_serves_the_other(report: dict[str, Any]) -> None:
     assert report["cross_parts"] == 2
     for key in ("aligned_ate_m", "residual_rms"):
@@ -118,6 +123,7 @@ def test_a_calibration_of_one_part_serves_the_other(report: dict[str, Any]) -> N
     assert report["cross_disagreement_sigma"] < 4.0
 
 
+@pytest.mark.slow
 def test_the_screen_tells_what_is_open(
     recorded: tuple[Path, SimulatedLog], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

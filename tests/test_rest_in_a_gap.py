@@ -17,6 +17,7 @@ from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.simulation.motion import Rests
 
+pytestmark = pytest.mark.slow
 SILENT = (15.0, 50.0)  # s
 
 
@@ -30,7 +31,7 @@ def silent_log(seed: int, motion: str = "static", rests: Rests | None = None) ->
     return replace(log, waveform=Waveform(time[kept], log.waveform.measured_sensor[kept]))
 
 
-@pytest.fixture(scope="module", params=[1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=[1, 2])
 def resting(request: pytest.FixtureRequest) -> tuple[Log, Smoothed, Trajectory]:
     log = silent_log(request.param)
     result = smooth(log, demo_site(coil_radius=None))

@@ -168,6 +168,7 @@ def resting_log(seed: int) -> tuple[Log, object]:
     return Log("rest", 0, "sim", ImuSamples(time, gyro, accel), None, fields, None), site
 
 
+@pytest.mark.slow
 def test_a_log_is_smoothed_alike_from_joined_and_from_single_steps(monkeypatch):
     log, site = resting_log(2)
     joined = smooth(log, site)
