@@ -74,6 +74,10 @@ BEACONS = {
         beacon((Coil(np.array([220.0, 3.0, -2.0]), radius=0.7), Coil(np.array([0.0, 9.0, 5.0])))),
         field_map=FIELD_MAP,
     ),
+    "two axes in conducting ground": replace(
+        beacon((Coil(np.array([220.0, 3.0, -2.0]), 0.1), Coil(np.array([-4.0, 180.0, 5.0]), -1.5))),
+        conductivity=5e3,  # S/m; a metre and a half of skin depth
+    ),
     "one coil": beacon((Coil(np.array([10.0, -20.0, 150.0]), phase=0.4),)),
 }
 
@@ -262,7 +266,8 @@ def test_the_value_is_what_a_magnetometer_sees_of_magpylibs_sources(source, rotv
         own.rotate(Rotation.from_matrix(source.world_from_beacon), anchor=0)
         sources.append(own.move(source.position_world))
     fields_world = np.array([s.getB(sensor_world) for s in sources])
-    value = seen_from(replace(source, field_map=None), rotvec).phasor_sensor
+    bare = replace(source, field_map=None, conductivity=0.0)
+    value = seen_from(bare, rotvec).phasor_sensor
     # The currents and the field are followed as functions of time over a cycle.
     cycle = np.linspace(0.0, 2.0 * np.pi, 7)
     tones = [(c.frequency_hz or source.frequency_hz) for c in source.coils]
@@ -332,7 +337,8 @@ def test_a_batch_is_what_its_epochs_are(source):
             source, MAGNETOMETER, rotation[epoch], position[epoch], phase[epoch], twist[epoch]
         )
         for name, block in vars(single).items():
-            assert relative_to_group(getattr(batch, name)[epoch], block) < 1e-13, name
+            if block is not None:
+                assert relative_to_group(getattr(batch, name)[epoch], block) < 1e-13, name
 
 
 def test_model_error_is_a_share_of_the_mean_square_of_the_quadratures():

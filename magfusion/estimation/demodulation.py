@@ -9,6 +9,7 @@ from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.integrity.detection import drowned, without_silence
 from magfusion.estimation.integrity.spectrum import beside_lines
 from magfusion.estimation.motion_compensation import MotionCompensated, demodulate_about, noisier
+from magfusion.estimation.skin_depths import refuse_too_deep
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.parameters import Calibration
@@ -125,14 +126,16 @@ def demodulated(log: Log, site: Site, settings: LockinSettings | None = None) ->
     Raises
     ------
     InputError
-        Where no window, or no slot, is usable.
+        Where no window, or no slot, is usable, or a beacon is too many skin depths away.
     """
     if log.waveform is None:
         if log.fields is None:
             raise EstimationError(f"log {log.name} has neither waveform nor phasors")
+        refuse_too_deep(log.fields, site)
         return Demodulation(log, without_silence(log.fields), {})
     receiver = Receiver.of(site, beside_lines(log, site, settings))
     windows, fields = receiver.whole(log.waveform, log.imu)
+    refuse_too_deep(fields, site)
     heard, hidden = without_silence(fields), drowned(fields)
     without = receiver.without_turn if isinstance(receiver, LockinReceiver) else Windows.none()
     dropped = receiver.dropped

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.files.field_map import read_field_maps, write_field_maps
 from magfusion.files.site_correlation import load_correlation, save_correlation
+from magfusion.files.site_ground import ground_entry, log_sigma
 from magfusion.files.site_motion import MILLION, MotionEntry, imu_entry, prior_entry
 from magfusion.files.site_region import region_entry
 from magfusion.files.site_response import response_entry, response_of
@@ -87,12 +88,16 @@ def load_site(path: Path | str, *, unknown: bool = False, without: bool = False)
             field_world = _reference_field(location)
         except InputError as error:
             raise InputError(f"{path}: world.{error}") from error
-    maps = _field_maps(entry, path)
+    maps, ground = _field_maps(entry, path), entry.world.conductivity_s_m
     site = Site(
         gravity=entry.world.gravity_m_s2,
         model_error=entry.world.model_error,
         model_error_length=entry.world.model_error_correlation_m,
-        beacons=tuple(replace(_beacon(b), field_map=maps.get(b.name)) for b in entry.beacons),
+        beacons=tuple(
+            replace(_beacon(b), field_map=maps.get(b.name), conductivity=ground)
+            for b in entry.beacons
+        ),
+        log_conductivity_sigma=log_sigma(ground, entry.world.sigma.conductivity_s_m),
         platform=Platform(
             NO_IMU if entry.platform.imu is None else _model(ImuModel, entry.platform.imu),
             _magnetometer(entry.platform.magnetometer),
@@ -296,6 +301,7 @@ def _world_entry(site: Site) -> dict[str, Any]:
     }
     if site.model_error_length != Site.model_error_length:
         entry["model_error_correlation_m"] = float(site.model_error_length)
+    entry |= ground_entry(site)
     field = site.earth_field_world
     if site.location is not None and (field is None or _is_reference(field, site.location)):
         day = datetime.date.fromisoformat(site.location.date)

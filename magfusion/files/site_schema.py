@@ -19,6 +19,7 @@ from magfusion.files.site_response import ResponseEntry, check_response
 from magfusion.files.site_values import (
     HIGHEST_FREQUENCY,
     LARGEST_ANGLE,
+    LARGEST_CONDUCTIVITY,
     LARGEST_DISTANCE,
     LARGEST_EARTH_FIELD,
     LARGEST_MOMENT,
@@ -27,6 +28,7 @@ from magfusion.files.site_values import (
     LARGEST_SCALE,
     LOWEST_FREQUENCY,
     SMALLEST_MOMENT,
+    a_conductivity,
     a_direction,
     a_moment,
     array,
@@ -105,6 +107,12 @@ class EarthEntry(StrictModel):
     strength_walk_t: Annotated[_NotNegative, tesla(LARGEST_EARTH_FIELD)] = _EARTH.strength_walk
 
 
+class WorldSigmaEntry(StrictModel):
+    """Priors of the world's calibration; an absent one is zero, which means known."""
+
+    conductivity_s_m: Annotated[_FromZero, between(0.0, LARGEST_CONDUCTIVITY)] = 0.0
+
+
 class WorldEntry(StrictModel):
     """Gravity, the Earth's field and the trust in the field model."""
 
@@ -115,12 +123,21 @@ class WorldEntry(StrictModel):
     earth_field_t: Annotated[Array, array(3), tesla(LARGEST_EARTH_FIELD)] | None = None
     location: LocationEntry | None = None
     earth: EarthEntry = EarthEntry()
+    conductivity_s_m: Annotated[_FromZero, AfterValidator(a_conductivity)] = 0.0
+    sigma: WorldSigmaEntry = WorldSigmaEntry()
 
     @model_validator(mode="after")
     def _one_earth(self) -> Self:
         if self.earth_field_t is not None and self.location is not None:
             remedy = "give either it or location, not both"
             raise refusal_at(("earth_field_t",), self.earth_field_t.tolist(), remedy)
+        return self
+
+    @model_validator(mode="after")
+    def _ground_that_conducts(self) -> Self:
+        if self.sigma.conductivity_s_m and not self.conductivity_s_m:
+            remedy = "give the likely conductivity too, not zero: it is estimated as a factor of it"
+            raise refusal_at(("conductivity_s_m",), self.conductivity_s_m, remedy)
         return self
 
 

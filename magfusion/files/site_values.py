@@ -20,6 +20,7 @@ LARGEST_DISTANCE = 1e6  # m
 LARGEST_ANGLE = 1e4  # degrees; a few turns do no harm
 LOWEST_FREQUENCY, HIGHEST_FREQUENCY = 1e-2, 1e6  # Hz
 LARGEST_MOMENT, SMALLEST_MOMENT = 1e9, 1e-9  # A m^2
+LARGEST_CONDUCTIVITY, SMALLEST_CONDUCTIVITY = 1e3, 1e-9  # S/m; the sea has 5, dry rock 1e-6
 LARGEST_LOG_MOMENT = 10.0  # a factor of 22,000
 LEAST_SIGMA = 1e-15  # in any unit; what is known better is known, which is zero
 SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e3  # of a magnetometer matrix
@@ -88,6 +89,15 @@ def _spread(value: object, shape: tuple[int, ...], lists: str, largest: float) -
         f"give one number or {lists}, finite and not negative, at most {largest:g}; 0 for what is"
         " known"
     )
+
+
+def a_conductivity(value: float) -> float:
+    """Refuse a conductivity that neither ground nor water has."""
+    if value != 0.0 and not SMALLEST_CONDUCTIVITY <= value <= LARGEST_CONDUCTIVITY:
+        raise refusal(
+            f"give it in S/m, from {SMALLEST_CONDUCTIVITY:g} to {LARGEST_CONDUCTIVITY:g}, or 0"
+        )
+    return value
 
 
 def a_moment(value: Array) -> Array:

@@ -83,6 +83,11 @@ def check_figures(look: Look) -> Figures:
             Figure("snr_{beacon}", snr, beacon=name, label="signal to noise"),
             Figure("heard_{beacon}", share, beacon=name, label="share of the epochs heard"),
         )
+    for name, (distance, depths) in look.depths.items():
+        figures |= Figures(
+            Figure("range_{beacon}_m", distance, "m", beacon=name, label="range by strength"),
+            Figure("skin_depths_{beacon}", depths, beacon=name, label="skin depths away"),
+        )
     if look.lines is not None:
         words = [
             f"{line.frequency_hz:.2f} Hz, {1e9 * line.amplitude:.3g} nT" for line in look.lines

@@ -4,7 +4,7 @@ Every solver predicts through `observe`; the simulator does not.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple, overload
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,8 +14,11 @@ from magfusion.model.coil_field import (
     alone,
     coil_fields,
     coil_fields_and_gradients,
+    coil_fields_by_log_conductivity,
     driven_dipoles,
 )
+from magfusion.model.perturbation import by_matrix as by_matrix
+from magfusion.model.perturbation import skew as skew
 from magfusion.model.receive_coils import (
     Observation,
     is_apart,
@@ -24,32 +27,7 @@ from magfusion.model.receive_coils import (
     points_apart,
 )
 from magfusion.model.site import Beacon, Magnetometer
-from magfusion.units import Array, ComplexArray
-
-
-@overload
-def skew(vector: Array) -> Array: ...
-@overload
-def skew(vector: ComplexArray) -> ComplexArray: ...
-def skew(vector: Array | ComplexArray) -> Array | ComplexArray:
-    """Return the matrix of the cross product, shape (..., 3, 3), of vectors (..., 3)."""
-    matrix = np.zeros((*vector.shape, 3), dtype=vector.dtype)
-    x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
-    matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -z, y, -x
-    matrix[..., 1, 0], matrix[..., 2, 0], matrix[..., 2, 1] = z, -y, x
-    return matrix
-
-
-@overload
-def by_matrix(field_sensor: Array) -> Array: ...
-@overload
-def by_matrix(field_sensor: ComplexArray) -> ComplexArray: ...
-def by_matrix(field_sensor: Array | ComplexArray) -> Array | ComplexArray:
-    """Return the derivative of ``matrix @ field_sensor`` by the matrix, shape (..., 3, 9)."""
-    columns = np.zeros((*field_sensor.shape, 3, 3), dtype=field_sensor.dtype)
-    for row in range(3):
-        columns[..., row, row, :] = field_sensor
-    return columns.reshape(*field_sensor.shape, 9)
+from magfusion.units import AnyArray, Array, ComplexArray
 
 
 def _source(beacon: Beacon | Sources) -> Sources:
@@ -71,12 +49,14 @@ def _turned(excitation: ComplexArray, phase: Array | None) -> ComplexArray:
 class _Mapped(NamedTuple):
     """What a field map makes of the model, beacon axes."""
 
-    model_beacon: Array  # (..., coils, 3), field of each coil without the map
+    model_beacon: AnyArray  # (..., coils, 3), field of each coil without the map
     correction: Array  # (..., 1, 3, 3), multiplies it
-    slope: Array  # (..., coils, 3, 3), what the map's change along each axis adds to the gradient
+    slope: (
+        AnyArray  # (..., coils, 3, 3), what the map's change along each axis adds to the gradient
+    )
 
 
-def _mapped(source: Sources, offset_beacon: Array, model_beacon: Array) -> _Mapped | None:
+def _mapped(source: Sources, offset_beacon: Array, model_beacon: AnyArray) -> _Mapped | None:
     """Evaluate the beacon's map at the sensor; None where it has none."""
     if source.field_map is None:
         return None
@@ -188,6 +168,12 @@ def observe(
     if twist_body is not None:
         twist = twist_body.astype(np.complex128)[..., None, :, None]
         by_time_offset = -(platform_pose @ twist)[..., 0]
+    by_ground = coil_fields_by_log_conductivity(_source(beacon), seen.offset_beacon)
+    if by_ground is not None:
+        if seen.mapped is not None:
+            by_ground = (seen.mapped.correction @ by_ground[..., None])[..., 0]
+        by_ground = seen.tones_from_coils @ by_ground
+        by_ground = by_ground @ np.swapaxes(sensor_from_body @ seen.body_from_beacon, -1, -2)
     return Observation(
         phasor_sensor=phasor,
         platform_pose=platform_pose,
@@ -197,6 +183,7 @@ def observe(
         matrix=by_matrix(in_sensor),
         body_from_sensor=np.concatenate([matrix @ skew(in_sensor), by_body @ mounting], axis=-1),
         time_offset=by_time_offset,
+        log_conductivity=by_ground,
     )
 
 
@@ -221,13 +208,13 @@ class _Seen(NamedTuple):
     phasor_sensor: ComplexArray
     platform_pose: ComplexArray
     offset_beacon: Array
-    coils_beacon: Array  # (..., coils, 3), field of each coil
+    coils_beacon: AnyArray  # (..., coils, 3), field of each coil
     tones_from_coils: ComplexArray  # (..., tones, coils)
     body_from_beacon: Array
     mapped: _Mapped | None
 
 
-def _times(left: Array, right: Array) -> Array:
+def _times(left: AnyArray, right: Array) -> AnyArray:
     """Return ``left @ right`` of many and one, or one a beacon: few products beat many small."""
     if right.ndim == 2:
         return (left.reshape(-1, 3) @ right).reshape(left.shape)
@@ -248,7 +235,7 @@ def _seen(
     beacon_from_body = np.swapaxes(body_from_beacon, -1, -2)
     body_from_sensor = magnetometer.body_from_sensor @ magnetometer.matrix.T  # not a rotation
     measured_from_beacon = np.swapaxes(_times(beacon_from_body, body_from_sensor), -1, -2)
-    # Coil by coil all is real; only their sum in a tone is complex.
+    # Coil by coil all is real where nothing conducts; only their sum in a tone is complex.
     mapped = _mapped(source, offset_beacon, coils)
     if mapped is not None:
         coils = (mapped.correction @ coils[..., None])[..., 0]
@@ -276,7 +263,7 @@ def _seen(
 def driven_field(
     beacon: Beacon | Sources,
     position_world: Array,
-    current: Array,
+    current: AnyArray,
     along_world: Array | None = None,
 ) -> Driven:
     """Return the field of a beacon at points, its coils' currents given, world axes.
@@ -288,7 +275,8 @@ def driven_field(
     position_world : ndarray, shape (n, 3)
         (m)
     current : ndarray, shape (n, coils) or (beacons, n, coils)
-        Of each coil, as a share of its peak.
+        Of each coil, as a share of its peak; complex, and turning with time, where the ground
+        conducts: what is returned is then the real part.
     along_world : ndarray, shape (n, 3), optional
         A displacement of the points, or their velocity.
     """
@@ -296,7 +284,8 @@ def driven_field(
     world_from_beacon = source.world_from_beacon
     offset = (position_world - source.position_world) @ world_from_beacon
     along = None if along_world is None else along_world @ world_from_beacon
-    if source.loops.radius is not None or source.field_map is not None:
+    whole = source.loops.radius is not None or source.field_map is not None
+    if whole or source.decay is not None:
         driven = _driven_coils(source, offset, current, along)
     else:
         driven = driven_dipoles(source, offset, current, along)
@@ -304,18 +293,18 @@ def driven_field(
     return Driven(driven.field @ back, None if driven.along is None else driven.along @ back)
 
 
-def _driven_coils(source: Sources, offset: Array, current: Array, along: Array | None) -> Driven:
+def _driven_coils(source: Sources, offset: Array, current: AnyArray, along: Array | None) -> Driven:
     """Return the field of coils of any size, with the beacon's map, as `driven_dipoles`."""
     coils, gradients = coil_fields_and_gradients(source, offset)
     mapped = _mapped(source, offset, coils)
     if mapped is not None:
         coils = (mapped.correction @ coils[..., None])[..., 0]
         gradients = mapped.correction @ gradients + mapped.slope
-    field = np.einsum("...nc,...ncx->...nx", current, coils)
+    field = np.real(np.einsum("...nc,...ncx->...nx", current, coils))
     if along is None:
         return Driven(field, None)
     by = np.einsum("...nc,...ncxy,...ny->...nx", current, gradients, along, optimize=True)
-    return Driven(field, by)
+    return Driven(field, np.real(by))
 
 
 @dataclass(frozen=True, eq=False)

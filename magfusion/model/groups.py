@@ -1,3 +1,12 @@
 """Names of the calibration groups of `magfusion.model.parameters`, for who only names them."""
 
-GROUPS = ("beacons", "moments", "phase", "magnetometer", "extrinsics", "time-offset", "earth")
+GROUPS = (
+    "beacons",
+    "moments",
+    "phase",
+    "magnetometer",
+    "extrinsics",
+    "time-offset",
+    "ground",
+    "earth",
+)

@@ -4,6 +4,7 @@ import numpy as np
 
 from magfusion.model.field import model_error_cov
 from magfusion.model.field_map import block_diagonal
+from magfusion.model.ground import conductivity_of, ground_error
 from magfusion.model.parameters import BeaconParameter, candidates
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
@@ -33,6 +34,8 @@ def calibration_error(site: Site, distance: Array) -> Array:
             rows = names.index(owner) if isinstance(parameter, BeaconParameter) else slice(None)
             share = parameter.field_error * np.mean(parameter.sigma(site, owner) ** 2)
             variance[:, rows] += share / distance[:, rows] ** parameter.falls
+    if site.log_conductivity_sigma and conductivity_of(site):
+        variance += ground_error(site, distance) ** 2
     return np.sqrt(variance)
 
 

@@ -41,6 +41,8 @@ class Observation:
         Right perturbation of the sensor's pose in the body: rotation, translation, sensor axes.
     time_offset : complex ndarray, optional
         IMU time offset; no further axis (T/s).  None where no twist was given.
+    log_conductivity : complex ndarray, optional
+        Logarithm of the ground's conductivity; no further axis (T).  None where nothing conducts.
     """
 
     phasor_sensor: ComplexArray
@@ -51,6 +53,7 @@ class Observation:
     matrix: ComplexArray
     body_from_sensor: ComplexArray
     time_offset: ComplexArray | None
+    log_conductivity: ComplexArray | None = None
 
 
 def is_apart(magnetometer: Magnetometer) -> bool:
@@ -130,9 +133,11 @@ def joined(apart: list[Observation], magnetometer: Magnetometer) -> Observation:
         for name, part in own.items():
             blocks[name].append(part)
     offsets = [o.time_offset for o in apart if o.time_offset is not None]
+    grounds = [o.log_conductivity for o in apart if o.log_conductivity is not None]
     return Observation(
         **{name: np.stack(rows, axis=-2) for name, rows in blocks.items()},
         phasor_sensor=joined_phasors([o.phasor_sensor for o in apart], magnetometer),
         phase=joined_phasors([o.phase for o in apart], magnetometer),
         time_offset=joined_phasors(offsets, magnetometer) if offsets else None,
+        log_conductivity=joined_phasors(grounds, magnetometer) if grounds else None,
     )

@@ -131,6 +131,9 @@ class Beacon:
         How its moments change with temperature.
     hemisphere_beacon : ndarray, shape (3,), optional
         Direction, of any length, in front of which the magnetometer always is.
+    conductivity : float
+        Of the ground or water that it and the magnetometer are in (S/m), the same in all
+        directions and without end; one for all beacons of a site.
     """
 
     name: str
@@ -147,6 +150,7 @@ class Beacon:
     noise_factor: float = 1.0
     hemisphere_beacon: Array | None = None
     warming: Warming | None = None
+    conductivity: float = 0.0
 
     @cached_property
     def tones(self) -> tuple[tuple[float, int | None], ...]:
@@ -344,6 +348,8 @@ class Site:
         Of its beacons, as a log or a stream has them.
     drives : DriveShares, optional
         Of its beacons' currents, likewise.
+    log_conductivity_sigma : float
+        Of the logarithm of the conductivity that its beacons have; zero means known.
     """
 
     gravity: float
@@ -360,6 +366,7 @@ class Site:
     region: Region | None = None
     temperatures: Temperatures | None = None
     drives: DriveShares | None = None
+    log_conductivity_sigma: float = 0.0
 
     @cached_property
     def bounds(self) -> Bounds | None:

@@ -50,6 +50,7 @@ CODES = {
     "gravity_direction": "the mean specific force contradicts gravity at the estimated attitude",
     "gravity_missing": "gravity has been removed from the specific force",
     "gravity_sign": "the accelerometer's vertical points the other way",
+    "ground": "the conductivity of ground or water is not as declared",
     "gyro_field": "the steady field does not turn as the gyroscope says",
     "gyro_scale": "the gyroscope's scale is wrong",
     "gyro_sign": "the sign of the gyroscope, or of one axis, is reversed",

@@ -1,6 +1,7 @@
 """What a magnetometer reads along a motion, sample by sample, and how that changes.
 
 Of real numbers all through: the coils' currents at every sample, and the field that they make.
+Where the ground conducts the field lags behind them, and both are complex until they are summed.
 """
 
 from typing import NamedTuple
@@ -14,7 +15,7 @@ from magfusion.model.parameters import Calibration
 from magfusion.model.receive_coils import is_apart, joined_samples, points_apart
 from magfusion.model.site import Magnetometer, Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.units import Array, ComplexArray
+from magfusion.units import AnyArray, Array, ComplexArray
 
 
 class Motion(NamedTuple):
@@ -79,7 +80,7 @@ def predicted_waveform(
     return field + magnetometer.offset, by
 
 
-def _currents(calibration: Calibration, time: Array, carrier: ComplexArray) -> list[Array]:
+def _currents(calibration: Calibration, time: Array, carrier: ComplexArray) -> list[AnyArray]:
     """Return the currents of each source's coils as a share of their peak.
 
     Shape (n, coils), or (beacons, n, coils) where it is several beacons.
@@ -87,10 +88,12 @@ def _currents(calibration: Calibration, time: Array, carrier: ComplexArray) -> l
     still = not np.any(calibration.drift) and not are_driven(calibration.site)
     phase = calibration.drive_phase(time[:1] if still else time)
     drive = carrier * (calibration.gain_at(time) * np.exp(1j * phase))
-    of_beacon, start = [], 0
+    of_beacon: list[AnyArray] = []
+    start = 0
     for beacon in calibration.site.beacons:
         tones = slice(start, start + len(beacon.tones))
-        of_beacon.append(np.asarray((drive[:, tones] @ beacon.excitation.T).real))
+        current = drive[:, tones] @ beacon.excitation.T
+        of_beacon.append(np.asarray(current if beacon.conductivity else current.real))
         start = tones.stop
     return [
         np.stack([of_beacon[k] for k in rows]) if len(rows) > 1 else of_beacon[rows[0]]
@@ -103,7 +106,7 @@ def _at_point(
     motion: Trajectory,
     site: Site,
     earth_field_world: Array,
-    currents: list[Array],
+    currents: list[AnyArray],
     change: Motion | None,
 ) -> tuple[Array, Array]:
     """Return what a magnetometer reads whose axes are at one point, without its offset."""

@@ -25,7 +25,7 @@ from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.site import Beacon, Site
 from magfusion.units import Array, BoolArray, IntArray
 
-SURVEY_GROUPS = ("beacons", "moments", "phase", "magnetometer", "extrinsics")
+SURVEY_GROUPS = ("beacons", "moments", "phase", "magnetometer", "extrinsics", "ground")
 CHUNK = 500  # points linearised at once
 NEAREST = 0.2  # m from a beacon's centre; nearer, coils are no dipoles
 OPEN = 1e-6  # of the best determined direction, in sigmas: what counts as no information

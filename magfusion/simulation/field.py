@@ -7,7 +7,8 @@ import numpy as np
 from magfusion.model.physics.solenoid import solenoid_field
 from magfusion.model.site import Beacon, Coil, Site
 from magfusion.simulation.disturbance import Spheres
-from magfusion.units import Array, ComplexArray
+from magfusion.simulation.ground import ground_effect
+from magfusion.units import AnyArray, Array, ComplexArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +50,19 @@ def coil_field(offset: Array, coil: Coil) -> Array:
     return solenoid_field(offset - coil.centre_beacon, coil.moment_beacon, coil.radius, coil.length)
 
 
-def beacon_fields_world(beacon: Beacon, point_world: Array) -> Array:
-    """Return the field of each coil at its peak current (T), shape (n, coils, 3)."""
+def beacon_fields_world(beacon: Beacon, point_world: Array) -> AnyArray:
+    """Return the field of each coil at its peak current (T), shape (n, coils, 3).
+
+    Complex where the ground conducts, in which it lags behind the current.
+    """
     offset_beacon = (point_world - beacon.position_world) @ beacon.world_from_beacon
-    fields_beacon = np.stack([coil_field(offset_beacon, coil) for coil in beacon.coils], axis=1)
-    return fields_beacon @ beacon.world_from_beacon.T
+    fields: list[AnyArray] = [coil_field(offset_beacon, coil) for coil in beacon.coils]
+    if beacon.conductivity:
+        for j, coil in enumerate(beacon.coils):
+            frequency_hz = coil.frequency_hz or beacon.frequency_hz
+            offset = offset_beacon - coil.centre_beacon
+            fields[j] = fields[j] + ground_effect(offset, coil, frequency_hz, beacon.conductivity)
+    return np.asarray(np.stack(fields, axis=1) @ beacon.world_from_beacon.T)
 
 
 def phasors_world(

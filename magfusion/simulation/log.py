@@ -232,13 +232,17 @@ def perturb_site(site: Site, rng: np.random.Generator) -> Site:
     """Return a site whose calibration is drawn from the priors that the given one declares.
 
     Rotations are perturbed on the right, in beacon and in sensor axes; positions in world axes
-    (beacons) and in body axes (magnetometer); moments by the exponential of their logarithm's.
+    (beacons) and in body axes (magnetometer); moments and the ground's conductivity by the
+    exponential of their logarithm's.
     What goes together is drawn together.
     """
     draw = _draws(site.correlation, rng)
     beacons = tuple(_perturb_beacon(beacon, draw) for beacon in site.beacons)
     magnetometer = _perturb_magnetometer(site.platform.magnetometer, draw)
     platform = replace(site.platform, magnetometer=magnetometer)
+    if site.log_conductivity_sigma:
+        error = draw("ground", "ground", "conductivity", np.array([site.log_conductivity_sigma]))
+        beacons = tuple(replace(b, conductivity=b.conductivity * np.exp(error[0])) for b in beacons)
     return replace(site, beacons=beacons, platform=platform)
 
 

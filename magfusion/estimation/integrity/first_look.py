@@ -1,6 +1,7 @@
 """A first look at a log, in seconds: everything that can be judged without solving for it."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from magfusion.estimation.integrity.spectrum import (
     spectrum,
 )
 from magfusion.estimation.integrity.stamps import Timing, timings
+from magfusion.estimation.skin_depths import depths_of
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.parameters import initial_calibration
@@ -56,6 +58,8 @@ class Look:
         Everything that stands out of it, tones too.
     fixes : Fixes, optional
         Of a few epochs.
+    depths : mapping
+        Range (m) and skin depths of each beacon that is detected; of none where nothing conducts.
     """
 
     trust: Trust
@@ -65,6 +69,7 @@ class Look:
     spectrum: Spectrum | None = None
     lines: tuple[Line, ...] | None = None
     fixes: Fixes | None = None
+    depths: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def fix_residual(self) -> float:
@@ -120,7 +125,7 @@ def first_look(log: Log, site: Site | None, lockin: LockinSettings | None = None
     trust = Trust(tuple(_promoted(findings)))
     if trust.reasons and trust.reasons[0].code in SYMPTOMS:
         trust = with_cause(trust, log, site, lockin)
-    return Look(trust, *look, hearing, found, seen, fixes)
+    return Look(trust, *look, hearing, found, seen, fixes, depths_of(samples, site))
 
 
 def _promoted(findings: list[Finding]) -> list[Finding]:

@@ -10,10 +10,12 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from magfusion.model.ground import conductivity_of
 from magfusion.model.parameters import (
     BEACON_POSITION,
     BEACON_ROTATION,
     CLOCK_RATE,
+    CONDUCTIVITY,
     DECLINATION,
     DEGREES,
     DRIFT,
@@ -131,6 +133,7 @@ TYPICAL: dict[Parameter, float] = {
     GYRO_ALIGNMENT: DEGREE,
     GRAVITY: 0.01,
     CLOCK_RATE: 1e-5,
+    CONDUCTIVITY: 0.1,
 }
 
 # What no site declares and every instrument has, one sigma: scales and axes of a MEMS, where in its
@@ -165,6 +168,7 @@ CODE: dict[Parameter, str] = {
     GYRO_ALIGNMENT: "imu_axes",
     GRAVITY: "gravity",
     CLOCK_RATE: "imu_clock",
+    CONDUCTIVITY: "ground",
 }
 
 
@@ -199,6 +203,8 @@ def held_blocks(site: Site, estimated: tuple[Block, ...], *, steady: bool) -> tu
     every = (*PARAMETERS, *INERTIAL)
     if not site.platform.inertial:
         every = tuple(p for p in PARAMETERS if p not in (TIME_OFFSET, CLOCK_RATE))
+    if not conductivity_of(site):
+        every = tuple(p for p in every if p != CONDUCTIVITY)
     kinds = [p for p in every if steady or not p.steady_only]
     return placed(
         Block(kind, owner, slice(0), np.full(len(kind.sigma(site, owner)), TYPICAL[kind]))
@@ -259,6 +265,7 @@ def spoken_name(block: Block) -> str:
         LOG_MOMENT: "the moments of beacon {owner}",
         PHASE: "the drive phase of beacon {owner}",
         DRIFT: "the clock of beacon {owner}",
+        CONDUCTIVITY: "the conductivity of the ground",
     }
     own = block.owner if isinstance(block.parameter, BeaconParameter) else ""
     return names.get(block.parameter, block.name).format(owner=own)

@@ -9,10 +9,12 @@ from itertools import combinations, product
 
 import numpy as np
 
+from magfusion.model.ground import range_of_strength, sphere
 from magfusion.model.parameters import Calibration, initial_calibration, predict_channels
 from magfusion.model.site import Beacon, Site
 from magfusion.units import MU0_OVER_4PI, Array, BoolArray, ComplexArray
 
+AROUND = 96  # directions of a beacon in conducting ground
 AZIMUTHS = 16  # of the cone that an unknown drive phase leaves
 ALTERNATIONS = 4  # between attitude and drive phases
 _TINY = 1e-300
@@ -33,6 +35,8 @@ def beacon_directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Arra
     distance : ndarray, shape (n, candidates)
         (m)
     """
+    if beacon.conductivity:
+        return _directions_in_ground(beacon, phasor)
     if beacon.synchronised or len(beacon.tones) == 1:
         return _directions(beacon, phasor)
     found = [_directions(beacon, one) for one in _polarities(beacon, phasor)]
@@ -58,7 +62,7 @@ def _directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Array]:
     left, size, right = np.linalg.svd(moments, full_matrices=True)
     rank = int(np.sum(size > 1e-3 * size[0]))
     if rank == 1:
-        direction = np.broadcast_to(_sphere(48), (len(phasor), 48, 3))
+        direction = np.broadcast_to(sphere(48), (len(phasor), 48, 3))
     else:
         # Columns: the field of a unit moment along each of the principal drive axes.
         unit = np.swapaxes(measured, 1, 2) @ right[:rank].T / size[:rank]
@@ -73,6 +77,16 @@ def _directions(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Array]:
     strength = np.sqrt(np.sum(seen**2, axis=(-1, -2)))
     total = np.sqrt(np.sum(measured**2, axis=(1, 2)))[:, None] + _TINY
     return direction, np.asarray(np.cbrt(MU0_OVER_4PI * strength / total))
+
+
+def _directions_in_ground(beacon: Beacon, phasor: ComplexArray) -> tuple[Array, Array]:
+    """Return directions all around, each at the range whose field is as strong as the phasors.
+
+    What lags is no Gram matrix of real fields; but along any direction it grows weaker with range.
+    """
+    direction = sphere(AROUND)
+    distance = range_of_strength(beacon, phasor, direction)
+    return np.broadcast_to(direction, (*distance.shape, 3)), distance
 
 
 def _planar_directions(beacon: Beacon, power: Array, axes: Array, left: Array) -> Array:
@@ -92,14 +106,6 @@ def _planar_directions(beacon: Beacon, power: Array, axes: Array, left: Array) -
     flat = sine * (within @ left[:, :2].T)
     up = cosine * left[:, 2]
     return np.concatenate([flat + up, flat - up], axis=1)
-
-
-def _sphere(number: int) -> Array:
-    """Evenly spread directions (Fibonacci lattice), shape (number, 3)."""
-    height = 1.0 - (2.0 * np.arange(number) + 1.0) / number
-    turn = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(number)
-    flat = np.sqrt(1.0 - height**2)
-    return np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
 
 
 def positions(calibration: Calibration, phasor: ComplexArray, weight: Array, keep: int) -> Array:

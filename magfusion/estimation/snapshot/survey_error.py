@@ -13,7 +13,7 @@ from magfusion.model.parameters import (
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.units import Array
 
-SURVEY_GROUPS = ("beacons", "moments", "magnetometer", "extrinsics")
+SURVEY_GROUPS = ("beacons", "moments", "magnetometer", "extrinsics", "ground")
 
 
 def survey_jacobians(

@@ -18,6 +18,7 @@ from magfusion.model.parameters.beacon import PHASE_SIGMA as PHASE_SIGMA
 from magfusion.model.parameters.beacon import BeaconParameter as BeaconParameter
 from magfusion.model.parameters.channels import linearize_channels as linearize_channels
 from magfusion.model.parameters.channels import predict_channels as predict_channels
+from magfusion.model.parameters.ground import CONDUCTIVITY as CONDUCTIVITY
 from magfusion.model.parameters.parameter import CENTIMETRE as CENTIMETRE
 from magfusion.model.parameters.parameter import DEGREES as DEGREES
 from magfusion.model.parameters.parameter import PERCENT as PERCENT
@@ -51,6 +52,7 @@ PARAMETERS: tuple[Parameter, ...] = (
     SENSOR_POSITION,
     TIME_OFFSET,
     CLOCK_RATE,
+    CONDUCTIVITY,
     DECLINATION,
     STRENGTH,
 )

@@ -1,0 +1,27 @@
+"""The conductivity of the ground as a site's file has it, with a sigma in its own unit.
+
+It is estimated by its logarithm: one sigma up is the conductivity and its sigma together.
+"""
+
+import math
+from typing import Any
+
+from magfusion.model.ground import conductivity_of
+from magfusion.model.site import Site
+
+
+def log_sigma(conductivity: float, sigma: float) -> float:
+    """Return the standard deviation of the logarithm, of one in S/m."""
+    return math.log1p(sigma / conductivity) if conductivity else 0.0
+
+
+def ground_entry(site: Site) -> dict[str, Any]:
+    """Return what a site's file says of it; nothing where nothing conducts."""
+    found = conductivity_of(site)
+    if not found:
+        return {}
+    entry: dict[str, Any] = {"conductivity_s_m": float(found)}
+    if site.log_conductivity_sigma:
+        sigma = found * math.expm1(site.log_conductivity_sigma)
+        entry["sigma"] = {"conductivity_s_m": float(sigma)}
+    return entry

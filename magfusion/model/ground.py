@@ -1,0 +1,91 @@
+"""Ground or water that conducts, about all the beacons of a site."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.model.coil_field import alone, coil_fields
+from magfusion.model.physics.conduction import skin_depth
+from magfusion.model.site import Beacon, Site
+from magfusion.units import MU0_OVER_4PI, Array, ComplexArray
+
+# Beyond so many skin depths hardly a hundredth of the field is left, and what is left says more of
+# the ground than of the place.
+DEEPEST = 5.0
+
+_NEARER = 3.0  # e-folds of range that conduction may take off
+_HALVINGS = 24
+_TINY = 1e-300
+
+
+def conductivity_of(site: Site) -> float:
+    """Return the conductivity that the beacons of a site are in (S/m); zero without any."""
+    return site.beacons[0].conductivity if site.beacons else 0.0
+
+
+def in_ground(site: Site, conductivity: float) -> Site:
+    """Return a site in ground or water of a conductivity (S/m)."""
+    beacons = tuple(replace(b, conductivity=conductivity) for b in site.beacons)
+    return replace(site, beacons=beacons)
+
+
+def skin_depths(beacon: Beacon, distance: Array) -> Array:
+    """Return how many skin depths of a beacon's highest tone some distances (m) are."""
+    frequency = float(beacon.tone_frequencies_hz.max())
+    return np.asarray(distance / skin_depth(frequency, beacon.conductivity))
+
+
+def ground_error(site: Site, distance: Array) -> Array:
+    """Return the relative error of each beacon's field that the conductivity's sigma causes.
+
+    Parameters
+    ----------
+    distance : ndarray, shape (n, beacons)
+        (m)
+
+    Returns
+    -------
+    ndarray, shape (n, beacons)
+        Of the field in the plane of the dipole's equator.
+    """
+    depths = [skin_depths(b, distance[:, k]) for k, b in enumerate(site.beacons)]
+    x = (1.0 + 1.0j) * np.minimum(np.stack(depths, axis=1), 2.0 * DEEPEST)
+    return site.log_conductivity_sigma * np.abs(x**2 * (1.0 - x) / (1.0 + x + x**2)) / 2.0
+
+
+def range_of_strength(beacon: Beacon, phasor: ComplexArray, direction_beacon: Array) -> Array:
+    """Return how far along each direction a beacon's field is as strong as its phasors.
+
+    Parameters
+    ----------
+    phasor : complex ndarray, shape (n, tones, 3)
+        (T), in any axes.
+    direction_beacon : ndarray, shape (directions, 3)
+        Unit vectors.
+
+    Returns
+    -------
+    ndarray, shape (n, directions)
+        (m)
+    """
+    total = np.sum(np.abs(phasor) ** 2, axis=(1, 2))[:, None] + _TINY
+    drive = beacon.moments_beacon.T @ beacon.excitation  # (3, tones)
+    loudest = 2.0 * MU0_OVER_4PI * np.sqrt(np.sum(np.abs(drive) ** 2))
+    # Conduction makes the field nowhere stronger than the dipole's at its poles.
+    far = np.log(np.cbrt(loudest / np.sqrt(total))) + np.zeros(len(direction_beacon))
+    near, source = far - _NEARER, alone(beacon)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (near + far)
+        coils = coil_fields(source, np.exp(middle)[..., None] * direction_beacon)
+        seen = beacon.excitation.T @ coils
+        louder = np.sum(np.abs(seen) ** 2, axis=(-1, -2)) > total
+        near, far = np.where(louder, middle, near), np.where(louder, far, middle)
+    return np.asarray(np.exp(0.5 * (near + far)))
+
+
+def sphere(number: int) -> Array:
+    """Return evenly spread directions (Fibonacci lattice), shape (number, 3)."""
+    height = 1.0 - (2.0 * np.arange(number) + 1.0) / number
+    turn = np.pi * (1.0 + np.sqrt(5.0)) * np.arange(number)
+    flat = np.sqrt(1.0 - height**2)
+    return np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
