@@ -18,11 +18,13 @@ _IMAGINARY = ("im_x", "im_y", "im_z")
 _UPPER = np.triu_indices(3)
 _COV = tuple(f"cov_{'xyz'[i]}{'xyz'[j]}" for i, j in zip(*_UPPER, strict=True))
 LEAST_ROWS = 8  # fewer may be zero in a component by their pose
+_AMPLITUDE = "amplitude"
+_PARTS = {axis: (f"re_{axis}", f"im_{axis}") for axis in "xyz"}
 _LAYOUT = Layout(
-    numbers=(*_REAL, *_IMAGINARY, "sigma", "window"),
+    numbers=("sigma", "window"),
     integers=(TIME, "tone"),
     texts=("beacon",),
-    optional=(_COV,),
+    optional=(*_PARTS.values(), (_AMPLITUDE,), _COV),
     repeats=True,
 )
 
@@ -47,7 +49,8 @@ def read_fields(path: Path, span: Span) -> FieldSamples:
     """Read and check phasors in Parquet or CSV, within a span of time.
 
     Channels are in the order in which the file first names them; the covariance is
-    ``sigma**2`` times the identity where the file does not hold one.
+    ``sigma**2`` times the identity where the file does not hold one.  A receiver of fewer axes
+    leaves columns out, which are NaN; one that tells no sign gives amplitudes, here along x.
 
     Raises
     ------
@@ -57,7 +60,7 @@ def read_fields(path: Path, span: Span) -> FieldSamples:
         positive, or a component measured nothing in any row.
     """
     table = read_table(path, _LAYOUT, span)
-    _refuse_blind(table, path)
+    axes, signed = _measured(table, path)
     channels, column = _channels(table)
     time_ns, first, row = np.unique(table.time_ns, return_index=True, return_inverse=True)
     cell = row * len(channels) + column
@@ -68,12 +71,19 @@ def read_fields(path: Path, span: Span) -> FieldSamples:
     differs = window != window[first][row]
     table.refuse(differs, "window", window, "write the same in all rows of one time")
     phasor = np.full((len(time_ns), len(channels), 3), np.nan, dtype=np.complex128)
-    phasor[row, column] = table.numbers(_REAL) + 1j * table.numbers(_IMAGINARY)
-    size = np.linalg.norm(phasor[row, column], axis=1)
+    for axis in axes:
+        names = _PARTS[axis] if signed else (_AMPLITUDE,)
+        parts = table.numbers(names)
+        phasor[row, column, "xyz".index(axis)] = parts[:, 0] + (1j * parts[:, 1] if signed else 0)
+    if not signed:
+        found = phasor[row, column, 0].real
+        table.refuse(found < 0.0, _AMPLITUDE, found, "an amplitude has no sign; write re and im")
+    size = np.sqrt(np.nansum(np.abs(phasor[row, column]) ** 2, axis=1))
     check_field(size, str(path))
     cov = np.full((*phasor.shape, 3), np.nan)
     cov[row, column] = _covariance(table)
-    return FieldSamples(table.time[first], window[first], channels, phasor, cov)
+    at = table.time[first], window[first]
+    return FieldSamples(*at, channels, phasor, cov, axes=axes, signed=signed)
 
 
 def order_channels(fields: FieldSamples, site: Site) -> FieldSamples:
@@ -100,18 +110,36 @@ def order_channels(fields: FieldSamples, site: Site) -> FieldSamples:
     return replace(fields, channels=site.channels, phasor_sensor=phasor, phasor_cov=cov)
 
 
-def _refuse_blind(table: Table, path: Path) -> None:
-    """Refuse what a receiver of one or two axes leaves: no number, or a zero that is none."""
-    parts = np.stack([table.numbers(names, nan=True) for names in (_REAL, _IMAGINARY)])
-    blind = np.all((parts == 0.0) | np.isnan(parts), axis=(0, 1))
+def _measured(table: Table, path: Path) -> tuple[str, bool]:
+    """Return the axes that a table has, and whether it tells their signs."""
+    axes = "".join(axis for axis, names in _PARTS.items() if table.has(names))
+    if table.has((_AMPLITUDE,)):
+        if axes or table.has(_COV):
+            raise InputError(
+                f"{path}: holds amplitude beside re, im or a covariance; keep the one or the other"
+            )
+        return "x", False
+    if not axes:
+        wanted = ", ".join((*_REAL, *_IMAGINARY))
+        raise InputError(f"{path}: columns {wanted} are missing; add what is missing.")
+    if table.has(_COV) and axes != "xyz":
+        raise InputError(f"{path}: holds a covariance of three axes, and only {axes}; leave it out")
+    _refuse_blind(table, path, axes)
+    return axes, True
+
+
+def _refuse_blind(table: Table, path: Path, axes: str) -> None:
+    """Refuse a component without a number, or with zeros that are none."""
+    parts = np.stack([table.numbers(_PARTS[axis], nan=True) for axis in axes])
+    blind = np.all((parts == 0.0) | np.isnan(parts), axis=(1, 2))
     if len(table) < LEAST_ROWS or not np.any(blind) or np.all(blind):
         return
-    axes = [axis for axis, none in zip("xyz", blind, strict=True) if none]
-    names = ", ".join(f"re_{axis}, im_{axis}" for axis in axes)
+    none = [axis for axis, nothing in zip(axes, blind, strict=True) if nothing]
+    names = ", ".join(f"re_{axis}, im_{axis}" for axis in none)
     raise InputError(
-        f"{path}: {names} measured nothing (zero or NaN in every row): no pose is found by a"
-        " receiver of one or two axes, and zeros would be taken for fields; give all three"
-        " components."
+        f"{path}: {names} measured nothing (zero or NaN in every row); give the component, or leave"
+        " its columns out and declare platform.magnetometer.axes without it: zeros would be taken"
+        " for fields."
     )
 
 

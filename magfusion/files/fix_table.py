@@ -1,5 +1,6 @@
 """Hypotheses of single-epoch fixes as a table, several rows a time, best first."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,8 @@ def write_hypotheses(
     determined: BoolArray,
     relation: NDArray[np.str_],
     trust: StateTrust | None = None,
+    *,
+    columns: Mapping[str, Array] | None = None,
 ) -> None:
     """Write the hypotheses of every epoch as Parquet.
 
@@ -41,25 +44,27 @@ def write_hypotheses(
         How each follows from the best, e.g. ``mirror A``.
     trust : StateTrust, optional
         Of each epoch, as in `magfusion.files.trajectory_table.write_trajectory`.
+    columns : mapping of str to ndarray, shape (n, hypotheses), optional
+        More that is said of each.
     """
+    more = {} if columns is None else columns
     epoch, rank = np.nonzero(np.isfinite(cost))
     rotation = Rotation.from_matrix(world_from_body[epoch, rank])
-    columns: dict[str, object] = {
+    table: dict[str, object] = {
         TIME: Span(epoch_ns).stamps(time[epoch]),
         "hypothesis": rank,
     }
-    columns |= dict(
+    table |= dict(
         zip(("position_x", "position_y", "position_z"), position_world[epoch, rank].T, strict=True)
     )
-    columns |= dict(
-        zip(("qw", "qx", "qy", "qz"), rotation.as_quat(scalar_first=True).T, strict=True)
-    )
-    columns |= {
+    table |= dict(zip(("qw", "qx", "qy", "qz"), rotation.as_quat(scalar_first=True).T, strict=True))
+    table |= {
         "chi_square": cost[epoch, rank],
         "probability": probability[epoch, rank],
         "determined": determined[epoch, rank],
         "relation": relation[epoch, rank],
     }
+    table |= {name: values[epoch, rank] for name, values in more.items()}
     if trust is not None:
-        columns |= trust_columns(trust, epoch)
-    write_table(columns, path)
+        table |= trust_columns(trust, epoch)
+    write_table(table, path)

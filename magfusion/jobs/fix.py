@@ -14,12 +14,19 @@ from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figure, Figures, heading
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from contextlib import AbstractContextManager
+
+    import numpy as np
+    from numpy.typing import NDArray
+
     from magfusion.estimation.snapshot.fix import Fixes
     from magfusion.jobs.inputs import Job
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
     from magfusion.model.trust import Risk, StateTrust, Trust
     from magfusion.receiver.windows import LockinSettings
+    from magfusion.units import Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,9 +133,11 @@ def run_fix(
     from magfusion.results.verdict import level_figures, trust_figures
 
     claimed = claim(job.output, "smooth", "fix")
-    log, site = read_job(job, report=report)
+    log, site = read_job(job, coil=True, report=report)
     began = time.perf_counter()
     report("demodulating", 0, 3)
+    if len(site.platform.magnetometer.axes) == 1:
+        return _run_coil(claimed, job, log, site, free, report)
     with named(job.log_path):
         phasor_samples, dropped = phasors(log, site, lockin)
     report("fixing", 1, 3)
@@ -155,6 +164,39 @@ def run_fix(
     return figures
 
 
+def _run_coil(
+    claimed: AbstractContextManager[Path],
+    job: Job,
+    log: Log,
+    site: Site,
+    free: tuple[str, ...],
+    report: Report,
+) -> Figures:
+    """Fix a receiver of one axis, whose roll about it nothing tells."""
+    from magfusion.jobs.fix_coil import find_coil
+    from magfusion.jobs.inputs import found_in, refuse_failed
+
+    assert log.fields is not None
+    found = find_coil(log, log.fields, site, free, report)
+    with claimed as whole:
+        directory = found_in(whole, found.trust)
+        figures = write_fix_result(
+            directory,
+            found.log,
+            site,
+            found.fixes,
+            found.figures,
+            found.states,
+            found.trust,
+            relation=found.relation,
+            columns=found.columns,
+        )
+        if directory != whole:
+            (directory / "report.json").rename(whole / "report.json")
+    refuse_failed(job.log_path, job.output, found.trust)
+    return figures
+
+
 def write_fix_result(
     directory: Path,
     log: Log,
@@ -163,8 +205,19 @@ def write_fix_result(
     figures: Figures,
     states: StateTrust | None = None,
     trust: Trust | None = None,
+    *,
+    relation: NDArray[np.str_] | None = None,
+    columns: Mapping[str, Array] | None = None,
 ) -> Figures:
-    """Write the fixes; return the figures with the errors against the truth."""
+    """Write the fixes; return the figures with the errors against the truth.
+
+    Parameters
+    ----------
+    relation : ndarray of str, optional
+        As in `write_hypotheses`, where it is not that of the symmetries.
+    columns : mapping, optional
+        More of them.
+    """
     from magfusion.estimation.snapshot.ambiguity import relations
     from magfusion.files.fix_table import write_hypotheses
     from magfusion.files.trajectory_table import write_trajectory
@@ -186,8 +239,9 @@ def write_fix_result(
         fixes.cost,
         fixes.probability,
         fixes.determined,
-        relations(fixes, site).label,
+        relations(fixes, site).label if relation is None else relation,
         states,
+        columns=columns or {},
     )
     write_recording(
         directory / "run.rrd",

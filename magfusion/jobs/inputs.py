@@ -233,7 +233,12 @@ def read_site(job: Job, *, unknown: bool = False, without: bool = False) -> Site
 
 
 def read_job(
-    job: Job, *, unknown: bool = False, without: bool = False, report: Report = quiet
+    job: Job,
+    *,
+    unknown: bool = False,
+    without: bool = False,
+    coil: bool = False,
+    report: Report = quiet,
 ) -> tuple[Log, Site]:
     """Read the log and the site of a job, and see that they belong together.
 
@@ -243,6 +248,8 @@ def read_job(
         Whether the job can do with beacons that were never surveyed.
     without : bool
         Whether it can do without any.
+    coil : bool
+        Whether it can do with a receiver of one axis.
 
     Raises
     ------
@@ -251,6 +258,7 @@ def read_job(
     """
     site = read_site(job, unknown=unknown, without=without)
     log = _open(job, report)
+    _check_axes(job, log, site, coil=coil)
     log, site = logged(log, site)
     if log.inertial and site.platform.imu == NO_IMU:
         raise InputError(
@@ -268,6 +276,42 @@ def read_job(
     with named(job.log_path):
         log, site = with_drives(log, site)
     return at_reference(log, site)
+
+
+def _check_axes(job: Job, log: Log, site: Site, *, coil: bool) -> None:
+    """Refuse components that are not those of the site's receiver, or that a job cannot take."""
+    declared, fields = site.platform.magnetometer.axes, log.fields
+    key = f"{job.declared_path}: platform.magnetometer.axes:"
+    if declared == "xyz" and (fields is None or (fields.axes == "xyz" and fields.signed)):
+        return
+    sensor = site.platform.magnetometer
+    if len(declared) < 3 and (sensor.warming is not None or sensor.coil_kappa != 0.0):
+        raise InputError(
+            f"{key} of a receiver of fewer than three axes neither warming nor coil_kappa_m2 is"
+            " taken into account; leave them out"
+        )
+    if len(declared) == 2:
+        raise InputError(
+            f"{key} a receiver of two axes is not located yet; give the third component, or one"
+            " axis alone"
+        )
+    if fields is None:
+        raise InputError(
+            f"{job.log_path}: a receiver of one axis is located by phasors or amplitudes; give"
+            " fields.parquet"
+        )
+    found = fields.axes if fields.signed else declared
+    if found != declared or (declared == "xyz" and not fields.signed):
+        has = ", ".join(fields.axes) if fields.signed else "one amplitude"
+        raise InputError(
+            f"{key} is [{', '.join(declared)}], and the fields of {job.log_path} have {has};"
+            " declare the axes that the receiver has"
+        )
+    if not coil:
+        raise InputError(
+            f"{key} a receiver of one axis leaves its roll open, and is located by fix alone; run"
+            " magfusion fix"
+        )
 
 
 def require_imu(job: Job, log: Log, what: str) -> None:

@@ -77,6 +77,10 @@ class FieldSamples:
     ahead : ndarray, shape (n, channels), optional
         How much later than at ``time`` the sensor was where each phasor was measured (s): of coils
         driven in turn, whose phasors are in the sensor's axes of ``time`` all the same.
+    axes : str
+        Components that the receiver has; the others are NaN.
+    signed : bool
+        False of amplitudes without sign and phase: real, of the one axis.
     """
 
     time: Array
@@ -85,6 +89,8 @@ class FieldSamples:
     phasor_sensor: ComplexArray
     phasor_cov: Array
     ahead: Array | None = None
+    axes: str = "xyz"
+    signed: bool = True
 
     def __post_init__(self) -> None:
         n, c = len(self.time), len(self.channels)
@@ -119,6 +125,8 @@ class FieldSamples:
             ahead=None
             if all(p.ahead is None for p in parts)
             else np.concatenate([p.ahead_or_zero for p in parts]),
+            axes=parts[0].axes,
+            signed=parts[0].signed,
         )
 
     def epochs(self) -> list["FieldSamples"]:
@@ -134,6 +142,8 @@ class FieldSamples:
             self.phasor_sensor[kept],
             self.phasor_cov[kept],
             None if self.ahead is None else self.ahead[kept],
+            self.axes,
+            self.signed,
         )
 
     @property

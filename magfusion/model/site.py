@@ -273,6 +273,8 @@ class Magnetometer:
         How matrix and offset change with temperature.
     response : FrequencyResponse, optional
         To fields that are not steady; None where they are measured as steady ones are.
+    axes : str
+        Letters of the axes that it has.
     """
 
     position_body: Array
@@ -286,6 +288,7 @@ class Magnetometer:
     coil_kappa: float = 0.0
     warming: SensorWarming | None = None
     response: FrequencyResponse | None = None
+    axes: str = "xyz"
 
 
 @dataclass(frozen=True)

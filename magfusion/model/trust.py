@@ -97,6 +97,7 @@ CODES = {
     "repeated_samples": "an instrument is read faster than it measures",
     "repeated_stamps": "samples have the stamp of another",
     "restarts": "fields and inertial data lead apart again and again",
+    "roll_open": "a receiver of one axis tells nothing of the roll about it",
     "sample_rate": "the clock of a stream runs at another rate than declared",
     "samples_lost": "samples are missing, one or a few at a time",
     "saturated": "samples stop at a limit of the instrument's range",

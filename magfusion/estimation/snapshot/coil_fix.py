@@ -1,0 +1,306 @@
+"""The fix of a receiver of one axis: where its coil is, and where that points.
+
+The likeliest places of a grid are refined together with the axis on the one measurement model.  The
+roll about the coil bears on nothing.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.estimation.snapshot.coil_starts import (
+    CoilEpochs,
+    Grid,
+    grid_about,
+    middle_of,
+    softened,
+)
+from magfusion.estimation.solve.batched import (
+    Model,
+    Normal,
+    minimise,
+    normal_equations,
+    open_inverse,
+)
+from magfusion.model.coil_field import as_points
+from magfusion.model.noise import calibration_error, model_error
+from magfusion.model.parameters import Calibration, linearize_channels, predict_channels
+from magfusion.model.site import Magnetometer, MagnetometerSigma, Site
+from magfusion.units import Array, BoolArray, IntArray
+
+ALIKE = 1e-3  # of the distance; hypotheses nearer to one another are one
+RIVAL = 25.0  # chi square above the best, from which a place is none
+SOFT_EDGE = 0.02  # of the distance; nobody declares a plane more sharply
+LEAST_GAIN_SIGMA = 1e-4  # nobody knows it better
+UNKNOWNS = 6  # of place, direction and gain
+CHUNK = 200  # epochs refined at once
+REFINED, MIRRORED = 12, 4  # starts that go on of the rough ones, and of which the mirrors do
+ROUGH_PASSES = 20
+ROUGH = 1e-4  # relative fall of the cost below which a start is good enough
+
+
+class Gain(NamedTuple):
+    """What is known of a coil's gain.
+
+    Parameters
+    ----------
+    nominal : float
+    sigma : float
+        Standard deviation of its logarithm; infinite where nothing is known of it.
+    """
+
+    nominal: float = 1.0
+    sigma: float = np.inf
+
+    @staticmethod
+    def of(sensor: Magnetometer, *, free: bool) -> "Gain":
+        """Return that of the one axis of a magnetometer, as declared or free."""
+        row = "xyz".index(sensor.axes)
+        nominal = float(np.linalg.norm(sensor.matrix[row]))
+        sigma = float(sensor.sigma.matrix[row, row]) / nominal
+        return Gain(nominal, np.inf if free else max(sigma, LEAST_GAIN_SIGMA))
+
+
+@dataclass(frozen=True, eq=False)
+class CoilFixes:
+    """Hypotheses of a coil at each epoch, the likeliest first.
+
+    Parameters
+    ----------
+    position_world : ndarray, shape (n, hypotheses, 3)
+        Of the coil (m).
+    axis_world : ndarray, shape (n, hypotheses, 3)
+        Its axis times its gain; of unknown sign where the amplitudes have none.
+    cov : ndarray, shape (n, hypotheses, 6, 6)
+        Of both.
+    cost : ndarray, shape (n, hypotheses)
+        Minus twice the logarithm of their likelihood, the first of each epoch its chi square;
+        infinite where an epoch has fewer.
+    determined : bool ndarray, shape (n, hypotheses)
+        False where place, direction or gain is open.
+    freedom : ndarray, shape (n,)
+        Degrees of freedom of the chi square.
+    """
+
+    position_world: Array
+    axis_world: Array
+    cov: Array
+    cost: Array
+    determined: BoolArray
+    freedom: Array
+
+
+def fix_coil(epochs: CoilEpochs, calibration: Calibration, gain: Gain) -> CoilFixes:
+    """Return where the coil is at each epoch, and where it points.
+
+    Parameters
+    ----------
+    epochs : CoilEpochs
+        One at least.
+    gain : Gain
+        Of the coil.
+
+    Raises
+    ------
+    EstimationError
+        Where the declared region holds no place that could be asked.
+    """
+    known = _at_point(calibration)
+    places = grid_about(known.site)
+    grid = Grid.of(known, float(epochs.time[0]), places, signed=epochs.signed)
+    parts = [
+        _refined(epochs.rows(slice(start, start + CHUNK)), known, gain, grid)
+        for start in range(0, len(epochs), CHUNK)
+    ]
+    every = _Refined(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    return _ranked(every, middle_of(known.site.beacons)[0])
+
+
+class _Refined(NamedTuple):
+    """Where the starts of epochs ended."""
+
+    state: Array  # (n, starts, 6)
+    cov: Array  # (n, starts, 6, 6)
+    cost: Array  # (n, starts)
+    chi_square: Array  # (n, starts)
+    determined: BoolArray  # (n, starts)
+    freedom: Array  # (n,)
+
+
+def _refined(epochs: CoilEpochs, known: Calibration, gain: Gain, grid: Grid) -> _Refined:
+    place, axis = grid.starts(epochs)
+    count = place.shape[1]
+    if np.isfinite(gain.sigma):
+        axis = axis * (gain.nominal / np.linalg.norm(axis, axis=-1, keepdims=True))
+    problem, points = _Problem(epochs, known, gain), _Problem(epochs, _of_points(known), gain)
+    start = np.concatenate([place, axis], axis=2).reshape(-1, 6)
+    owner = np.repeat(np.arange(len(epochs)), count)
+    # A place of the grid is only nearly right: at full weight some end in the next valley, and
+    # there dipoles are as good as coils of true size.
+    soft = points.of(owner, softened(epochs)[owner])
+    rough = minimise(soft, start, relative=ROUGH, passes=ROUGH_PASSES)
+    order = np.argsort(rough.cost.reshape(-1, count), axis=1, kind="stable")[:, :REFINED]
+    best = np.take_along_axis(rough.state.reshape(-1, count, 6), order[..., None], axis=1)
+    start = np.concatenate([best, _mirrored(best[:, :MIRRORED], known.site)], axis=1)
+    count = start.shape[1]
+    start = start.reshape(-1, 6)
+    owner = np.repeat(np.arange(len(epochs)), count)
+    sigma = problem.sigma(owner, start)
+    solved = minimise(problem.of(owner, sigma), start)
+    state, chi_square = solved.state.reshape(-1, count, 6), solved.cost.reshape(-1, count)
+    # The weights are those of each place: where they are small, that it explains all is no wonder.
+    share = np.sum(np.log(sigma / problem.sigma(owner, None)), axis=1).reshape(-1, count)
+    cost = chi_square + share * (4.0 if epochs.signed else 2.0)
+    # In units of the gain, which may be any: what is open is then told by its direction alone.
+    unit = np.ones((len(solved.state), 6))
+    unit[:, 3:] = np.linalg.norm(solved.state[:, 3:], axis=1, keepdims=True)
+    square = unit[:, :, None] * unit[:, None, :]
+    inverse, determined = open_inverse(solved.information * square)
+    cov = (inverse * square).reshape(-1, count, 6, 6)
+    cost = cost + _outside(known.site, state[..., :3], cov[..., :3, :3])
+    if not epochs.signed:  # of both signs the one that points up
+        sign = np.ones_like(state)
+        sign[..., 3:] = np.where(state[..., 5:] < 0.0, -1.0, 1.0)
+        state, cov = sign * state, sign[..., :, None] * cov * sign[..., None, :]
+    there = epochs.heard * (2.0 if epochs.signed else 1.0)
+    freedom = np.asarray(there - UNKNOWNS + float(np.isfinite(gain.sigma)))
+    return _Refined(state, cov, cost, chi_square, determined.reshape(-1, count), freedom)
+
+
+def _mirrored(state: Array, site: Site) -> Array:
+    """Return states on the other side of the plane to which the beacons are nearest."""
+    middle, _ = middle_of(site.beacons)
+    centres = np.array([beacon.position_world for beacon in site.beacons])
+    normal = np.linalg.svd(centres - middle)[2][-1]
+    turn = 2.0 * np.outer(normal, normal) - np.eye(3)
+    return np.concatenate([middle - (state[..., :3] - middle) @ turn, state[..., 3:] @ turn], -1)
+
+
+def _at_point(calibration: Calibration) -> Calibration:
+    """Return a calibration whose magnetometer is a point with the axes of the world."""
+    platform, zero = calibration.site.platform, np.zeros(3)
+    sigma = MagnetometerSigma(np.zeros((3, 3)), zero, zero, zero)
+    response = platform.magnetometer.response
+    plain = Magnetometer(zero, np.eye(3), 1.0, np.eye(3), zero, sigma, response=response)
+    site = replace(calibration.site, platform=replace(platform, magnetometer=plain))
+    return replace(calibration, site=site)
+
+
+def _of_points(calibration: Calibration) -> Calibration:
+    beacons = tuple(as_points(beacon) for beacon in calibration.site.beacons)
+    return replace(calibration, site=replace(calibration.site, beacons=beacons))
+
+
+def _outside(site: Site, place: Array, cov: Array) -> Array:
+    """Return what being outside of the region costs hypotheses, shape (n, hypotheses)."""
+    if site.bounds is None:
+        return np.zeros(place.shape[:-1])
+    margin, normal = site.bounds.margin(place), site.bounds.normal_world
+    variance = np.einsum("ki,nhij,kj->nhk", normal, cov, normal)
+    away = np.min(_distances(site, place), axis=-1)[..., None]
+    score = margin / np.sqrt(np.maximum(variance, 0.0) + (SOFT_EDGE * away) ** 2)
+    return np.asarray(np.sum(np.minimum(score, 0.0) ** 2, axis=-1))
+
+
+def _distances(site: Site, place: Array) -> Array:
+    centres = np.array([beacon.position_world for beacon in site.beacons])
+    return np.asarray(np.linalg.norm(place[..., None, :] - centres, axis=-1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Place and axis of the coil at every epoch."""
+
+    epochs: CoilEpochs
+    calibration: Calibration
+    gain: Gain
+
+    def of(self, owner: IntArray, sigma: Array) -> Model:
+        """Return the model of starts, each of an epoch, with the errors of its channels."""
+
+        def model(rows: IntArray, state: Array) -> Normal:
+            return self.normal(owner[rows], state, sigma[rows])
+
+        return model
+
+    def sigma(self, epoch: IntArray, state: Array | None) -> Array:
+        """Return the errors of channels at states, or of noise alone, shape (k, channels) (T)."""
+        there = np.isfinite(self.epochs.measured[epoch])
+        noise = np.where(there, self.epochs.sigma[epoch], 1.0)
+        if state is None:
+            return noise
+        place, axis = state[:, :3], state[:, 3:]
+        attitude = np.broadcast_to(np.eye(3), (len(state), 3, 3))
+        field = predict_channels(self.calibration, self.epochs.time[epoch], attitude, place)
+        size = np.linalg.norm(field, axis=2) * np.linalg.norm(axis, axis=1, keepdims=True)
+        error = self._error(place) * size / np.sqrt(3.0)
+        return np.asarray(np.where(there, np.hypot(noise, error), 1.0))
+
+    def normal(self, epoch: IntArray, state: Array, sigma: Array) -> Normal:
+        """Return the normal equations at states of place and axis, shape (k, 6)."""
+        place, axis, count = state[:, :3], state[:, 3:], len(state)
+        attitude = np.broadcast_to(np.eye(3), (count, 3, 3))
+        value, by_pose, _ = linearize_channels(
+            self.calibration, (), self.epochs.time[epoch], attitude, place
+        )
+        field = value[..., :3] + 1j * value[..., 3:]
+        slope = by_pose[..., :3, 3:] + 1j * by_pose[..., 3:, 3:]
+        seen = np.einsum("kcx,kx->kc", field, axis)
+        by_place = np.einsum("kcxy,kx->kcy", slope, axis)
+        measured = self.epochs.measured[epoch]
+        there = np.isfinite(measured)
+        weight = np.where(there, 1.0 / sigma, 0.0)
+        jacobian = np.concatenate([by_place, field], axis=2)
+        left = seen - np.where(there, measured, 0.0)
+        if self.epochs.signed:
+            rows = np.concatenate([jacobian.real, jacobian.imag], axis=1)
+            residual = np.concatenate([left.real, left.imag], axis=1)
+            weight = np.concatenate([weight, weight], axis=1)
+        else:
+            size = np.abs(seen)
+            rows = ((np.conj(seen) / np.maximum(size, 1e-300))[..., None] * jacobian).real
+            residual = size - np.where(there, measured.real, 0.0)
+        residual, rows = residual * weight, rows * weight[..., None]
+        if np.isfinite(self.gain.sigma):
+            gain = np.linalg.norm(axis, axis=1)
+            prior = np.log(gain / self.gain.nominal) / self.gain.sigma
+            by_axis = axis / (self.gain.sigma * gain**2)[:, None]
+            own = np.concatenate([np.zeros((count, 3)), by_axis], axis=1)
+            residual = np.column_stack([residual, prior])
+            rows = np.concatenate([rows, own[:, None]], axis=1)
+        return normal_equations(residual, rows)
+
+    def _error(self, place: Array) -> Array:
+        """Return the relative error of each channel that model and survey leave, (k, channels)."""
+        site = self.calibration.site
+        owner = [i for i, b in enumerate(site.beacons) for _ in b.tones]
+        survey = calibration_error(site, _distances(site, place))[:, owner]
+        return np.hypot(model_error(site, place), survey)
+
+
+def _ranked(found: _Refined, middle: Array) -> CoilFixes:
+    """Return the hypotheses that differ, and of which none is much less likely than the best."""
+    kept: list[list[int]] = []
+    for row, costs in zip(found.state, found.cost, strict=True):
+        own: list[int] = []
+        for k in np.argsort(costs, kind="stable").tolist():
+            near = ALIKE * float(np.linalg.norm(row[k, :3] - middle))
+            apart = all(np.linalg.norm(row[k, :3] - row[o, :3]) > near for o in own)
+            if apart and (not own or costs[k] <= costs[own[0]] + RIVAL):
+                own.append(k)
+        kept.append(own)
+    most = max(map(len, kept))
+    index = np.array([[*own, *[own[0]] * (most - len(own))] for own in kept])
+    there = np.arange(most) < np.array([len(own) for own in kept])[:, None]
+    rows = np.arange(len(index))[:, None]
+    cost = found.cost[rows, index]
+    cost = cost - cost[:, :1] + found.chi_square[rows, index[:, :1]]
+    return CoilFixes(
+        position_world=found.state[rows, index, :3],
+        axis_world=found.state[rows, index, 3:],
+        cov=found.cov[rows, index],
+        cost=np.where(there, cost, np.inf),
+        determined=found.determined[rows, index] & there,
+        freedom=found.freedom,
+    )

@@ -1,0 +1,196 @@
+"""The poses of a platform whose receiver has one axis, and what is to be said of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.integrity.statistics import FALSE_ALARMS, log_p_chi_square
+from magfusion.estimation.snapshot.coil_fix import CoilFixes
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.field import skew
+from magfusion.model.site import Magnetometer, Site
+from magfusion.model.trajectory import Trajectory, interpolate
+from magfusion.model.trust import Finding, StateTrust, Trust, Verdict
+from magfusion.units import Array, BoolArray
+
+ANY_ROLL = np.pi / np.sqrt(3.0)  # rad; standard deviation of a turn of which nothing is known
+AMBIGUOUS = 0.05  # posterior share of a rival that is said
+FEW = 0.1  # share of the epochs; more of them cast doubt
+LONGEST_STEP = 0.1  # s; of a truth that is interpolated
+
+
+def axis_of(sensor: Magnetometer) -> Array:
+    """Return the direction that a magnetometer of one axis feels, body axes, shape (3,)."""
+    felt = sensor.body_from_sensor @ sensor.matrix["xyz".index(sensor.axes)]
+    return np.asarray(felt / np.linalg.norm(felt))
+
+
+def coil_lever(sensor: Magnetometer) -> Array:
+    """Return where its coil is, body axes, shape (3,) (m)."""
+    if sensor.coil_centres_sensor is None:
+        return sensor.position_body
+    own = sensor.coil_centres_sensor["xyz".index(sensor.axes)]
+    return np.asarray(sensor.position_body + sensor.body_from_sensor @ own)
+
+
+def poses_of(found: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixes:
+    """Return the poses that a coil's places and directions leave, the roll chosen and open.
+
+    Of all turns that point the axis as it was found the smallest is taken, so that equal epochs
+    have equal poses.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    signed : bool
+        Whether it is known which way the axis points.
+    """
+    sensor = site.platform.magnetometer
+    lever_body, sigma = coil_lever(sensor), sensor.sigma
+    gain = np.linalg.norm(found.axis_world, axis=-1)
+    towards = found.axis_world / gain[..., None]
+    rotation = _least_turn(axis_of(sensor), towards)
+    back = np.swapaxes(rotation, -1, -2)
+    lever = rotation @ lever_body
+    # By the turn (world axes) and the place of the coil: the body moves about the coil.
+    by_axis = np.zeros((*gain.shape, 6, 6))
+    by_axis[..., :3, 3:] = skew(towards) / gain[..., None, None]
+    by_axis[..., 3:, :3] = np.eye(3)
+    by_axis[..., 3:, 3:] = skew(lever) @ by_axis[..., :3, 3:]
+    cov = by_axis @ found.cov @ np.swapaxes(by_axis, -1, -2)
+    cov += ANY_ROLL**2 * _outer(np.concatenate([towards, np.cross(lever, towards)], axis=-1))
+    along = np.sum(lever * towards, axis=-1, keepdims=True) * towards
+    cov[..., 3:, 3:] += 1.5 * _outer(lever - along)  # about the coil on a circle, not a tangent
+    if not signed:  # twice as far in half of the cases
+        cov[..., 3:, 3:] += 2.0 * _outer(along)
+    body = np.zeros_like(cov)
+    body[..., :3, :3] = body[..., 3:, 3:] = back
+    cov = body @ cov @ np.swapaxes(body, -1, -2)
+    turn = sensor.body_from_sensor * sensor.sigma.rotation_sensor
+    cov[..., :3, :3] += turn @ turn.T
+    cov[..., 3:, 3:] += np.diag(sigma.position_body**2)
+    shape = (*gain.shape, len(site.channels))
+    freedom = np.maximum(found.freedom, 1.0)[:, None]
+    return Fixes(
+        time=time,
+        world_from_body=rotation,
+        position_world=found.position_world - lever,
+        pose_cov=cov,
+        cost=found.cost,
+        residual_rms=np.sqrt(found.cost / freedom),
+        phase=np.zeros(shape),
+        determined=np.zeros(gain.shape, dtype=bool),  # the roll never is
+        log_gain=np.broadcast_to(np.log(gain)[..., None], shape).copy(),
+        gravity_cost=np.zeros(gain.shape),
+        prior_cost=np.zeros(gain.shape),
+    )
+
+
+def _outer(vector: Array) -> Array:
+    return np.asarray(vector[..., :, None] * vector[..., None, :])
+
+
+def _least_turn(from_vector: Array, to_vector: Array) -> Array:
+    """Return the smallest rotations that take directions to others, shape (..., 3, 3)."""
+    start = np.broadcast_to(from_vector, to_vector.shape)
+    across = np.cross(start, to_vector)
+    sine = np.linalg.norm(across, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, np.sum(start * to_vector, axis=-1, keepdims=True))
+    smallest = np.eye(3)[np.argmin(np.abs(start), axis=-1)]
+    other = np.cross(start, smallest)  # any axis across, for the opposite direction
+    other = other / np.linalg.norm(other, axis=-1, keepdims=True)
+    about = np.where(sine > 1e-12, across / np.maximum(sine, 1e-300), other)
+    turn = Rotation.from_rotvec((about * angle).reshape(-1, 3))
+    return np.asarray(turn.as_matrix().reshape(*to_vector.shape, 3))
+
+
+def axis_sigma(found: CoilFixes) -> Array:
+    """Return the standard deviation of the axis across itself, shape (n, hypotheses) (rad)."""
+    gain = np.linalg.norm(found.axis_world, axis=-1)
+    across = skew(found.axis_world / gain[..., None]) / gain[..., None, None]
+    square = across @ found.cov[..., 3:, 3:] @ np.swapaxes(across, -1, -2)
+    return np.asarray(np.sqrt(0.5 * np.trace(square, axis1=-2, axis2=-1)))
+
+
+def nearest_truth(truth: Trajectory, poses: Trajectory, site: Site, *, signed: bool) -> Trajectory:
+    """Return the true poses, turned about the coil to the roll (and sign) that a fix chose.
+
+    An error against them is one of place and direction: of five degrees of freedom.
+    """
+    true, there = interpolate(truth, poses.time, LONGEST_STEP)
+    if not len(true):
+        return truth
+    sensor, chosen = site.platform.magnetometer, poses.world_from_body[there]
+    lever, axis = coil_lever(sensor), axis_of(sensor)
+    coil = true.position_world + true.world_from_body @ lever
+    found, actual = chosen @ axis, true.world_from_body @ axis
+    if not signed:
+        actual = actual * np.where(np.sum(found * actual, axis=1) < 0.0, -1.0, 1.0)[:, None]
+    turned = _least_turn(found, actual) @ chosen
+    return Trajectory(true.time, turned, coil - turned @ lever)
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedPoses:
+    """What is to be said of poses."""
+
+    states: StateTrust
+    trust: Trust
+
+
+def judged_poses(fixes: Fixes, found: CoilFixes, left_out: int, *, signed: bool) -> JudgedPoses:
+    """Return the verdict on each pose and on all.
+
+    Parameters
+    ----------
+    left_out : int
+        Epochs of too few channels.
+    """
+    count = len(fixes)
+    log_p = log_p_chi_square(found.cost[:, 0], np.maximum(found.freedom, 1.0))
+    odd = (found.freedom >= 1.0) & (log_p < np.log(FALSE_ALARMS / count))
+    share, open_ = fixes.probability, ~found.determined[:, 0]
+    rival = share[:, 1] > AMBIGUOUS if share.shape[1] > 1 else np.zeros(count, dtype=bool)
+    roll = (
+        "One axis tells nothing of the roll about it: a roll is chosen, and its sigma is that of"
+        " any. Place and direction are told; of errors against a truth, these alone."
+    )
+    turned = "" if signed else " Amplitudes have no sign: the axis may point the other way."
+    findings = [Finding("roll_open", roll + turned, Verdict.TRUSTWORTHY)]
+    for code, rows, what in (
+        (
+            "ambiguous",
+            rival,
+            "are ambiguous: fixes.parquet holds every place that explains them; declare a"
+            " hemisphere or region, or add a beacon that is off the plane of the others.",
+        ),
+        (
+            "geometry",
+            open_,
+            "leave place or direction of the coil open; add beacons that stand or point otherwise.",
+        ),
+        (
+            "field_residuals",
+            odd,
+            "have residuals that noise and model error do not explain; look for iron, and for a"
+            " beacon that is not as declared.",
+        ),
+    ):
+        findings += _share(code, rows, what)
+    if left_out:
+        text = f"{left_out} epochs hold too few beacons for place, direction and gain; left out."
+        findings.append(Finding("few_data", text, Verdict.TRUSTWORTHY))
+    none, doubt = np.full(count, np.nan), rival | odd | open_
+    verdicts = tuple(Verdict.DOUBTFUL if d else Verdict.TRUSTWORTHY for d in doubt.tolist())
+    states = StateTrust(verdicts, none, none.copy(), ((),) * count)
+    return JudgedPoses(states, Trust(tuple(findings)))
+
+
+def _share(code: str, rows: BoolArray, what: str) -> list[Finding]:
+    count, share = int(np.sum(rows)), float(np.mean(rows))
+    if not count:
+        return []
+    verdict = Verdict.DOUBTFUL if share > FEW else Verdict.TRUSTWORTHY
+    return [Finding(code, f"{count} of {len(rows)} epochs {what}", verdict, share / FEW)]

@@ -1,0 +1,202 @@
+"""What a receiver of one axis measured, and from where its coil is sought.
+
+What it measures of each beacon is one number, ``u . B_j(p)`` with u the coil's axis times its gain:
+linear in u where the place is given, and its square linear in ``u u^T`` where its sign is not
+known.  So a grid of places about the beacons is asked in closed form.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.errors import EstimationError
+from magfusion.model.parameters import Calibration, predict_channels
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Beacon, Site
+from magfusion.units import Array, BoolArray, ComplexArray, IntArray
+
+DIRECTIONS, RADII = 400, 28  # of the grid about the beacons
+NEAREST, FARTHEST = 0.15, 8.0  # of their extent
+LIKELY, KEPT = 400, 40  # places of the grid that are looked at again, and that are refined
+SOFT, FLOOR = 0.1, 0.01  # error at a place of the grid: of an amplitude, of the largest
+FLAT = 1e-9  # of the largest singular value; a combination of channels that says nothing
+_TINY = 1e-300
+_PAIRS = np.triu_indices(3)
+
+
+@dataclass(frozen=True, eq=False)
+class CoilEpochs:
+    """What a coil measured.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        (s)
+    measured : complex ndarray, shape (n, channels)
+        Phasors, or amplitudes (T); NaN where missing.
+    sigma : ndarray, shape (n, channels)
+        Of either part (T).
+    signed : bool
+        Whether the phase tells the sign.
+    """
+
+    time: Array
+    measured: ComplexArray
+    sigma: Array
+    signed: bool
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @staticmethod
+    def of(fields: FieldSamples, site: Site) -> "CoilEpochs":
+        """Return what the one axis measured; without a sign where some drive's phase is unknown."""
+        k = "xyz".index(fields.axes)
+        measured, sigma = fields.phasor_sensor[..., k], np.sqrt(fields.phasor_cov[..., k, k].real)
+        signed = fields.signed and all(beacon.synchronised for beacon in site.beacons)
+        if not signed:
+            measured = np.where(np.isfinite(measured), np.abs(measured), np.nan)
+        return CoilEpochs(fields.time, measured.astype(np.complex128), sigma, signed)
+
+    def rows(self, kept: BoolArray | slice) -> "CoilEpochs":
+        """Return some epochs."""
+        return CoilEpochs(self.time[kept], self.measured[kept], self.sigma[kept], self.signed)
+
+    @property
+    def heard(self) -> IntArray:
+        """How many channels each row holds, shape (n,)."""
+        return np.asarray(np.sum(np.isfinite(self.measured), axis=1))
+
+
+def middle_of(beacons: tuple[Beacon, ...]) -> tuple[Array, float]:
+    """Return the middle of some beacons, shape (3,) (m), and how far they extend about it (m)."""
+    centres = np.array(
+        [b.position_world + b.world_from_beacon @ b.centres_beacon.mean(axis=0) for b in beacons]
+    )
+    middle = np.mean(centres, axis=0)
+    return middle, 2.0 * float(np.sqrt(np.mean(np.sum((centres - middle) ** 2, axis=1))))
+
+
+def grid_about(site: Site) -> Array:
+    """Return places to ask, shape (g, 3) (m): on spheres about the beacons.
+
+    Those outside of the region too: on the way some end on the other side, and are mirrored back.
+
+    Raises
+    ------
+    EstimationError
+        Where none is inside of the region.
+    """
+    middle, extent = middle_of(site.beacons)
+    number = np.arange(DIRECTIONS) + 0.5
+    height, turn = 1.0 - 2.0 * number / DIRECTIONS, np.pi * (1.0 + np.sqrt(5.0)) * number
+    flat = np.sqrt(1.0 - height**2)
+    sphere = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
+    radii = np.geomspace(NEAREST * extent, FARTHEST * extent, RADII) if extent > 0.0 else np.ones(1)
+    places = np.asarray(middle + (radii[:, None, None] * sphere).reshape(-1, 3))
+    inside = site.bounds is None or bool(np.any(np.all(site.bounds.margin(places) > 0.0, axis=1)))
+    if not inside or not extent > 0.0:
+        raise EstimationError(
+            "no place within the declared region is near enough to beacons that stand apart: a"
+            " receiver of one axis is located by several of them"
+        )
+    return places
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Places, and what a coil at each would measure of every axis, or pair of axes.
+
+    Parameters
+    ----------
+    places_world : ndarray, shape (g, 3)
+        (m)
+    field : complex ndarray, shape (g, channels, 3)
+        (T), world axes.
+    design : ndarray, shape (g, rows, unknowns)
+        Of the axis, or of its products.
+    scale : ndarray, shape (g, rows)
+        What the rows are weighed by: a share of the field counts alike everywhere.
+    """
+
+    places_world: Array
+    field: ComplexArray
+    design: Array
+    scale: Array
+
+    @staticmethod
+    def of(calibration: Calibration, time: float, places_world: Array, *, signed: bool) -> "Grid":
+        """Return the places of a receiver whose axes are the world's."""
+        attitude = np.broadcast_to(np.eye(3), (len(places_world), 3, 3))
+        at = np.full(len(places_world), time)
+        field = predict_channels(calibration, at, attitude, places_world)
+        size = np.linalg.norm(field, axis=2)
+        scale = np.where(size > 0.0, 1.0 / np.maximum(size, _TINY), 0.0)
+        if signed:
+            parts = np.concatenate([field.real, field.imag], axis=1)
+            return Grid(places_world, field, parts, np.concatenate([scale, scale], axis=1))
+        square = np.einsum("gcx,gcy->gcxy", field, field.conj()).real
+        twice = np.where(_PAIRS[0] == _PAIRS[1], 1.0, 2.0)
+        return Grid(places_world, field, square[:, :, *_PAIRS] * twice, scale**2)
+
+    def starts(self, epochs: CoilEpochs) -> tuple[Array, Array]:
+        """Return the likeliest places of each epoch, and their axes, shapes (n, kept, 3)."""
+        if epochs.signed:
+            given = np.concatenate([epochs.measured.real, epochs.measured.imag], axis=1)
+        else:
+            given = epochs.measured.real**2
+        there, count = np.isfinite(given), min(KEPT, len(self.places_world))
+        soft = softened(epochs)
+        place, axis = np.empty((2, len(given), count, 3))
+        for pattern in np.unique(there, axis=0):
+            scale = np.where(pattern, self.scale, 0.0)
+            design = self.design * scale[..., None]
+            left, size, right = np.linalg.svd(design, full_matrices=False)
+            felt = size > FLAT * size[:, :1]
+            left = np.where(felt[:, None], left, 0.0)
+            inverse = np.where(felt, 1.0 / np.where(felt, size, 1.0), 0.0)[..., None]
+            for row in np.flatnonzero(np.all(there == pattern, axis=1)).tolist():
+                target = np.where(pattern, given[row], 0.0) * scale
+                along = (target[:, None] @ left)[:, 0]
+                total = np.sum(target**2, axis=1)
+                cost = 1.0 - np.sum(along**2, axis=1) / np.maximum(total, _TINY)
+                best = np.argsort(cost, kind="stable")[:LIKELY]
+                found = np.swapaxes(right[best], 1, 2) @ (inverse[best] * along[best, :, None])
+                axes = found[..., 0] if epochs.signed else _roots(found[..., 0])
+                misfit, axes = self._misfit(best, axes, epochs, row, soft[row])
+                again = np.argsort(misfit, kind="stable")[:count]
+                place[row], axis[row] = self.places_world[best[again]], axes[again]
+        return place, axis
+
+    def _misfit(
+        self, places: IntArray, axes: Array, epochs: CoilEpochs, row: int, sigma: Array
+    ) -> tuple[Array, Array]:
+        """Return the chi square of an epoch at places and axes, these scaled to make it least."""
+        seen = np.einsum("gcx,gx->gc", self.field[places], axes)
+        if not epochs.signed:
+            seen = np.abs(seen).astype(np.complex128)
+        there = np.isfinite(epochs.measured[row])
+        seen = np.where(there, seen, 0.0) / sigma
+        measured = np.where(there, epochs.measured[row], 0.0) / sigma
+        size = np.sum(np.abs(seen) ** 2, axis=1)
+        factor = np.sum(seen.conj() * measured, axis=1).real / np.maximum(size, _TINY)
+        left = measured - factor[:, None] * seen
+        return np.sum(np.abs(left) ** 2, axis=1), axes * factor[:, None]
+
+
+def softened(epochs: CoilEpochs) -> Array:
+    """Return the errors of amplitudes with those of a place that is only nearly right (T)."""
+    size = np.abs(np.nan_to_num(epochs.measured))
+    largest = np.max(size, axis=1, keepdims=True)
+    sigma = np.where(np.isfinite(epochs.measured), epochs.sigma, 1.0)
+    return np.asarray(np.sqrt(sigma**2 + (SOFT * size) ** 2 + (FLOOR * largest) ** 2))
+
+
+def _roots(pairs: Array) -> Array:
+    """Return the vectors whose products come nearest to some symmetric matrices."""
+    matrix = np.empty((len(pairs), 3, 3))
+    matrix[:, *_PAIRS] = pairs
+    matrix[:, _PAIRS[1], _PAIRS[0]] = pairs
+    value, vector = np.linalg.eigh(matrix)
+    least = 1e-6 * np.max(np.abs(value), axis=1, keepdims=True)
+    return np.asarray(np.sqrt(np.maximum(value[:, -1:], least + _TINY)) * vector[:, :, -1])

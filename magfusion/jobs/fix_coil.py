@@ -1,0 +1,149 @@
+"""The fix of a receiver of one axis: its place and direction, the roll about it open."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magfusion.errors import EstimationError
+from magfusion.estimation.integrity.place_witness import of_place
+from magfusion.estimation.integrity.recording import BRIDGED, recorded
+from magfusion.estimation.snapshot.ambiguity import relations
+from magfusion.estimation.snapshot.coil_fix import UNKNOWNS, CoilFixes, Gain, fix_coil
+from magfusion.estimation.snapshot.coil_poses import (
+    axis_sigma,
+    judged_poses,
+    nearest_truth,
+    poses_of,
+)
+from magfusion.estimation.snapshot.coil_starts import CoilEpochs
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.site import Site
+from magfusion.model.trust import StateTrust, Trust
+from magfusion.results.figures import Column, Figure, Figures, Section, heading
+from magfusion.results.report import where_found
+from magfusion.results.verdict import trust_figures
+from magfusion.units import Array
+
+if TYPE_CHECKING:
+    from magfusion.model.progress import Report
+
+
+@dataclass(frozen=True, eq=False)
+class FoundCoil:
+    """Poses of a receiver of one axis, with all that is said of them.
+
+    Parameters
+    ----------
+    log : Log
+        Whose truth is turned to the roll that was chosen.
+    columns : dict
+        More columns of the hypotheses' table, shape (n, hypotheses) each.
+    """
+
+    log: Log
+    fixes: Fixes
+    states: StateTrust
+    trust: Trust
+    figures: Figures
+    relation: NDArray[np.str_]
+    columns: dict[str, Array]
+
+
+def find_coil(
+    log: Log, fields: FieldSamples, site: Site, free: tuple[str, ...], report: Report
+) -> FoundCoil:
+    """Fix every epoch of a receiver of one axis.
+
+    Parameters
+    ----------
+    fields : FieldSamples
+        Channels in the site's order.
+    free : tuple of str
+        ``gain`` where nothing is known of it, ``phase`` where nothing is known of drive phases.
+
+    Raises
+    ------
+    EstimationError
+        Where no epoch holds enough channels.
+    """
+    began = time.perf_counter()
+    report("fixing", 1, 3)
+    if "phase" in free:
+        site = replace(site, beacons=tuple(replace(b, synchronised=False) for b in site.beacons))
+    epochs = CoilEpochs.of(fields, site)
+    gain = Gain.of(site.platform.magnetometer, free="gain" in free)
+    least = UNKNOWNS - int(np.isfinite(gain.sigma))
+    enough = epochs.heard >= least
+    if not np.any(enough):
+        raise EstimationError(
+            f"{log.name}: no epoch holds as many as {least} beacons, which place, direction and"
+            " gain of a receiver of one axis need; add beacons, or write their fields at one time"
+        )
+    kept = epochs.rows(enough)
+    calibration = initial_calibration(site, float(np.mean(kept.time)))
+    found = fix_coil(kept, calibration, gain)
+    report("done", 3, 3)
+    fixes = poses_of(found, kept.time, site, signed=kept.signed)
+    judged = judged_poses(fixes, found, int(np.sum(~enough)), signed=kept.signed)
+    first = (fixes.world_from_body, fixes.position_world, fixes.pose_cov)
+    trust = judged.trust | Trust(of_place(site, fixes.time, *(part[:, 0] for part in first)))
+    streams = replace(log, fields=None)  # the other axes are no silence
+    trust |= Trust(recorded(streams, site, BRIDGED))
+    figures = heading("fix", log.name) | trust_figures(trust)
+    figures |= _figures(fixes, found, signed=kept.signed)
+    figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
+    if log.truth is not None:
+        turned = nearest_truth(log.truth, fixes.best(), site, signed=kept.signed)
+        log = replace(log, truth=turned)
+    decided = replace(fixes, determined=np.ones_like(fixes.determined))
+    return FoundCoil(
+        log=log,
+        fixes=fixes,
+        states=judged.states,
+        trust=trust,
+        figures=figures,
+        relation=relations(decided, site).label,
+        columns=_columns(found),
+    )
+
+
+def _columns(found: CoilFixes) -> dict[str, Array]:
+    gain = np.linalg.norm(found.axis_world, axis=-1)
+    towards = found.axis_world / gain[..., None]
+    place = found.cov[..., :3, :3]
+    return {f"axis_{letter}": towards[..., k] for k, letter in enumerate("xyz")} | {
+        "axis_sigma_deg": np.rad2deg(axis_sigma(found)),
+        "position_sigma_m": np.sqrt(np.trace(place, axis1=-2, axis2=-1) / 3.0),
+        "gain": gain,
+    }
+
+
+def _figures(fixes: Fixes, found: CoilFixes, *, signed: bool) -> Figures:
+    """Return the figures of the fixes: what one axis tells, and what it leaves open."""
+    columns = _columns(found)
+    sigma = float(np.median(columns["position_sigma_m"][:, 0]))
+    across = float(np.median(columns["axis_sigma_deg"][:, 0]))
+    share = fixes.probability
+    rivals = int(np.sum(share[:, 1] > 0.05)) if share.shape[1] > 1 else 0
+    determined = ["position", "direction of the axis", *(["its sign"] if signed else [])]
+    undetermined = ["roll about the axis", *([] if signed else ["sign of the axis"])]
+    row = ("position_sigma_median_m", sigma, "m", None, Section.ERRORS, "position", Column.SIGMA)
+    tilt = ("axis_sigma_median_deg", across, "deg", None, Section.ERRORS, "axis", Column.SIGMA)
+    return Figures(
+        Figure("epochs", len(fixes)),
+        where_found("ambiguous_epochs", rivals > 0, rivals),
+        where_found("undetermined_epochs", False, int(np.sum(~found.determined[:, 0]))),
+        Figure("residual_rms_median", float(np.median(fixes.residual_rms[:, 0]))),
+        Figure(*row),
+        Figure(*tilt),
+        Figure("determined", determined, section=Section.REPORT),
+        Figure("undetermined", undetermined, section=Section.REPORT),
+        Figure("gain_median", float(np.median(columns["gain"][:, 0]))),
+    )
