@@ -7,7 +7,9 @@ them with an inertial stream as records of 10 ms, and the scenario tells
 
 1. how far its states are from the truth at rest and turning, and how many there are a second;
 2. how far those are that it predicts to the instant of a display, 20 ms ahead of the samples;
-3. what a second of data takes of a processor once it has begun, beside the start.
+3. what a second of data takes of a processor once it has begun, beside the start;
+4. with ``--plate``, how soon a plate of aluminium that is moved beside the head is said, and
+   whether the sigmas hold meanwhile.
 """
 
 import json
@@ -17,20 +19,21 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from harness import conclude, rms, scenario_parser
+from moving_plate import Plate
 from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.spatial.transform import Rotation, RotationSpline
 from scipy.special import ellipe, ellipk
 
-from magfusion.units import DEGREE, Array
+from magfusion.units import DEGREE, Array, ComplexArray
 
 CARRIER_HZ, RATE_HZ, FIELD_KNOTS_HZ = 6000.0, 20e3, 1000.0
-CYCLE = 1.0 / 120.0  # s
 LAYERS, ROWS, WIRE, CURRENT = 8, 20, 5e-4, 1.0  # m, A
 FORMERS = (0.020, 0.026, 0.032)  # m; of the coils, one about the other
 EARTH_WORLD = np.array([0.0, 2e-5, -4.5e-5])  # T
@@ -41,6 +44,27 @@ SOURCE_PPM = 20.0  # of a crystal
 UNKNOWN = 0.0123  # s; when a cycle of a clock of its own begins
 RESTING, TURNING = 5.0, 8.5  # s; it turns at its full rate until a second before, and from then
 CHANGE, BEGUN = 1.0, 6.5  # s; from rest to the full rate, and from when states are compared
+PLATE_CENTRE, PLATE_FAR = np.array([0.3, 0.16, 0.0]), 1.0  # m; held there, and from how far beside
+WRONG_SIDE = 0.2  # m; the source is farther away
+PLATE_NEAR, PLATE_RUN = 0.01, 18.5  # share of the fields; s
+PLATE_COMES, PLATE_HELD, PLATE_MOVES, PLATE_KNOTS_HZ = 9.5, 4.0, 1.0, 50.0  # s
+
+REGION = """region:
+  half_space: {normal: [1, 0, 0]}
+"""
+IMU = """  imu:
+    gyro_noise: 1.0e-4
+    accel_noise: 1.0e-3
+    gyro_bias_walk: 1.0e-6
+    accel_bias_walk: 1.0e-5
+    gyro_bias_sigma: 5.0e-3
+    accel_bias_sigma: 0.05
+    time_offset_sigma_s: 0.001
+"""
+PRIOR = """  motion_prior:
+    accel_density_m_s2_rthz: 2.0
+    angular_accel_density_rad_s2_rthz: 3.0
+"""
 
 
 @dataclass(frozen=True)
@@ -65,6 +89,14 @@ class Config:
     source_ppm : float, optional
         By how much the clock of the source runs fast, which is then its own: when a cycle begins
         the site does not say, a fourth slot is silent, and the stream must tell.
+    plate : bool
+        Whether a plate of aluminium is brought beside the head, held there, and taken away.
+    hemisphere : bool
+        Whether the site says on which side of the source the head is.
+    inertial : bool
+        Whether there is an IMU; else the site has a motion prior.
+    rate_hz : float
+        Cycles a second.
     """
 
     duration: float = 16.0
@@ -75,7 +107,16 @@ class Config:
     imu_rate_hz: float = 500.0
     ahead: float = 0.02
     source_ppm: float | None = None
+    plate: bool = False
+    hemisphere: bool = True
+    inertial: bool = True
+    rate_hz: float = 120.0
     seed: int = 0
+
+    @property
+    def cycle(self) -> float:
+        """Duration of a cycle (s)."""
+        return 1.0 / self.rate_hz
 
     @property
     def slots(self) -> int:
@@ -97,6 +138,31 @@ class Figures:
     turned_deg_s: float
     processor_share: float  # seconds of processor for a second of data
     python_ms: float  # a million turns of an empty loop, in the same run
+
+
+@dataclass(frozen=True)
+class SideFigures:
+    """What the states say of the side of the source, where nobody told it."""
+
+    first_s: float  # of the states
+    ambiguous: float  # share of the states that say so
+    wrong: float  # share that do not, and are on the other side
+    mm: float  # of those that do not
+
+
+@dataclass(frozen=True)
+class PlateFigures:
+    """What a plate did to a run of the pipe: positions in mm, mean squared errors in variances."""
+
+    largest_share: float  # of the fields
+    said_after_s: float  # it made a hundredth of them
+    wrongly_said: int  # states before
+    poses: float  # share of the states that have one while it is there
+    nees: float  # of the poses from when it made a hundredth of the fields until it is gone
+    error_mm: float
+    error_deg: float
+    after_mm: float  # two seconds after it has gone
+    after_nees: float
 
 
 def loop_field(radius: float, place: Array) -> Array:
@@ -190,15 +256,22 @@ def waveform(config: Config, head: Head, rng: np.random.Generator) -> tuple[Arra
     own_clock = (
         time if config.source_ppm is None else (time - UNKNOWN) * (1 + 1e-6 * config.source_ppm)
     )
-    slot = np.floor(own_clock / CYCLE * config.slots + 1e-9).astype(int) % config.slots
-    current = np.cos(2.0 * np.pi * CARRIER_HZ * own_clock)
+    slot = np.floor(own_clock / config.cycle * config.slots + 1e-9).astype(int) % config.slots
+    current = np.exp(2j * np.pi * CARRIER_HZ * own_clock)
     current *= 1.0 - config.drive_drift * time / 60.0
+    coarse = np.arange(0.0, config.duration + 2.0 / PLATE_KNOTS_HZ, 1.0 / PLATE_KNOTS_HZ)
+    metal = plate_fields(head, coarse)[0] if config.plate else None
     world_from_body = head.turn(knots)
     body = CubicSpline(knots, world_from_body.inv().apply(EARTH_WORLD))(time)
     for axis, former in enumerate(FORMERS):
         coil_world = winding_field(former, axis, head.place(knots))
+        driven = np.where(slot == axis, current, 0.0)[:, None]
         own = CubicSpline(knots, world_from_body.inv().apply(coil_world))(time)
-        body += np.where(slot == axis, current, 0.0)[:, None] * own
+        body += driven.real * own
+        if metal is not None:
+            added = CubicSpline(coarse, metal[axis])(knots)
+            for wave, part in ((driven.real, added.real), (-driven.imag, added.imag)):
+                body += wave * CubicSpline(knots, world_from_body.inv().apply(part))(time)
     hum = sum(
         share * np.cos(2.0 * np.pi * order * 49.97 * time + phase)
         for order, share, phase in ((1, 1.0, 0.3), (3, 0.3, 1.1), (5, 0.1, 2.0))
@@ -208,6 +281,28 @@ def waveform(config: Config, head: Head, rng: np.random.Generator) -> tuple[Arra
     body += config.noise * rng.standard_normal(body.shape)
     step = 2.0 * RANGE / 2**BITS
     return time, step * np.round(body / step)
+
+
+def plate_centre(time: Array) -> Array:
+    """Return where the plate is (n, 3) (m)."""
+    leaves = PLATE_COMES + PLATE_MOVES + PLATE_HELD
+    come, gone = (
+        np.clip((time - begin) / PLATE_MOVES, 0.0, 1.0) for begin in (PLATE_COMES, leaves)
+    )
+    away = 1.0 - come**2 * (3.0 - 2.0 * come) + gone**2 * (3.0 - 2.0 * gone)
+    return np.asarray(PLATE_CENTRE + away[:, None] * [0.0, PLATE_FAR, 0.0])
+
+
+def plate_fields(head: Head, time: Array) -> tuple[ComplexArray, Array]:
+    """Return what the plate adds to each coil (3, n, 3) (T), and its share of the fields (n,)."""
+    place, centre, plate = head.place(time), plate_centre(time), Plate()
+    added, whole = [], []
+    for axis, former in enumerate(FORMERS):
+        coil = partial(winding_field, former, axis)
+        added.append(plate.added(coil, centre, place, CARRIER_HZ))
+        whole.append(coil(place))
+    share = np.linalg.norm(added, axis=(0, 2)) / np.linalg.norm(whole, axis=(0, 2))
+    return np.array(added), share
 
 
 def site_text(config: Config) -> str:
@@ -234,21 +329,11 @@ beacons:
     position_m: [0, 0, 0]
     rpy_deg: [0, 0, 0]
     frequency_hz: {CARRIER_HZ}
-    slots: {{duration_s: {CYCLE / config.slots!r}, count: {config.slots}}}
+    slots: {{duration_s: {config.cycle / config.slots!r}, count: {config.slots}}}
     synchronised: {"true" if config.source_ppm is None else "false"}
     coils:{coils}
-region:
-  half_space: {{normal: [1, 0, 0]}}
-platform:
-  imu:
-    gyro_noise: 1.0e-4
-    accel_noise: 1.0e-3
-    gyro_bias_walk: 1.0e-6
-    accel_bias_walk: 1.0e-5
-    gyro_bias_sigma: 5.0e-3
-    accel_bias_sigma: 0.05
-    time_offset_sigma_s: 0.001
-  magnetometer:
+{REGION if config.hemisphere else ""}platform:
+{IMU if config.inertial else PRIOR}  magnetometer:
     noise_density_t_rthz: 1.4e-11
 """
 
@@ -263,11 +348,11 @@ def records(config: Config) -> bytes:
         own = slice(*np.searchsorted(imu[0], [begin - 1e-9, end - 1e-9]))
         rows = slice(*np.searchsorted(wave[0], [begin - 1e-9, end - 1e-9]))
         record: dict[str, Any] = {
-            "imu": dict(
-                zip(("time", "gyro", "accel"), (part[own].tolist() for part in imu), strict=True)
-            ),
             "magnetometer": {"time": wave[0][rows].tolist(), "field": wave[1][rows].tolist()},
         }
+        if config.inertial:
+            parts = (part[own].tolist() for part in imu)
+            record = {"imu": dict(zip(("time", "gyro", "accel"), parts, strict=True))} | record
         lines.append(json.dumps(record).encode())
     return b"\n".join(lines) + b"\n"
 
@@ -302,6 +387,61 @@ def errors(states: list[dict[str, Any]], head: Head, begin: float, end: float) -
     return np.array([1e3 * rms(np.linalg.norm(place, axis=1)), rms(turn.magnitude() / DEGREE)])
 
 
+def nees(states: list[dict[str, Any]], head: Head) -> float:
+    """Return the mean squared error of poses, each component in units of its sigma."""
+    time = np.array([s["time"] for s in states])
+    sigma = np.array([[s["sigma"]["position"], s["sigma"]["rotation_body"]] for s in states])
+    place = np.array([s["position"] for s in states]) - head.place(time)
+    quaternion = np.array([s["quaternion"] for s in states])
+    turn = head.turn(time).inv() * Rotation.from_quat(quaternion, scalar_first=True)
+    return float(np.mean(np.sum((np.stack([place, turn.as_rotvec()], 1) / sigma) ** 2, (1, 2))))
+
+
+def run_beside_plate(config: Config) -> PlateFigures:
+    """Simulate a head beside which a plate is moved, and navigate it through the pipe."""
+    given, head = records(config), Head(config)
+    with tempfile.TemporaryDirectory() as directory:
+        site = Path(directory) / "site.yaml"
+        site.write_text(site_text(config))
+        states, _ = piped(site, given)
+    time = np.arange(0.0, config.duration, 0.02)
+    share = plate_fields(head, time)[1]
+    near, gone = time[share > PLATE_NEAR][[0, -1]]
+    said = [s["time"] for s in states if any(r["code"] == "metal_near" for r in s["reasons"])]
+    there = [s for s in states if near <= s["time"] < gone]
+    posed = [s for s in there if not s["lost"]]
+    after = [s for s in states if s["time"] >= gone + 2.0 and not s["lost"]]
+    return PlateFigures(
+        float(np.max(share)),
+        next((t for t in said if t >= near), np.inf) - near,
+        sum(t < PLATE_COMES for t in said),
+        len(posed) / len(there),
+        nees(posed, head),
+        *errors(posed, head, near, gone),
+        errors(after, head, gone, config.duration)[0],
+        nees(after, head),
+    )
+
+
+def run_without_hemisphere(config: Config) -> SideFigures:
+    """Navigate a head through the pipe where no side of the source is told."""
+    given, head = records(replace(config, hemisphere=False)), Head(config)
+    with tempfile.TemporaryDirectory() as directory:
+        site = Path(directory) / "site.yaml"
+        site.write_text(site_text(replace(config, hemisphere=False)))
+        states, _ = piped(site, given)
+    sure = [s for s in states if not s["ambiguous"] and not s["lost"]]
+    place = np.array([s["position"] for s in sure]).reshape(-1, 3)
+    off = np.linalg.norm(place - head.place(np.array([s["time"] for s in sure])), axis=1)
+    wrong, found = int(np.sum(off > WRONG_SIDE)), off[off <= WRONG_SIDE]
+    return SideFigures(
+        states[0]["time"],
+        sum(bool(s["ambiguous"]) for s in states) / len(states),
+        wrong / len(states),
+        1e3 * rms(found) if len(found) else np.inf,
+    )
+
+
 def python_ms() -> float:
     """Return the processor time of a million turns of an empty loop (ms): that of the machine."""
     began = time.process_time()
@@ -321,7 +461,8 @@ def run(config: Config) -> Figures:
         speed = python_ms()
         states, seconds = piped(site, given)
         speed = 0.5 * (speed + python_ms())
-        carried, _ = piped(site, given, "--rate", "120", "--horizon", str(config.ahead))
+        rate = f"{config.rate_hz:g}"
+        carried, _ = piped(site, given, "--rate", rate, "--horizon", str(config.ahead))
     end = config.duration
     turned = np.linalg.norm(head.rate_body(np.arange(TURNING, end, 0.01)), axis=1)
     told = [s for s in states if s["time"] >= BEGUN and not s["lost"]]
@@ -340,7 +481,7 @@ def report(found: Figures) -> str:
     """Return the table that a reader sees."""
     return "\n".join(
         [
-            f"three wound coils, {1.0 / CYCLE:.0f} cycles a second; 0.3 to 0.6 m",
+            "three wound coils, 0.3 to 0.6 m away",
             f"{'states a second':<32}{found.states_per_s:8.1f}",
             f"{'at rest':<32}{found.rest_mm:8.3f} mm {found.rest_deg:7.3f} deg",
             f"{'turning, ' + format(found.turned_deg_s, '.0f') + ' deg/s':<32}"
@@ -352,12 +493,48 @@ def report(found: Figures) -> str:
     )
 
 
+def report_of_plate(found: PlateFigures) -> str:
+    """Return what a reader sees of the run beside a plate."""
+    return "\n".join(
+        [
+            f"a plate of aluminium makes up to {100 * found.largest_share:.1f} % of the fields",
+            f"said {found.said_after_s:.2f} s after it made {100 * PLATE_NEAR:g} %;"
+            f" before it came, {found.wrongly_said} states said so",
+            f"{'while it is there':<32}{found.error_mm:8.3f} mm {found.error_deg:7.3f} deg,"
+            f" NEES {found.nees:.1f}, poses in {100 * found.poses:.0f} %",
+            f"{'after it':<32}{found.after_mm:8.3f} mm, NEES {found.after_nees:.1f}",
+        ]
+    )
+
+
 def main() -> None:
     """Print the table and one JSON line."""
-    given = scenario_parser(__doc__, Config.seed, quick="four seconds of turning").parse_args()
-    config = Config(seed=given.seed)
+    parser = scenario_parser(__doc__, Config.seed, quick="four seconds of turning")
+    parser.add_argument("--plate", action="store_true", help="beside a moving plate alone")
+    parser.add_argument("--no-hemisphere", action="store_true", help="no side is told, alone")
+    parser.add_argument("--no-imu", action="store_true", help="without an IMU, 60 cycles a second")
+    parser.add_argument("--rate", type=float, default=Config.rate_deg_s, help="of turning (deg/s)")
+    given = parser.parse_args()
+    config = Config(seed=given.seed, rate_deg_s=given.rate)
+    if given.no_hemisphere:
+        side = run_without_hemisphere(replace(config, duration=TURNING + 2.0))
+        told_of_side = (
+            f"first state {side.first_s:.1f} s after the data begin; {100 * side.ambiguous:.0f} %"
+            f" say ambiguous, {100 * side.wrong:.1f} % are wrong and do not; the others err by"
+            f" {side.mm:.2f} mm"
+        )
+        conclude(told_of_side, side)
+        return
+    if given.plate:
+        beside = run_beside_plate(replace(config, duration=PLATE_RUN, plate=True))
+        conclude(report_of_plate(beside), beside)
+        return
     if given.quick:
         config = replace(config, duration=TURNING + 4.0)
+    if given.no_imu:
+        alone = run(replace(config, inertial=False, rate_hz=60.0))
+        conclude(report(alone), alone)
+        return
     known, searched = run(config), run(replace(config, source_ppm=SOURCE_PPM))
     told = [report(known), "a clock of its own, slots found in the stream:", report(searched)]
     conclude("\n".join(told), {"known": known, "searched": searched})

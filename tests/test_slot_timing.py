@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from time_slots_and_mains import tracker
 
+from magfusion.errors import InputError
 from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.model.site import Site, Slots
-from magfusion.receiver.receiver import SlotReceiver
+from magfusion.receiver.cycles import whole_cycles
+from magfusion.receiver.receiver import SlotReceiver, received
 from magfusion.receiver.slot_timing import is_searched, slot_start
 
 SLOTS = Slots(1.0 / 480.0, 4)
@@ -87,3 +89,30 @@ def test_a_clock_that_runs_away_is_followed() -> None:
     assert np.max(np.abs(late)) < 0.05 * SLOTS.duration
     size = np.concatenate([np.linalg.norm(p.phasor_sensor, axis=2) for p in parts])
     assert np.nanmax(np.nanstd(size, axis=0) / np.nanmean(size, axis=0)) < 0.02
+
+
+def test_a_whole_log_is_followed_as_a_stream_is() -> None:
+    site, ppm = _free(6e3), 100.0
+    waveform = _stream(6e3, 2.2e-3, ppm, 6.0)
+    silent = waveform.time < 1.5  # the source is switched on later
+    waveform.measured_sensor[silent] = np.array([2e-5, 1e-5, 4e-5]) + 3e-9 * np.sin(
+        7e2 * waveform.time[silent, None]
+    )
+    time = np.arange(0.9, 7.2, 2e-3)
+    imu = ImuSamples(time, np.zeros((len(time), 3)), np.zeros((len(time), 3)))
+    found, _ = received(waveform, imu, site)
+    kept = found.rows(found.time > 2.0)
+    size = np.linalg.norm(kept.phasor_sensor, axis=2)
+    # In six seconds the clock runs more than a quarter of a slot away.
+    assert np.max(np.nanstd(size, axis=0) / np.nanmean(size, axis=0)) < 0.02
+    assert np.sum(kept.valid) > 3 * 118 * 5
+    epochs = whole_cycles(kept, imu, site)
+    assert len(epochs) > 118 * 5
+    own = (kept.time[:, None] - 2.2e-3) * (1.0 + 1e-6 * ppm) / SLOTS.duration
+    slot = np.floor(own[:, 0]).astype(int) % 4
+    assert np.array_equal(np.argmax(kept.valid, axis=1), slot)
+
+
+def test_pulses_whose_timing_nobody_knows_are_refused() -> None:
+    with pytest.raises(InputError, match=r"pulses of direct current by a clock of its own"):
+        SlotReceiver(_free(0.0)).check()

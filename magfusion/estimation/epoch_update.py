@@ -13,8 +13,10 @@ from magfusion.estimation.input_queue import Arrivals, Measured
 from magfusion.estimation.integrity.bank import SubsetBank
 from magfusion.estimation.integrity.gate import Gate
 from magfusion.estimation.integrity.judgement import Judgement
+from magfusion.estimation.integrity.near_metal import NearMetal
 from magfusion.estimation.integrity.online import Heard, OnlineWitness
 from magfusion.estimation.integrity.place_witness import of_place
+from magfusion.estimation.integrity.reckoned import Reckoned
 from magfusion.estimation.integrity.recovery import (
     AgreedFix,
     Attempts,
@@ -27,6 +29,7 @@ from magfusion.estimation.integrity.recovery import (
 from magfusion.estimation.integrity.score_online import OnlineScore
 from magfusion.estimation.measurements.earth import EarthField, EarthWeight, speed_sigma
 from magfusion.estimation.measurements.measurement import Measurement
+from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.propagation import Propagated
 from magfusion.estimation.state import State
@@ -61,6 +64,8 @@ class EpochUpdate:
     gate: Gate
     witness: OnlineWitness
     score: OnlineScore
+    metal: NearMetal
+    _reckoned: Reckoned
     _attempts: Attempts
     _pointing: Attempts
     _earth: EarthWeight | None
@@ -78,6 +83,7 @@ class EpochUpdate:
     ) -> None:
         self.site, self.blocks, self.bank = site, blocks, bank
         self.gate = Gate(site.channels, blocks)
+        self.metal, self._reckoned = NearMetal(site, blocks), Reckoned(blocks)
         self.witness = OnlineWitness(site, estimated)
         self.score = OnlineScore(site, estimated, blocks[len(estimated) :], steady=earth)
         self._attempts, self._pointing = Attempts(), Attempts()
@@ -122,8 +128,11 @@ class EpochUpdate:
             if self._lost(state) and self._found_again(estimator, found, predicted):
                 return self._judged(estimator.state, None)
             point, refused = self._linearization_point(found.samples, state)
-            explained = state if point is None else point
-            phasors = self.gate.passed(found.phasors, explained, found.samples.valid[0], refused)
+            explained, valid = state if point is None else point, found.samples.valid[0]
+            phasors = self._weighed_phasors(found, explained, asked=point is None)
+            if self.metal.comes:
+                return self._without_the_last(estimator, predicted)
+            phasors = self.gate.passed(phasors, explained, valid, refused)
             found = replace(found, phasors=phasors)
             if self.gate.lost and self._found_again(estimator, found, predicted):
                 return self._judged(estimator.state, None)
@@ -147,7 +156,20 @@ class EpochUpdate:
         judged = self._judged(estimator.state, self._lost_since(estimator.state))
         return judged if found is None else replace(judged, heard=found.heard)
 
+    def _without_the_last(self, estimator: Estimator, predicted: Propagated) -> Judgement:
+        """Go on with a prediction that holds nothing of what came while it was not noticed."""
+        estimator.replace_state(self._reckoned.taken_back(predicted))
+        self._reckoned.forget()
+        self.score.end()
+        return self._judged(estimator.state, self._lost_since(estimator.state))
+
     # What was measured
+
+    def _weighed_phasors(self, found: Measured, explained: State, *, asked: bool) -> FieldPhasors:
+        """Weigh phasors by what is near; of those that the score asks of, all is predicted once."""
+        if asked:
+            self.score.foresee(found.phasors, explained)
+        return self.metal.weighed(found.phasors, explained, found.samples.valid[0])
 
     def _of_fields(self, found: Measured, known: State, step: float) -> list[Measurement]:
         measurements: list[Measurement] = [found.phasors]
@@ -186,6 +208,8 @@ class EpochUpdate:
     def _hear(
         self, before: State, predicted: Propagated, state: State, found: Measured | None
     ) -> None:
+        if self.metal.lone and not self.metal.near:
+            self._reckoned.hear(before, predicted, state)
         elapsed, accel = predicted.state.time - before.time, None
         if elapsed > 0.0 and not predicted.bridged:
             gained = predicted.state.velocity_world - before.velocity_world
@@ -208,11 +232,13 @@ class EpochUpdate:
     def _judged(self, state: State, since: float | None) -> Judgement:
         held = self.score.said_of(state)
         said = self.witness.judgement(state, self.gate, since, held)
-        said = said.beside(*_of_place(self.site, state))
+        said = said.beside(*self.metal.said().findings, *_of_place(self.site, state))
         return said if self.bank is None else self.bank.heard(said, state)
 
     def _compare(self, samples: FieldSamples, state: State) -> None:
         """See from time to time whether a fix finds the platform where the state says."""
+        if self.metal.near:
+            return
         self._since_compared += 1
         due = state.time >= self._compared_at + COMPARED_EVERY
         due = due and self._since_compared >= COMPARED_EPOCHS
@@ -258,6 +284,7 @@ class EpochUpdate:
         if not explains(fix, found.samples, state.calibration):
             return False
         estimator.replace_state(restarted(state, fix))
+        self._reckoned.forget()
         self.witness.forget_motion()
         self.score.end()
         self._separate(None, [], estimator.state)

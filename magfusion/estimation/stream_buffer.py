@@ -1,6 +1,7 @@
 """What has arrived and is not used up yet: streams in order, and how late they may be."""
 
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -38,6 +39,15 @@ def check_clock(name: str, time: Array, newest: float) -> None:
         )
 
 
+@dataclass(eq=False)
+class _Room:
+    """What samples are kept in, up to an end."""
+
+    time: Array
+    rows: Array
+    end: int
+
+
 class Buffer:
     """One stream, sorted by time: stamps with rows of numbers.
 
@@ -58,6 +68,7 @@ class Buffer:
     def __init__(self, name: str, width: int) -> None:
         self.name, self.width = name, width
         self._time, self._rows = np.empty(0), np.empty((0, width))
+        self._room: _Room | None = None
         self._waiting: deque[tuple[Array, Array]] = deque()
         self.newest = -np.inf
         self.settled = -np.inf
@@ -90,15 +101,30 @@ class Buffer:
     def rows(self) -> tuple[Array, Array]:
         """Return all that is kept, in order of time; of equal stamps the first."""
         if self._waiting:
-            time = np.concatenate([self._time, *(t for t, _ in self._waiting)])
-            rows = np.concatenate([self._rows, *(r for _, r in self._waiting)])
+            time = np.concatenate([t for t, _ in self._waiting])
+            rows = np.concatenate([r for _, r in self._waiting])
             self._waiting.clear()
-            if np.any(np.diff(time) <= 0.0):
-                time, first = np.unique(time, return_index=True)
-                self.late += len(rows) - len(first)
-                rows = rows[first]
-            self._time, self._rows = time, rows
+            if np.all(np.diff(time, prepend=self._time[-1:]) > 0.0):
+                self._append(time, rows)
+                return self._time, self._rows
+            time = np.concatenate([self._time, time])
+            time, first = np.unique(time, return_index=True)
+            rows = np.concatenate([self._rows, rows])
+            self.late += len(rows) - len(first)
+            self._time, self._rows = time, rows[first]
         return self._time, self._rows
+
+    def _append(self, time: Array, rows: Array) -> None:
+        """Put later samples behind those that are kept, which are copied only now and then."""
+        kept, more, room = len(self._time), len(time), self._room
+        if room is None or self._time.base is not room.time or room.end + more > len(room.time):
+            size = 2 * (kept + more)
+            room = self._room = _Room(np.empty(size), np.empty((size, self.width)), kept)
+            room.time[:kept], room.rows[:kept] = self._time, self._rows
+        begin, end = room.end, room.end + more
+        room.time[begin:end], room.rows[begin:end] = time, rows
+        self._time, self._rows = room.time[begin - kept : end], room.rows[begin - kept : end]
+        room.end = end
 
     def between(self, begin: float, end: float) -> tuple[Array, Array]:
         """Return the samples of a stretch, with the neighbours just outside it."""

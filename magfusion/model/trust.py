@@ -73,6 +73,7 @@ CODES = {
     "magnetometer_matrix": "the magnetometer's matrix, with the iron about it, is not as declared",
     "magnetometer_offset": "the magnetometer's offset is not as declared",
     "mains": "mains in the field",
+    "metal_near": "metal or iron came near a lone beacon or the sensor, and changes its field",
     "missing_samples": "samples hold no number",
     "moment_units": "the moments of all beacons are off by the factor of a unit or a convention",
     "moments": "the moments of beacons are not as declared",

@@ -7,7 +7,7 @@ from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site
 from magfusion.receiver.slots import schedule
 from magfusion.receiver.turn import Turn, on_clock, turn_of
-from magfusion.units import Array, BoolArray
+from magfusion.units import Array, BoolArray, IntArray
 
 # s; from the first to the last slot of an epoch. Half as long after its middle, a head that is
 # accelerated by 10 m/s^2 is 0.2 mm from where a steady velocity leads.
@@ -64,8 +64,7 @@ def cycles(samples: FieldSamples, measured_from_still: Turn, site: Site) -> Fiel
     measured_from_still : callable
         As from `magfusion.receiver.turn.turn_of`.
     """
-    slots = schedule(site)
-    _, cycle = np.unique(slots.running(samples.time) // slots.count, return_inverse=True)
+    slots, cycle = schedule(site), _cycle_of(samples, site)
     row, channel = np.nonzero(samples.valid)
     number = int(cycle[-1]) + 1
     time: Array = np.bincount(cycle, samples.time) / np.bincount(cycle)
@@ -85,3 +84,15 @@ def cycles(samples: FieldSamples, measured_from_still: Turn, site: Site) -> Fiel
         phasor_cov=cov,
         ahead=ahead,
     )
+
+
+def _cycle_of(samples: FieldSamples, site: Site) -> IntArray:
+    """Return the cycle of each row, counted from the first: by the coils that it holds.
+
+    A source whose clock runs away from the log's keeps no schedule for long.
+    """
+    slots = schedule(site)
+    slot = np.array([slot for beacon in site.beacons for _, slot in beacon.tones], dtype=float)
+    count = np.maximum(np.sum(samples.valid, axis=1), 1)
+    begin = samples.time - (samples.valid @ slot / count + 0.5) * slots.duration
+    return np.cumsum(np.diff(begin, prepend=begin[:1]) > 0.5 * slots.cycle)

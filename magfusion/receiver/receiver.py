@@ -7,7 +7,7 @@ used `magfusion.receiver.admission` says, for both and whatever the size of the 
 from abc import ABC, abstractmethod
 from collections import Counter
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from magfusion.receiver.cycles import cycles, joins
 from magfusion.receiver.design import Designs, separable, variance_growth
 from magfusion.receiver.lockin import WindowOperator, designs_of, window_operator
 from magfusion.receiver.slot_phasors import SlotValues, demodulate_slots, slot_values
-from magfusion.receiver.slot_timing import is_searched, slot_start, with_start
+from magfusion.receiver.slot_timing import check_told, heard_for, is_searched, slot_start
 from magfusion.receiver.slots import (
     SlotSettings,
     check_carriers,
@@ -104,11 +104,6 @@ class Receiver(ABC):
         if isinstance(settings, SlotSettings) or has_schedule(site):
             return SlotReceiver(site, settings)
         return LockinReceiver(site, settings)
-
-    @property
-    def timed(self) -> Site:
-        """The site with the schedule as it was found in the stream."""
-        return self.site
 
     @property
     @abstractmethod
@@ -218,8 +213,9 @@ class Receiver(ABC):
         """
         assert self.grid is not None
         self._follow(waveform)
-        waveform, imu = self._since(waveform, imu, time_offset)
-        new = self.admit(waveform, imu, until).number
+        new = self.admit(*self._since(waveform, imu, time_offset, self.next_number), until).number
+        oldest = min([*self.recent[:1].tolist(), *new[:1].tolist(), self.next_number])
+        waveform, imu = self._since(waveform, imu, time_offset, oldest)
         expected = int(np.sum(self._driven(new)))
         known = np.concatenate([self.recent, new])
         self.recent = known[known >= self.next_number - self.remembered]
@@ -242,8 +238,7 @@ class Receiver(ABC):
         """
         if len(imu):
             imu = initial_calibration(self.site, 0.0, float(imu.time[0])).on_log_rate(imu)
-        self.begin(waveform, imu)
-        windows = self.admit(waveform, imu)
+        windows = self._admitted(waveform, imu)
         expected = int(np.sum(self._driven(windows.number)))
         if expected == 0:
             raise self._none_usable()
@@ -253,6 +248,11 @@ class Receiver(ABC):
         if len(found) == 0:
             raise self._none_usable()
         return windows, found
+
+    def _admitted(self, waveform: Waveform, imu: ImuSamples) -> Windows:
+        """Begin, and return the usable windows of a whole log."""
+        self.begin(waveform, imu)
+        return self.admit(waveform, imu)
 
     def centre_of(self, number: int) -> float:
         """Return the centre of a window (s)."""
@@ -289,10 +289,10 @@ class Receiver(ABC):
         return windows.rows(verdict < 0)
 
     def _since(
-        self, waveform: Waveform, imu: ImuSamples, time_offset: float | None
+        self, waveform: Waveform, imu: ImuSamples, time_offset: float | None, number: int
     ) -> tuple[Waveform, ImuSamples]:
-        """Return the samples that the next windows, or what is remembered for them, can need."""
-        oldest = self.centre_of(min([*self.recent[:1].tolist(), self.next_number]) - 1)
+        """Return the samples that windows from a number on can need."""
+        oldest = self.centre_of(number - 1)
         first = max(int(np.searchsorted(waveform.time, oldest)) - BEFORE, 0)
         offset = self.site.platform.imu.time_offset if time_offset is None else time_offset
         begin = max(int(np.searchsorted(imu.time, oldest - offset - INERTIAL_MARGIN)) - 1, 0)
@@ -443,12 +443,14 @@ class SlotReceiver(Receiver):
     def check(self) -> None:
         """Refuse a schedule that not all coils keep, as `Receiver.check`."""
         schedule(self.site)
+        check_told(self.site)
         slot_settings_of(self.site, None if isinstance(self._given, SlotSettings) else self._given)
 
     def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
         """Lay slots by the schedule, from the first that is whole, as `Receiver.begin`."""
         slots = schedule(self.site)
         rate_hz = sample_rate_hz(waveform)
+        check_told(self.site)
         check_carriers(self.site, rate_hz, self.settings)
         if is_searched(self.site):
             start = slot_start(waveform, self.site, rate_hz)
@@ -472,6 +474,33 @@ class SlotReceiver(Receiver):
         clips = not is_pulsed(self.site)
         self._begin(waveform, imu, grid, LEAST_SHARE_OF_SLOT, clips=clips)
 
+    def _admitted(self, waveform: Waveform, imu: ImuSamples) -> Windows:
+        """Follow slots that are searched through a whole log, as through a stream."""
+        if not is_searched(self.site):
+            return super()._admitted(waveform, imu)
+        time, refusal, parts = waveform.time, None, [Windows.none()]
+        span = heard_for(schedule(self.site))
+        ends = np.searchsorted(time, np.arange(time[0] + span, time[-1], span))
+        for end in np.append(ends, len(time)).tolist():
+            newest = float(time[end - 1])
+            rows = slice(int(np.searchsorted(time, newest - 1.01 * span)), end)
+            look = Waveform(time[rows], waveform.measured_sensor[rows])
+            if self.grid is None:
+                # Where nothing is heard yet, there is nothing to count on from.
+                try:
+                    self.begin(look, imu)
+                except InputError as error:
+                    refusal = error
+                    continue
+            self._follow(look)
+            come = Waveform(time[:end], waveform.measured_sensor[:end])
+            own, inertial = self._since(come, imu, None, self.next_number)
+            found = self.admit(own, inertial, None if end == len(time) else newest)
+            parts.append(replace(found, first=found.first + end - len(own)))
+        if self.grid is None and refusal is not None:
+            raise refusal
+        return reduce(Windows.joined, parts)
+
     def phasors(
         self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
     ) -> tuple[FieldSamples, IntArray]:
@@ -492,15 +521,8 @@ class SlotReceiver(Receiver):
         found = found.rows(number >= since)
         seen = len(found)
         if seen and self.joined and joins(self.site):
-            found = cycles(found, turn, self.timed)
+            found = cycles(found, turn, self.site)
         return found, seen
-
-    @property
-    def timed(self) -> Site:
-        """The site with the schedule as it was found in the stream."""
-        if self.grid is None or not is_searched(self.site):
-            return self.site
-        return with_start(self.site, self.grid.centre - 0.5 * self.grid.step)
 
     def _follow(self, waveform: Waveform) -> None:
         """Bring the slots to where the stream shows them, half the way: a look is noisy."""

@@ -4,10 +4,9 @@ Folded at the cycle, the size of the carrier is a step in each slot: the slots b
 best, and the silent ones say which is which.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
+from magfusion.errors import InputError
 from magfusion.model.samples import Waveform
 from magfusion.model.site import Site, Slots
 from magfusion.receiver.slots import carriers_hz, is_pulsed, owners, schedule
@@ -34,13 +33,27 @@ def is_searched(site: Site) -> bool:
     return not any(alike)
 
 
-def with_start(site: Site, start: float) -> Site:
-    """Return a site whose schedule begins at a time (s)."""
-    beacons = tuple(
-        b if b.slots is None else replace(b, slots=replace(b.slots, start=start))
-        for b in site.beacons
-    )
-    return replace(site, beacons=beacons)
+def check_told(site: Site) -> None:
+    """Refuse pulses whose timing nobody knows.
+
+    Raises
+    ------
+    InputError
+        Folded at the cycle, the Earth's field under them looks as a coil's does.
+    """
+    free = [beacon.name for beacon in site.beacons if not beacon.synchronised]
+    if free and is_pulsed(site):
+        raise InputError(
+            f"beacon {free[0]} gives pulses of direct current by a clock of its own (synchronised:"
+            " false), and nothing in the stream tells which slot is which; record when its cycles"
+            " begin and give that (synchronised: true, with start_s), or drive the coils with a"
+            " carrier"
+        )
+
+
+def heard_for(slots: Slots) -> float:
+    """Return how much of a stream tells when a cycle begins (s)."""
+    return max(LONGEST_FOLD, 2.0 * FEWEST_CYCLES * slots.cycle)
 
 
 def slot_start(waveform: Waveform, site: Site, rate_hz: float) -> float | None:
@@ -54,8 +67,7 @@ def slot_start(waveform: Waveform, site: Site, rate_hz: float) -> float | None:
         Usual sampling rate.
     """
     slots = schedule(site)
-    longest = max(LONGEST_FOLD, 2.0 * FEWEST_CYCLES * slots.cycle)
-    part = waveform.time >= waveform.time[-1] - longest
+    part = waveform.time >= waveform.time[-1] - heard_for(slots)
     time, measured = waveform.time[part], waveform.measured_sensor[part]
     if time[-1] - time[0] < FEWEST_CYCLES * slots.cycle:
         return None

@@ -20,12 +20,10 @@ from magfusion.model.site import Site
 from magfusion.model.trust import Trust, Verdict
 from magfusion.receiver.cycles import cycles, joins
 from magfusion.receiver.receiver import Receiver
-from magfusion.receiver.slot_timing import is_searched
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.turn import on_clock, turn_of
 from magfusion.receiver.windows import LockinSettings
 
-LOOK = 0.3  # s; after which the slots are looked for again
 START_RATE_HZ = 20.0  # of the cycles of a slotted tracker that a start is made of
 
 
@@ -122,7 +120,7 @@ def find_online_start(
     heard = log
     try:
         if log.waveform is not None and has_schedule(site) and joins(site):
-            log, site = _of_cycles(log, log.waveform, site, settings)
+            log = _of_cycles(log, log.waveform, site, settings)
         result = smooth(log, site, SmootherSettings(loss="huber", **asked))
         honest, trust = judged(result, log)
         score = score_of(result, imu)
@@ -147,40 +145,17 @@ def find_online_start(
     )
 
 
-def _of_cycles(
-    log: Log, waveform: Waveform, site: Site, settings: EstimatorSettings
-) -> tuple[Log, Site]:
-    """Return the phasors of a slotted tracker, a cycle an epoch, and no more than a start needs.
-
-    The site has the schedule as it is in the stream.
-    """
+def _of_cycles(log: Log, waveform: Waveform, site: Site, settings: EstimatorSettings) -> Log:
+    """Return the phasors of a slotted tracker, a cycle an epoch, and no more than a start needs."""
     receiver = Receiver.of(site, settings.lockin)
-    if is_searched(site):
-        epochs = _followed(receiver, waveform, log.imu)
-    else:
-        _, found = receiver.whole(waveform, log.imu)
-        known = on_clock(log.imu, site.platform.imu.time_offset)
-        epochs = cycles(found, turn_of(known, site), site)
+    _, found = receiver.whole(waveform, log.imu)
+    known = on_clock(log.imu, site.platform.imu.time_offset)
+    epochs = cycles(found, turn_of(known, site), site)
     if len(epochs) < 2:
         raise InputError("magnetometer: no two cycles of time slots are usable; record longer")
     every = max(1, int(len(epochs) / (START_RATE_HZ * float(np.ptp(epochs.time)) + 1.0)))
     rows = slice((len(epochs) - 1) % every, None, every)
-    return replace(log, waveform=None, fields=epochs.rows(rows)), receiver.timed
-
-
-def _followed(receiver: Receiver, waveform: Waveform, imu: ImuSamples) -> FieldSamples:
-    """Return the cycles of a schedule that is found in the stream, whose clock drifts away."""
-    receiver.joined = True
-    ends = np.arange(waveform.time[0] + LOOK, waveform.time[-1] + LOOK, LOOK)
-    parts = []
-    for k, until in enumerate(ends):
-        until = min(float(until), float(waveform.time[-1]))
-        rows = slice(0, int(np.searchsorted(waveform.time, until, side="right")))
-        come = Waveform(waveform.time[rows], waveform.measured_sensor[rows])
-        if k == 0:
-            receiver.begin(come, imu)
-        parts.append(receiver.push(come, imu, until))
-    return FieldSamples.joined(parts)
+    return replace(log, waveform=None, fields=epochs.rows(rows))
 
 
 def _wider(result: Smoothed, honest: Smoothed) -> tuple[float, float]:

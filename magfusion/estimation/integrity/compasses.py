@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magfusion.estimation.integrity.turning import agrees, axes, field_body
+from magfusion.model.platform_motion import A_HAND
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.strapdown import attitude_from_gyro
@@ -196,7 +197,10 @@ def wrong_force(means: StillMeans, site: Site | None) -> Iterator[Finding]:
         )
         return
     bias = 0.1 if site is None else site.platform.imu.accel_bias_sigma
-    sigma = np.hypot(bias, scatter / np.sqrt(len(sizes)))
+    motion = A_HAND if site is None else site.platform.motion
+    # What the velocity gains within a span is no gravity; few spans tell little of it.
+    usual = np.sqrt(2.0 / 3.0) * motion.speed_sigma / SPAN
+    sigma = np.hypot(bias, np.hypot(scatter, usual / np.sqrt(len(sizes))) / np.sqrt(len(sizes)))
     if abs(size - gravity) > max(FORCE_LIMIT * sigma, 0.02 * gravity):
         yield Finding(
             "accel_scale",

@@ -104,8 +104,11 @@ def score_of(result: Smoothed, imu: ImuSamples) -> Score | None:
     graph, estimate = result.graph, result.estimate
     if not graph.measurements or result.fix_response is not None:
         return None
+    known = result.declared.site
+    if not known.platform.inertial and len(known.beacons) == 1:
+        return None  # nothing contradicts a lone beacon but that a path ought to be short
     steady = any(isinstance(m, EarthField) for m in graph.measurements)
-    held = held_blocks(result.declared.site, result.blocks, steady=steady)
+    held = held_blocks(known, result.blocks, steady=steady)
     size = dimension(held)
     if size == 0:
         return None

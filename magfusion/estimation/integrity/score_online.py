@@ -84,7 +84,7 @@ class OnlineScore:
             b._replace(columns=slice(at - MOTION + b.columns.start, at - MOTION + b.columns.stop))
             for b in self.held
         )
-        self.tangent, self.whole = (*estimated, *considered), at
+        self.asked, self.whole = (*estimated, *considered, *self.blocks), at
         self.spread = self._declared(considered)
         self._sums, self._asked_at, self._said = None, -np.inf, Judgement()
 
@@ -118,6 +118,11 @@ class OnlineScore:
         What was said of the site stays said.
         """
         self._sums = None
+
+    def foresee(self, measurement: Measurement, predicted: State) -> None:
+        """Predict a measurement for all that is asked: who asks for less of it finds it there."""
+        if self._sums is not None:
+            measurement.linearize(states_of([predicted]), predicted.calibration, self.asked)
 
     def predict(self, before: State, after: State, transition: Array, imu: ImuSamples) -> None:
         """Carry the response on to a prediction.
@@ -155,7 +160,7 @@ class OnlineScore:
         if sums is None or not measurements:
             return
         errors, jacobians = [], []
-        blocks, width = (*self.tangent, *self.blocks), self.whole - MOTION + len(self.unit)
+        blocks, width = self.asked, self.whole - MOTION + len(self.unit)
         for measurement in measurements:
             rows = measurement.linearize(states_of([predicted]), predicted.calibration, blocks)
             rows, _ = rows.weighed(measurement.loss)

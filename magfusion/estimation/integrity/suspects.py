@@ -202,7 +202,9 @@ def held_blocks(site: Site, estimated: tuple[Block, ...], *, steady: bool) -> tu
     known = {block.key for block in estimated}
     every = (*PARAMETERS, *INERTIAL)
     if not site.platform.inertial:
-        every = tuple(p for p in PARAMETERS if p not in (TIME_OFFSET, CLOCK_RATE))
+        # What moves steadily need not be where the platform's axes are said to be.
+        of_imu = (TIME_OFFSET, CLOCK_RATE, SENSOR_ROTATION, SENSOR_POSITION)
+        every = tuple(p for p in PARAMETERS if p not in of_imu)
     if not conductivity_of(site):
         every = tuple(p for p in every if p != CONDUCTIVITY)
     kinds = [p for p in every if steady or not p.steady_only]
