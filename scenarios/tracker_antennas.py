@@ -61,7 +61,7 @@ def nominal(shape: tuple[int, ...] = (), *, sized: bool = False) -> Antenna:
     Of dipoles, or with the term of a size, which is not known yet.
     """
     eye, zero = np.broadcast_to(np.eye(3), (*shape, 3, 3)), np.zeros((*shape, 3, 3))
-    kappas = (np.zeros(shape), np.zeros(shape)) if sized else ()
+    kappas = (np.zeros((*shape, 3)), np.zeros(shape)) if sized else ()
     return Antenna(eye, zero, eye, zero, *kappas)
 
 
@@ -70,8 +70,11 @@ def with_kappas(antenna: Antenna, config: Config) -> Antenna:
     if not config.is_sized:
         return antenna
     shape = antenna.moments_beacon.shape[:-2]
-    kappas = (np.full(shape, disc_kappa(0.5 * d)) for d in (config.transmitter, config.receiver))
-    return replace(antenna, **dict(zip(("kappa_beacon", "kappa_sensor"), kappas, strict=True)))
+    return replace(
+        antenna,
+        kappa_beacon=np.full((*shape, 3), disc_kappa(0.5 * config.transmitter)),
+        kappa_sensor=np.full(shape, disc_kappa(0.5 * config.receiver)),
+    )
 
 
 def wires(coil: Array, centre: Array, diameter: float) -> tuple[Array, Array]:

@@ -127,7 +127,7 @@ def test_exact_poses_are_exact(true_site: Site, given: Callable[[Survey], list[s
     assert figures["chi2_per_dof"] == pytest.approx(0.9, abs=0.15)
     assert float(str(figures["position_m_after"])) < 2e-3
     sized = run([*arguments, *options, "--sizes"])
-    assert sized["parameters"] == 38
+    assert sized["parameters"] == 40
     kappa, sigma = (float(str(sized[f"receiver_kappa_m2{s}"])) for s in ("", "_sigma"))
     assert abs(kappa) < 4.0 * sigma  # the coils are points
 

@@ -4,6 +4,7 @@ Where the poses are themselves uncertain, see `magfusion.calibration.antenna_gra
 of paper 000 is in `magfusion.papers.p000_tracker.bench`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from magfusion.model.antenna import (
     SENSITIVITIES,
     SENSOR_CENTRES,
     Antenna,
+    Coupling,
     antenna_from_vector,
     observe_antenna,
 )
@@ -24,6 +26,8 @@ from magfusion.units import Array, IntArray
 
 ITERATIONS = 20
 CONVERGED = 1e-4  # of a prior sigma
+
+Observe = Callable[[Antenna, Array, Array], Coupling]  # as `observe_antenna`
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +95,7 @@ def prior_sigma(
     centre : float
         (m)
     kappa : float
-        Of both finite sizes (m^2); that of coils of 3 cm radius.
+        Of the finite sizes (m^2); that of coils of 3 cm radius.
     """
     sigma = np.empty(antenna.vector().shape[-1])
     for columns, coils in (
@@ -106,7 +110,14 @@ def prior_sigma(
     return sigma
 
 
-def fit_at_known_poses(survey: AntennaSurvey, start: Antenna, sigma: Array) -> AntennaFit:
+def prior_root(sigma: Array) -> Array:
+    """Return a factor L of a prior's covariance ``L L^T`` (k, k), of standard deviations (k,)."""
+    return np.diag(sigma) if sigma.ndim == 1 else sigma
+
+
+def fit_at_known_poses(
+    survey: AntennaSurvey, start: Antenna, sigma: Array, model: Observe = observe_antenna
+) -> AntennaFit:
     """Fit the antenna by least squares, the poses taken as exact.
 
     Many surveys are fitted in one call.
@@ -115,8 +126,10 @@ def fit_at_known_poses(survey: AntennaSurvey, start: Antenna, sigma: Array) -> A
     ----------
     start : Antenna
         Mean of the prior; of a single antenna, or with the survey's leading axes.
-    sigma : ndarray, shape (k,)
-        Of the prior (`prior_sigma`).
+    sigma : ndarray, shape (k,) or (k, k)
+        Of the prior (`prior_sigma`), or a factor of its covariance (`prior_root`).
+    model : callable
+        Predicts the couplings; one that is not `observe_antenna` takes one survey alone.
 
     Raises
     ------
@@ -124,6 +137,7 @@ def fit_at_known_poses(survey: AntennaSurvey, start: Antenna, sigma: Array) -> A
         Where it does not converge.
     """
     lead = survey.coupling.shape[:-3]
+    root = prior_root(sigma)
     mean = np.broadcast_to(start.vector(), (*lead, len(sigma))).reshape(-1, len(sigma))
     n = survey.coupling.shape[-3]
     rotation = survey.beacon_from_sensor.reshape(-1, n, 3, 3)
@@ -131,12 +145,12 @@ def fit_at_known_poses(survey: AntennaSurvey, start: Antenna, sigma: Array) -> A
     coupling = survey.coupling.reshape(-1, n, 3, 3)
     weight = 1.0 / survey.sigma.reshape(-1, n)[..., None, None]
 
-    def model(rows: IntArray, scaled: Array) -> Normal:
-        """Take (vector - mean) / sigma."""
-        antenna = antenna_from_vector((mean[rows] + scaled * sigma)[:, None])
-        seen = observe_antenna(antenna, rotation[rows], position[rows])
+    def normal(rows: IntArray, scaled: Array) -> Normal:
+        """Take what times the root is (vector - mean)."""
+        antenna = antenna_from_vector((mean[rows] + scaled @ root.T)[:, None])
+        seen = model(antenna, rotation[rows], position[rows])
         error = (seen.value - coupling[rows]) * weight[rows]
-        jacobian = seen.antenna * (weight[rows, ..., None] * sigma)
+        jacobian = (seen.antenna * weight[rows, ..., None]) @ root
         fields = normal_equations(
             error.reshape(len(rows), -1), jacobian.reshape(len(rows), -1, len(sigma))
         )
@@ -146,15 +160,15 @@ def fit_at_known_poses(survey: AntennaSurvey, start: Antenna, sigma: Array) -> A
             fields.information + np.eye(len(sigma)),
         )
 
-    found = minimise(model, np.zeros_like(mean), passes=ITERATIONS, absolute=CONVERGED**2)
+    found = minimise(normal, np.zeros_like(mean), passes=ITERATIONS, absolute=CONVERGED**2)
     if not np.all(found.converged):
         raise EstimationError(
             f"the antenna's calibration does not converge in {ITERATIONS} steps: poses and"
             " couplings disagree by far more than the prior allows"
         )
-    cov = np.linalg.inv(found.information) * sigma[:, None] * sigma
+    cov = root @ np.linalg.inv(found.information) @ root.T
     return AntennaFit(
-        antenna=antenna_from_vector((mean + found.state * sigma).reshape(*lead, -1)),
+        antenna=antenna_from_vector((mean + found.state @ root.T).reshape(*lead, -1)),
         cov=cov.reshape(*lead, *cov.shape[1:]),
         chi2=found.cost.reshape(lead),
         dof=9 * n,

@@ -8,7 +8,14 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
 
-from magfusion.calibration.antenna import CONVERGED, ITERATIONS, AntennaFit, AntennaSurvey
+from magfusion.calibration.antenna import (
+    CONVERGED,
+    ITERATIONS,
+    AntennaFit,
+    AntennaSurvey,
+    Observe,
+    prior_root,
+)
 from magfusion.calibration.graph import CalibrationGraph, Estimate, solve
 from magfusion.model.antenna import Antenna, antenna_from_vector, observe_antenna
 from magfusion.units import Array
@@ -22,6 +29,7 @@ def fit_at_uncertain_poses(
     sigma: Array,
     rotation_sigma: float,
     position_sigma: float,
+    model: Observe = observe_antenna,
 ) -> AntennaFit:
     """Fit the antenna and all poses together.
 
@@ -31,11 +39,14 @@ def fit_at_uncertain_poses(
         One survey; its poses are the means of their priors and the start.
     start : Antenna
         Mean of the prior.
-    sigma : ndarray, shape (k,)
-        Of the prior (`magfusion.calibration.antenna.prior_sigma`): it holds the gauges too.
+    sigma : ndarray, shape (k,) or (k, k)
+        Of the prior (`magfusion.calibration.antenna.prior_sigma`), or a factor of its covariance:
+        it holds the gauges too.
     rotation_sigma, position_sigma : float
         Of each axis of a pose (rad, m).  Infinite where the poses are not known at all: then the
         antenna's shape is found, but neither its frames nor its scale (self-calibration).
+    model : callable
+        Predicts the couplings.
 
     Returns
     -------
@@ -48,17 +59,16 @@ def fit_at_uncertain_poses(
     EstimationError
         Where it does not converge.
     """
-    n, mean = len(survey.position_beacon), start.vector()
+    n, mean, root = len(survey.position_beacon), start.vector(), prior_root(sigma)
     weight = 1.0 / survey.sigma[:, None, None]
 
     def rows(estimate: Estimate) -> tuple[Array, Array, Array]:
-        seen = observe_antenna(
-            antenna_from_vector(mean + estimate.calibration * sigma), *_poses(estimate.values, n)
-        )
+        antenna = antenna_from_vector(mean + root @ estimate.calibration)
+        seen = model(antenna, *_poses(estimate.values, n))
         return (
             ((seen.value - survey.coupling) * weight).reshape(n, 9),
             (seen.pose * weight[..., None]).reshape(n, 9, 6),
-            (seen.antenna * weight[..., None] * sigma).reshape(n, 9, -1),
+            (seen.antenna * weight[..., None] @ root).reshape(n, 9, -1),
         )
 
     # Zero where a pose is not known: no prior on it at all.
@@ -70,13 +80,13 @@ def fit_at_uncertain_poses(
         values.insert(X(i), pose)
         native.add(gtsam.PriorFactorPose3(X(i), pose, noise))
     steps = {X(i): POSE_STEP for i in range(n)}
-    none = np.zeros(len(sigma))
-    graph = CalibrationGraph(rows, native, none, np.eye(len(sigma)), steps)
+    none = np.zeros(len(root))
+    graph = CalibrationGraph(rows, native, none, np.eye(len(root)), steps)
     found, cov = solve(graph, Estimate(values, none), "antenna", ITERATIONS, CONVERGED**2)
     beacon_from_sensor, position_beacon = _poses(found.estimate.values, n)
     return AntennaFit(
-        antenna=antenna_from_vector(mean + found.estimate.calibration * sigma),
-        cov=cov * np.outer(sigma, sigma),
+        antenna=antenna_from_vector(mean + root @ found.estimate.calibration),
+        cov=root @ cov @ root.T,
         chi2=np.asarray(2.0 * found.cost),
         dof=survey.coupling.size - n * int(np.sum(precision == 0.0)),
         beacon_from_sensor=beacon_from_sensor,

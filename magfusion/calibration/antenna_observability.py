@@ -144,7 +144,7 @@ def _gauges(antenna: Antenna, beacon_from_sensor: Array) -> dict[str, Array]:
     shifts = [np.tile(axis, (3, 1)) for axis in unit]
     scale = rows((3.0 * moments, centres, zero, arms))
     if antenna.kappa_beacon is not None and antenna.kappa_sensor is not None:
-        scale[:, KAPPAS] = 2.0 * np.array([antenna.kappa_beacon, antenna.kappa_sensor])
+        scale[:, KAPPAS] = 2.0 * np.append(antenna.kappa_beacon, antenna.kappa_sensor)
     return {
         "the share of moments and sensitivities in their product": rows(
             (moments, zero, -axes, zero)

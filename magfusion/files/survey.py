@@ -9,14 +9,21 @@ import pyarrow.csv
 import pyarrow.parquet
 from scipy.spatial.transform import Rotation
 
-from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
+from magfusion.files.plain_table import (
+    POSITION,
+    QUATERNION,
+    column,
+    integers,
+    numbers,
+    poses,
+    read_whole,
+    refuse_rows,
+)
 from magfusion.units import Array, ComplexArray, IntArray
 
-_POSITION = ("position_x", "position_y", "position_z")
-_QUATERNION = ("qw", "qx", "qy", "qz")
 _PHASOR = ("re_x", "re_y", "re_z", "im_x", "im_y", "im_z")
-_POSE = (*_POSITION, *_QUATERNION)
+_POSE = (*POSITION, *QUATERNION)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,47 +95,72 @@ def write_survey(survey: Survey, path: Path) -> None:
             pa.parquet.write_table(table, unfinished)
 
 
-def read_survey(path: Path) -> Survey:
+def read_survey(path: Path, list_of_poses: Path | None = None) -> Survey:
     """Read and check a survey in Parquet or CSV.
+
+    Parameters
+    ----------
+    list_of_poses : Path, optional
+        Table with the pose of each ``point``, as a turntable or a robot gives them, where the
+        survey's rows have none.
 
     Raises
     ------
     InputError
         Where a column is missing or of the wrong type, a number is not finite, an amplitude or
-        sigma is not positive, a quaternion is not of unit length, a row is repeated, or the rows
-        of one point disagree on its pose.
+        sigma is not positive, a quaternion is not of unit length, a row is repeated, the rows
+        of one point disagree on its pose, or a point is not in the list of poses.
     """
-    table = _read_table(path)
+    table = read_whole(path, "survey")
     values = ("amplitude",) if "amplitude" in table.column_names else _PHASOR
-    number = {name: _numbers(table, name, path) for name in (*_POSE, *values, "sigma")}
+    number = {name: numbers(table, name, path) for name in (*values, "sigma")}
     for name in {"amplitude", "sigma"} & number.keys():
-        _refuse(number[name] <= 0.0, path, f"column {name}", number[name], "a positive number")
-    point, tone = (_integers(table, name, path) for name in ("point", "tone"))
-    _refuse(tone < 0, path, "column tone", tone, "an integer from 0")
-    names = [str(name) for name in _column(table, "beacon", path).to_pylist()]
-    return _arranged(path, point, list(zip(names, tone.tolist(), strict=True)), number)
+        refuse_rows(number[name] <= 0.0, path, f"column {name}", number[name], "a positive number")
+    point, tone = (integers(table, name, path) for name in ("point", "tone"))
+    refuse_rows(tone < 0, path, "column tone", tone, "an integer from 0")
+    names = [str(name) for name in column(table, "beacon", path).to_pylist()]
+    pose = poses(table, path) if list_of_poses is None else _listed(point, path, list_of_poses)
+    return _arranged(path, point, list(zip(names, tone.tolist(), strict=True)), number, *pose)
+
+
+def _listed(point: IntArray, path: Path, list_of_poses: Path) -> tuple[Array, Array]:
+    """Return the poses of points by a list of them."""
+    table = read_whole(list_of_poses, "list of poses")
+    known = integers(table, "point", list_of_poses)
+    position, attitude = poses(table, list_of_poses)
+    repeated = np.ones(len(known), dtype=bool)
+    repeated[np.unique(known, return_index=True)[1]] = False
+    refuse_rows(repeated, list_of_poses, "column point", known, "one row per point")
+    wanted = f"a point that {list_of_poses} has"
+    refuse_rows(~np.isin(point, known), path, "column point", point, wanted)
+    order = np.argsort(known)
+    rows = order[np.searchsorted(known[order], point)]
+    return position[rows], attitude[rows]
 
 
 def _arranged(
-    path: Path, point: IntArray, channel: list[tuple[str, int]], number: dict[str, Array]
+    path: Path,
+    point: IntArray,
+    channel: list[tuple[str, int]],
+    number: dict[str, Array],
+    position: Array,
+    attitude: Array,
 ) -> Survey:
     channels = tuple(dict.fromkeys(channel))
     points, first, row = np.unique(point, return_index=True, return_inverse=True)
-    column = np.array([channels.index(c) for c in channel])
-    cell = row * len(channels) + column
+    own = np.array([channels.index(c) for c in channel])
+    cell = row * len(channels) + own
     repeated = np.ones(len(cell), dtype=bool)
     repeated[np.unique(cell, return_index=True)[1]] = False
-    _refuse(repeated, path, "columns point, beacon, tone", point, "one row per point and channel")
-    pose = np.stack([number[name] for name in _POSE], axis=1)
+    wanted = "one row per point and channel"
+    refuse_rows(repeated, path, "columns point, beacon, tone", point, wanted)
+    pose = np.hstack([position, attitude.reshape(-1, 9)])
     moved = (pose != pose[first][row]).any(axis=1)
-    _refuse(moved, path, "pose of column point", point, "the same pose in all rows of a point")
-    quaternion = pose[:, 3:]
-    length = np.linalg.norm(quaternion, axis=1)
-    _refuse(np.abs(length - 1.0) > 1e-3, path, "columns qw to qz", length, "unit length")
+    refuse_rows(moved, path, "pose of column point", point, "the same pose in all rows of a point")
 
     def grid(value: Array | ComplexArray) -> Array | ComplexArray:
         filled = np.full((len(points), len(channels), *value.shape[1:]), np.nan, dtype=value.dtype)
-        filled[row, column] = value
+        filled[row, own] = value
         return filled
 
     phasor = None
@@ -137,51 +169,10 @@ def _arranged(
         phasor = np.asarray(grid(real + 1j * imaginary), dtype=np.complex128)
     return Survey(
         point=points,
-        position_world=pose[first, :3],
-        world_from_body=Rotation.from_quat(quaternion[first], scalar_first=True).as_matrix(),
+        position_world=position[first],
+        world_from_body=attitude[first],
         channels=channels,
         sigma=np.asarray(grid(number["sigma"]).real),
         phasor_sensor=phasor,
         amplitude=np.asarray(grid(number["amplitude"]).real) if phasor is None else None,
     )
-
-
-def _read_table(path: Path) -> pa.Table:
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file; give the path of a survey.")
-    try:
-        table = pa.csv.read_csv(path) if path.suffix == ".csv" else pa.parquet.read_table(path)
-    except (pa.ArrowInvalid, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"{path}: is no readable survey ({reason}); write it again.") from error
-    if table.num_rows == 0:
-        raise InputError(f"{path}: holds no rows; a survey needs at least one measurement.")
-    return table
-
-
-def _column(table: pa.Table, name: str, path: Path) -> pa.ChunkedArray:
-    if name not in table.column_names:
-        found = ", ".join(table.column_names)
-        raise InputError(f"{path}: column {name} is missing (found {found}); add it.")
-    return table[name]
-
-
-def _numbers(table: pa.Table, name: str, path: Path) -> Array:
-    column = _column(table, name, path)
-    if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
-        raise InputError(f"{path}: column {name} holds {column.type}; write numbers.")
-    value = np.asarray(column.to_numpy(), dtype=np.float64)
-    _refuse(~np.isfinite(value), path, f"column {name}", value, "a finite number")
-    return value
-
-
-def _integers(table: pa.Table, name: str, path: Path) -> IntArray:
-    value = _numbers(table, name, path)
-    _refuse(value != np.round(value), path, f"column {name}", value, "an integer")
-    return value.astype(np.int64)
-
-
-def _refuse(bad: np.ndarray, path: Path, place: str, value: np.ndarray, wanted: str) -> None:
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise InputError(f"{path}: {place}, row {row}: found {value[row]}; write {wanted}.")

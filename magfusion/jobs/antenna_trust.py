@@ -2,78 +2,99 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magfusion.model.trust import Finding, Trust, Verdict
-from magfusion.units import DEGREE, Array
+from magfusion.units import DEGREE
 
 if TYPE_CHECKING:
     from magfusion.calibration.antenna import AntennaFit
+    from magfusion.calibration.antenna_tracking import PoseErrors
+    from magfusion.jobs.antenna_fit import Solved
     from magfusion.results.figures import Estimate
 
 WORSE = 1.5  # errors at poses left out, by those of the declared antenna
 
 
 def judged(
-    fit: AntennaFit,
+    found: Solved,
     estimates: list[Estimate],
-    open_directions: Sequence[str],
-    before: tuple[Array, Array],
-    after: tuple[Array, Array],
+    errors: tuple[PoseErrors, PoseErrors] | None,
 ) -> tuple[AntennaFit, Trust]:
     """Return a fit with a covariance that its witnesses allow, and what they say.
 
     Parameters
     ----------
-    open_directions : sequence of str
-        What the poses do not determine, in words.
-    before, after : (ndarray, ndarray)
-        Errors of attitude (rad) and position (m) of each pose by the declared antenna, and by one
-        that was fitted without the pose.
+    errors : tuple of PoseErrors, optional
+        Of fixes at surveyed poses with the declared antenna, and with one that was fitted without
+        the pose; None where there was no survey.
     """
     from magfusion.estimation.integrity.priors import contradiction, trust_of, unexplained
 
+    fit = found.fit
     fitted = unexplained(
-        "the couplings",
+        "the couplings" if errors else "the probe's readings",
         float(fit.chi2),
         fit.dof,
-        "Check the survey's poses, their sigmas (--pose-rotation-deg, --pose-position-m) and metal"
-        " near the antennas.",
+        "Check the poses, their sigmas (--pose-rotation-deg, --pose-position-m,"
+        " --probe-position-m, --probe-tilt-deg) and metal near the antennas.",
     )
     prior = np.diag([one.prior_sigma**2 for one in estimates])
     moved = contradiction(
         [one.key for one in estimates],
         np.array([one.change for one in estimates]),
-        prior - fit.cov / fitted.excess,
+        prior - (fit.cov / fitted.excess)[: len(prior), : len(prior)],
         prior,
         "Check moments, wiring and frames of the tracker in the site.",
     )
-    findings = []
-    for what, worse, better, size, unit in (
-        ("attitude", after[0], before[0], DEGREE, "deg"),
-        ("position", after[1], before[1], 1e-3, "mm"),
-    ):
-        ratio = _rms(worse) / _rms(better)
-        if ratio > WORSE:
-            text = (
-                f"At poses that an antenna was not fitted to, its {what} errs by"
-                f" {_rms(worse) / size:.2g} {unit}, and the declared one by"
-                f" {_rms(better) / size:.2g}: survey more poses, or keep the declared antenna."
-            )
-            findings.append(Finding("transfer", text, weight=ratio))
-    if open_directions:
+    findings = _transferred(*errors) if errors else []
+    if found.observed is not None and found.observed.null_space:
         text = (
-            f"These poses do not determine {', '.join(open_directions)}: the declared values"
-            " and wide sigmas are kept there."
+            f"These poses do not determine {', '.join(found.observed.null_space)}: the declared"
+            " values and wide sigmas are kept there."
         )
         findings.append(Finding("geometry", text, Verdict.TRUSTWORTHY))
+    if errors is None:
+        findings += _of_probe(found, estimates)
     trust, excess = trust_of(fitted, moved)
     return replace(fit, cov=excess * fit.cov), trust | Trust(tuple(findings))
 
 
-def _rms(value: Array) -> float:
-    return float(np.sqrt(np.mean(value**2)))
+def _transferred(before: PoseErrors, after: PoseErrors) -> list[Finding]:
+    """Return whether fixes are worse than with the declared antenna."""
+    findings = []
+    for k, (what, size, unit) in enumerate((("attitude", DEGREE, "deg"), ("position", 1e-3, "mm"))):
+        ratio = float(after.rms[k] / before.rms[k])
+        sure = after.rms[k] - before.rms[k] > 2.0 * float(
+            np.hypot(after.rms_sigma[k], before.rms_sigma[k])
+        )
+        if ratio > WORSE and sure:
+            text = (
+                f"At poses that an antenna was not fitted to, its {what} errs by"
+                f" {after.rms[k] / size:.2g} {unit}, and the declared one by"
+                f" {before.rms[k] / size:.2g}: survey more poses, or keep the declared antenna."
+            )
+            findings.append(Finding("transfer", text, weight=ratio))
+    return findings
+
+
+def _of_probe(found: Solved, estimates: list[Estimate]) -> list[Finding]:
+    """Return what the probe's readings leave open, and that no pose was tried."""
+    own = tuple(f"{side}." for side in found.probed)
+    open_ones = [e.key for e in estimates if e.key.startswith(own) and not e.determined]
+    findings = []
+    if open_ones:
+        text = (
+            f"The probe's readings do not determine {', '.join(open_ones)}: the declared values and"
+            " wide sigmas are kept there. Read the points on each coil's own axis too, or turn the"
+            " probe to its other axes."
+        )
+        findings.append(Finding("geometry", text, Verdict.TRUSTWORTHY))
+    text = (
+        "No pose was tried: what fixes err by with these antennas is not known. Give a survey of"
+        f" some known poses beside --probe ({', '.join(sorted(found.probed))} read)."
+    )
+    return [*findings, Finding("few_data", text, Verdict.TRUSTWORTHY)]

@@ -19,7 +19,7 @@ from magfusion.units import Array
 
 MOMENTS, CENTRES = slice(0, 9), slice(9, 18)  # of the transmitting antenna, coil by coil
 SENSITIVITIES, SENSOR_CENTRES = slice(18, 27), slice(27, 36)  # of the receiving one
-KAPPAS = slice(36, 38)
+KAPPAS = slice(36, 40)  # of the transmitting coils one by one, and of the receiving ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +38,10 @@ class Antenna:
         Of each receiving coil, sensor axes: the rows of the magnetometer's matrix.
     centres_sensor : ndarray, shape (..., 3, 3)
         Of each receiving coil (m).
-    kappa_beacon, kappa_sensor : ndarray, shape (...), optional
-        Finite size of the coils (m^2, `magfusion.model.physics.finite_size`).  Both or neither.
+    kappa_beacon : ndarray, shape (..., 3), optional
+        Finite size of each transmitting coil (m^2, `magfusion.model.physics.finite_size`).
+    kappa_sensor : ndarray, shape (...), optional
+        Of the receiving coils.  Both or neither.
     """
 
     moments_beacon: Array
@@ -50,7 +52,7 @@ class Antenna:
     kappa_sensor: Array | None = None
 
     def vector(self) -> Array:
-        """Return the parameters as one vector, shape (..., 36), or (..., 38) with finite size."""
+        """Return the parameters as one vector, shape (..., 36), or (..., 40) with finite size."""
         lead = self.moments_beacon.shape[:-2]
         parts = [
             v.reshape(*lead, 9)
@@ -62,7 +64,7 @@ class Antenna:
             )
         ]
         if self.kappa_beacon is not None and self.kappa_sensor is not None:
-            parts += [np.asarray(self.kappa_beacon)[..., None]]
+            parts += [np.asarray(self.kappa_beacon)]
             parts += [np.asarray(self.kappa_sensor)[..., None]]
         return np.concatenate(parts, axis=-1)
 
@@ -72,13 +74,13 @@ class Antenna:
 
 
 def antenna_from_vector(vector: Array) -> Antenna:
-    """Return the antenna whose `Antenna.vector` is given, shape (..., 36) or (..., 38)."""
+    """Return the antenna whose `Antenna.vector` is given, shape (..., 36) or (..., 40)."""
     lead = vector.shape[:-1]
     blocks = [
         vector[..., columns].reshape(*lead, 3, 3)
         for columns in (MOMENTS, CENTRES, SENSITIVITIES, SENSOR_CENTRES)
     ]
-    sizes = [] if vector.shape[-1] == KAPPAS.start else [vector[..., 36], vector[..., 37]]
+    sizes = [] if vector.shape[-1] == KAPPAS.start else [vector[..., 36:39], vector[..., 39]]
     return Antenna(*blocks, *sizes)
 
 
@@ -88,8 +90,7 @@ def antenna_of(beacon: Beacon, magnetometer: Magnetometer) -> Antenna:
     Raises
     ------
     InputError
-        Where the beacon has not three coils, each alone in its tone or time slot, or where these
-        are of different size.
+        Where the beacon has not three coils, each alone in its tone or time slot.
     """
     if len(beacon.coils) != 3 or len(beacon.tones) != 3:
         raise InputError(
@@ -97,19 +98,15 @@ def antenna_of(beacon: Beacon, magnetometer: Magnetometer) -> Antenna:
             " slots; a tracker needs three coils, each with a frequency or slot of its own"
         )
     kappas = np.array([coil_kappa(coil.radius, coil.length) for coil in beacon.coils])
-    if np.ptp(kappas) > 1e-6 * np.max(np.abs(kappas)):
-        raise InputError(
-            f"beacon {beacon.name} has coils of different size, and an antenna is calibrated with"
-            " one; give all three the same radius_m and length_m"
-        )
-    sizes = (kappas[0], np.array(magnetometer.coil_kappa))
+    sizes = (kappas, np.array(magnetometer.coil_kappa))
+    is_sized = bool(np.any(kappas)) or magnetometer.coil_kappa != 0.0
     centres = magnetometer.coil_centres_sensor
     return Antenna(
         moments_beacon=beacon.moments_beacon,
         centres_beacon=beacon.centres_beacon,
         sensitivities_sensor=magnetometer.matrix,
         centres_sensor=np.zeros((3, 3)) if centres is None else centres,
-        **dict(zip(("kappa_beacon", "kappa_sensor"), sizes, strict=True) if any(sizes) else ()),
+        **dict(zip(("kappa_beacon", "kappa_sensor"), sizes, strict=True) if is_sized else ()),
     )
 
 
@@ -122,7 +119,7 @@ class Coupling(NamedTuple):
         Rows are receiving coils, columns transmitting ones (T).
     pose : ndarray, shape (..., 3, 3, 6)
         Right perturbation of beacon_from_sensor: rotation, translation, sensor axes.
-    antenna : ndarray, shape (..., 3, 3, 36) or (..., 3, 3, 38)
+    antenna : ndarray, shape (..., 3, 3, 36) or (..., 3, 3, 40)
         By `Antenna.vector`.
     """
 
@@ -150,12 +147,13 @@ def observe_antenna(
     in_beacon = antenna.sensitivities_sensor @ turn
     place = position_beacon[..., None, :] + antenna.centres_sensor @ turn
     offset = place[..., :, None, :] - antenna.centres_beacon[..., None, :, :]
-    kappa = antenna.kappa_beacon, antenna.kappa_sensor
+    sent, heard = antenna.kappa_beacon, antenna.kappa_sensor
     seen = coil_coupling(
         offset,
         np.broadcast_to(antenna.moments_beacon[..., None, :, :], offset.shape),
         np.broadcast_to(in_beacon[..., :, None, :], offset.shape),
-        *(None if k is None else np.asarray(k)[..., None, None] for k in kappa),
+        None if sent is None else np.asarray(sent)[..., None, :],
+        None if heard is None else np.asarray(heard)[..., None, None],
     )
     back = beacon_from_sensor[..., None, :, :]
     by_offset, by_sensitivity = seen.by_offset @ back, seen.by_sensitivity @ back  # sensor axes
@@ -170,6 +168,8 @@ def observe_antenna(
         columns[..., k, :, SENSITIVITIES][..., own] = by_sensitivity[..., k, :, :]
         columns[..., k, :, SENSOR_CENTRES][..., own] = by_offset[..., k, :, :]
     if columns.shape[-1] == KAPPAS.stop:
-        columns[..., 36], columns[..., 37] = seen.by_kappa_moment, seen.by_kappa_sensitivity
+        columns[..., 39] = seen.by_kappa_sensitivity
+        for k in range(3):
+            columns[..., :, k, 36 + k] = seen.by_kappa_moment[..., :, k]
     pose = np.concatenate([rotation, by_offset], axis=-1)
     return Coupling(value=seen.value, pose=pose, antenna=columns)

@@ -1,0 +1,171 @@
+"""What fixes with a site err by at surveyed poses, the survey's own error taken off.
+
+A fix and the survey's pose differ by the errors of both.  What noise and calibration should make of
+the fix's own is scaled by two witnesses: by what the declared error of the survey leaves of the
+differences, which drowns where the survey errs more than the tracker; and by the residuals that no
+pose takes up, and that are no error of a pose.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.calibration.antenna import AntennaFit
+from magfusion.calibration.antenna_site import BodySurvey, of_site
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.field import model_error_cov, skew
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Beacon, Site
+from magfusion.units import Array
+
+MODELLED = 0.3  # relative error of a variance that residuals beside the pose predict
+DEVIATES = 3.0  # sigmas
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """Errors of fixes, one column for the attitude (rad) and one for the position (m).
+
+    Parameters
+    ----------
+    difference : ndarray, shape (n, 2)
+        From the surveyed poses.
+    rms, rms_sigma : ndarray, shape (2,)
+        Of the fixes themselves, and how well that is known.
+    survey : ndarray, shape (2,)
+        What the survey's poses err by, as declared.
+    """
+
+    difference: Array
+    rms: Array
+    rms_sigma: Array
+    survey: Array
+
+
+def fixed_poses(site: Site, beacon: Beacon, survey: BodySurvey) -> tuple[Array, Array]:
+    """Return world_from_body and position (m) of the fixes that are next to the surveyed poses.
+
+    By `magfusion.estimation.snapshot.likelihood.fix_epochs`, as ``magfusion fix`` does.
+    """
+    alone = replace(site, beacons=(replace(beacon, hemisphere_beacon=None),), region=None)
+    turn = np.exp(1j * np.array([coil.phase for coil in beacon.coils]))
+    n, count = len(survey.sigma), len(alone.channels)
+    cov = (survey.sigma**2)[:, None, None, None] * np.eye(3) * np.ones((1, count, 1, 1))
+    samples = FieldSamples(
+        np.zeros(n),
+        np.ones(n),
+        alone.channels,
+        np.asarray(np.swapaxes(survey.coupling, 1, 2) * turn[:, None], dtype=np.complex128),
+        cov,
+    )
+    fixes = fix_epochs(samples, initial_calibration(replace(alone, correlation=None), 0.0))
+    apart = np.linalg.norm(fixes.position_world - survey.position_world[:, None], axis=-1)
+    best = np.argmin(np.where(np.isfinite(fixes.cost), apart, np.inf), axis=1)
+    rows = np.arange(n)
+    return fixes.world_from_body[rows, best], fixes.position_world[rows, best]
+
+
+def differences(site: Site, beacon: Beacon, survey: BodySurvey) -> Array:
+    """Return how far fixes are from the surveyed poses, shape (n, 2) (rad, m)."""
+    rotation, position = fixed_poses(site, beacon, survey)
+    turn = np.swapaxes(survey.world_from_body, -1, -2) @ rotation
+    off = np.linalg.norm(position - survey.position_world, axis=-1)
+    return np.column_stack([Rotation.from_matrix(turn).magnitude(), off])
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """What noise and calibration make of fixes, pose by pose.
+
+    Parameters
+    ----------
+    square : ndarray, shape (n, 2)
+        Mean square error (rad^2, m^2).
+    excess : ndarray, shape (n,)
+        Square of the residuals that no pose takes up, by what is expected of it.
+    """
+
+    square: Array
+    excess: Array
+
+
+def expected(site: Site, beacon: Beacon, fit: AntennaFit, survey: BodySurvey) -> Expected:
+    """Return what fixes with a site should err by at poses that its antennas were not fitted to.
+
+    Parameters
+    ----------
+    site, beacon
+        With the antennas of the fit.
+    survey : BodySurvey
+        At whose poses.
+    """
+    sensor = site.platform.magnetometer
+    own = survey.of_sensor(beacon, sensor)
+    seen = of_site(beacon, sensor)(fit.antenna, own.beacon_from_sensor, own.position_beacon)
+    n = len(own.sigma)
+    by_pose, by_antenna = seen.pose.reshape(n, 9, 6), seen.antenna.reshape(n, 9, -1)
+    cov = by_antenna @ fit.cov @ np.swapaxes(by_antenna, 1, 2)
+    cov += (own.sigma**2)[:, None, None] * np.eye(9)
+    error = site.model_error if beacon.model_error is None else beacon.model_error
+    phasor = np.swapaxes(seen.value, 1, 2).astype(np.complex128)
+    model = model_error_cov(phasor, error)[..., 0, 0]
+    weight = 1.0 / np.sqrt(own.sigma[:, None] ** 2 + model)  # of each coil's column
+    white = np.tile(weight[:, None, :], (1, 3, 1)).reshape(n, 9, 1)
+    gain = np.linalg.pinv(white * by_pose) * np.swapaxes(white, 1, 2)
+    # From the sensor's origin to the body's.
+    lever = -sensor.body_from_sensor.T @ sensor.position_body
+    gain[:, 3:] -= skew(lever) @ gain[:, :3]
+    of_pose = gain @ cov @ np.swapaxes(gain, 1, 2)
+    diagonal = np.diagonal(of_pose, axis1=1, axis2=2).reshape(n, 2, 3)
+    left = np.linalg.svd(by_pose / np.linalg.norm(by_pose, axis=1, keepdims=True))[0][..., 6:]
+    beside = np.swapaxes(left, 1, 2)
+    rest = beside @ (seen.value - survey.coupling).reshape(n, 9, 1)
+    declared = beside @ cov @ left
+    excess = np.swapaxes(rest, 1, 2) @ np.linalg.solve(declared, rest)
+    return Expected(np.sum(diagonal, axis=2), excess[:, 0, 0] / 3.0)
+
+
+def own_errors(difference: Array, survey: Array, predicted: Expected | None) -> PoseErrors:
+    """Return what fixes err by themselves.
+
+    Parameters
+    ----------
+    difference : ndarray, shape (n, 2)
+        From surveyed poses (rad, m).
+    survey : ndarray, shape (2,)
+        Error of these, one sigma an axis.
+    predicted : Expected, optional
+        What the fixes should err by.
+    """
+    n, of_survey = len(difference), 3.0 * survey**2
+    square = difference**2 - of_survey
+    plain, spread = np.mean(square, axis=0), np.var(square, axis=0, ddof=1) / n
+    if predicted is None:
+        own, variance = np.maximum(plain, np.mean(difference**2, axis=0) / n), spread
+    else:
+        own, variance = _scaled(square, of_survey, predicted)
+        # A prediction of another shape than the errors have says nothing of them.
+        other = np.abs(plain - own) > DEVIATES * np.sqrt(spread + variance)
+        own, variance = np.where(other, plain, own), np.where(other, spread, variance)
+    rms = np.sqrt(np.maximum(own, 0.0))
+    return PoseErrors(difference, rms, 0.5 * np.sqrt(variance) / rms, np.sqrt(of_survey))
+
+
+def _scaled(square: Array, of_survey: Array, predicted: Expected) -> tuple[Array, Array]:
+    """Return the mean square of the errors, and its variance, by the scale of the prediction.
+
+    Far poses err by many times what near ones do; each tells as much of the scale.
+    """
+    model = predicted.square
+    share = model / (model + of_survey)
+    gain = np.sum(share**2 * square / model, axis=0) / np.sum(share**2, axis=0)
+    residual = float(np.mean(predicted.excess))
+    size = np.maximum(gain, residual)
+    # Three components a pose, of which each is a square of a normal number.
+    of_gain = size**2 * (2.0 / 3.0) / np.sum(share**2, axis=0)
+    of_residual = (MODELLED * size) ** 2
+    weight = of_residual / (of_residual + of_gain)
+    whole, mean = weight * gain + (1.0 - weight) * residual, np.mean(model, axis=0)
+    return whole * mean, weight * of_gain * mean**2

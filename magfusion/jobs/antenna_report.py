@@ -1,0 +1,144 @@
+"""What the antennas' calibration tells: its figures."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magfusion.results.figures import Estimate, Figure, Figures
+from magfusion.units import DEGREE
+
+if TYPE_CHECKING:
+    from magfusion.calibration.antenna import AntennaFit
+    from magfusion.calibration.antenna_observability import Observability
+    from magfusion.calibration.antenna_tracking import PoseErrors
+    from magfusion.files.probe import Side
+    from magfusion.jobs.antenna_fit import Bench
+    from magfusion.jobs.calibrate_antenna import AntennaSettings
+    from magfusion.model.antenna import Antenna
+    from magfusion.model.site import Site
+    from magfusion.units import Array
+
+_AXES = "xyz"
+
+
+def estimates(fit: AntennaFit, start: Antenna, *, sizes: bool) -> list[Estimate]:
+    """Return every number of the antennas with its sigma and that of its prior."""
+    from magfusion.jobs.antenna_fit import declared_sigma
+
+    blocks = ("transmitter.moment", "transmitter.centre", "receiver.matrix", "receiver.centre")
+    names = [f"{block}_{coil}{axis}" for block in blocks for coil in _AXES for axis in _AXES]
+    names += [*(f"transmitter.kappa_{c}" for c in _AXES), "receiver.kappa"] if sizes else []
+    found = fit.antenna.vector()
+    prior = declared_sigma(start, sizes=True)
+    columns = (found - start.vector(), np.diagonal(fit.cov), prior)
+    rows = zip(names, *(column[: len(names)] for column in columns), strict=True)
+    return [
+        Estimate(name, float(change), sigma=float(np.sqrt(variance)), prior_sigma=float(before))
+        for name, change, variance, before in rows
+    ]
+
+
+def read_figures(bench: Bench, dropped: int) -> Figures:
+    """Return how much was read."""
+    found = []
+    if bench.survey is not None:
+        found += [Figure("poses", len(bench.survey.sigma)), Figure("poses_dropped", dropped)]
+    for side, readings in bench.probed.items():
+        found.append(Figure(f"{side}_probe_readings", len(readings), label=f"{side}, readings"))
+    return Figures(*found)
+
+
+def error_figures(
+    errors: tuple[PoseErrors, PoseErrors] | None, probed: dict[Side, tuple[Array, Array]]
+) -> Figures:
+    """Return errors before and after: of fixes at poses, and of what a probe reads at points."""
+    found = []
+    for k, (name, unit, size) in enumerate((("attitude", "deg", DEGREE), ("position", "m", 1.0))):
+        for when, one in zip(("before", "after"), errors or (), strict=False):
+            key = f"{name}_{unit}_{when}"
+            raw = float(np.sqrt(np.mean(one.difference[:, k] ** 2))) / size
+            words = f"{name} error {when}"
+            found.append(Figure(key, float(one.rms[k]) / size, unit, label=words))
+            found.append(
+                Figure(f"{key}_against_survey", raw, unit, label=f"{words}, with the survey's own")
+            )
+            if when == "after":
+                known = float(one.rms_sigma[k]) / size
+                found.append(Figure(f"{key}_sigma", known, unit, label=f"{words}, known to"))
+    for side, (before, after) in probed.items():
+        for when, value in (("before", before), ("after", after)):
+            rms = float(np.sqrt(np.mean(value**2)))
+            words = f"{side}, field at points left out, {when}"
+            found.append(Figure(f"{side}_field_error_{when}", rms, label=words))
+    return Figures(*found)
+
+
+def figures(
+    fit: AntennaFit, observed: Observability | None, start: Antenna, settings: AntennaSettings
+) -> Figures:
+    """Return what was found of the antennas, and what was not."""
+    from magfusion.model.antenna import CENTRES, KAPPAS, MOMENTS, SENSITIVITIES, SENSOR_CENTRES
+
+    sigma = np.sqrt(np.diagonal(fit.cov))
+    found = fit.antenna.vector()
+    change = found - start.vector()
+    chi2 = float(fit.chi2 / fit.dof)
+    figures = [Figure("chi2_per_dof", chi2, label="chi square per degree of freedom")]
+    if observed is not None:
+        figures += _observed_figures(observed, exact=settings.exact)
+    for columns, name, unit in (
+        (MOMENTS, "moment_change_a_m2", "A m^2"),
+        (CENTRES, "transmitter_centre_change_m", "m"),
+        (SENSITIVITIES, "matrix_change", ""),
+        (SENSOR_CENTRES, "receiver_centre_change_m", "m"),
+    ):
+        figures += [
+            Figure(f"{name}_largest", float(np.max(np.abs(change[columns]))), unit),
+            Figure(f"{name}_sigma_largest", float(np.max(sigma[columns])), unit),
+        ]
+    if settings.sizes:
+        kappas = np.stack([found[KAPPAS], sigma[KAPPAS]])
+        sizes = {"transmitter": np.mean(kappas[:, :3], axis=1)}
+        sizes |= {f"transmitter_{c}": kappas[:, k] for k, c in enumerate(_AXES)}
+        for name, (value, error) in (sizes | {"receiver": kappas[:, 3]}).items():
+            key, words = f"{name}_kappa_m2", f"{name.replace('_', ' ')} kappa"
+            figures += [
+                Figure(key, float(value), "m^2", label=words),
+                Figure(f"{key}_sigma", float(error), "m^2", label=f"{words} sigma"),
+            ]
+    return Figures(*figures)
+
+
+def _observed_figures(observed: Observability, *, exact: bool) -> list[Figure]:
+    return [
+        Figure("poses_taken_as", "exact" if exact else "uncertain"),
+        Figure("parameters", observed.parameters),
+        Figure("rank", observed.rank),
+        Figure("not_seen_by_these_poses", list(observed.null_space)),
+        Figure("weakest_seen_relative", float(observed.singular[observed.rank - 1])),
+        Figure("fewest_of_these_poses", observed.fewest_poses),
+    ]
+
+
+def mounting_figures(site: Site, declared: Site) -> Figures:
+    """Return by how much the receiver is mounted otherwise than declared, and its sigmas."""
+    from scipy.spatial.transform import Rotation
+
+    found, before = site.platform.magnetometer, declared.platform.magnetometer
+    turn = before.body_from_sensor.T @ found.body_from_sensor
+    turned = float(Rotation.from_matrix(turn).magnitude()) / DEGREE
+    moved = float(np.linalg.norm(found.position_body - before.position_body))
+    known = float(np.max(found.sigma.rotation_sensor)) / DEGREE
+    return Figures(
+        Figure("boresight_change_deg", turned, "deg", label="boresight, change"),
+        Figure("boresight_sigma_deg", known, "deg", label="boresight, sigma an axis"),
+        Figure("lever_change_m", moved, "m", label="lever arm, change"),
+        Figure(
+            "lever_sigma_m",
+            float(np.max(found.sigma.position_body)),
+            "m",
+            label="lever arm, sigma an axis",
+        ),
+    )
