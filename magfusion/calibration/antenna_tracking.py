@@ -127,6 +127,17 @@ def expected(site: Site, beacon: Beacon, fit: AntennaFit, survey: BodySurvey) ->
     return Expected(np.sum(diagonal, axis=2), excess[:, 0, 0] / 3.0)
 
 
+def turned_elsewhere(site: Site, beacon: Beacon, fit: AntennaFit, survey: BodySurvey) -> Array:
+    """Return what fixes should err by where the body was surveyed but turned anyhow, shape (2,).
+
+    Root mean square (rad, m): what a survey of few attitudes leaves open is felt in others.
+    """
+    n = len(survey.sigma)
+    turn = Rotation.random(n, rng=np.random.default_rng(0)).as_matrix()
+    other = replace(survey, world_from_body=turn)
+    return np.sqrt(np.mean(expected(site, beacon, fit, other).square, axis=0))
+
+
 def own_errors(difference: Array, survey: Array, predicted: Expected | None) -> PoseErrors:
     """Return what fixes err by themselves.
 

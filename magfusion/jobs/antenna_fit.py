@@ -54,6 +54,8 @@ class Solved:
         What the survey's poses determine.
     probed : dict
         Relative errors of readings at points left out, before and after.
+    elsewhere : ndarray, shape (2,), optional
+        What fixes should err by in other attitudes than were surveyed (rad, m).
     """
 
     fit: AntennaFit
@@ -61,6 +63,7 @@ class Solved:
     root: Array
     observed: Observability | None
     probed: dict[Side, tuple[Array, Array]] = field(default_factory=dict)
+    elsewhere: Array | None = None
 
 
 def declared_sigma(start: Antenna, *, sizes: bool) -> Array:
@@ -81,6 +84,8 @@ def solved(bench: Bench, settings: AntennaSettings) -> Solved:
     """
     from magfusion.calibration.antenna import AntennaFit
     from magfusion.calibration.antenna_observability import observability
+    from magfusion.calibration.antenna_site import with_fit
+    from magfusion.calibration.antenna_tracking import turned_elsewhere
     from magfusion.model.antenna import antenna_from_vector
 
     mean = bench.start.vector()
@@ -98,7 +103,10 @@ def solved(bench: Bench, settings: AntennaSettings) -> Solved:
     fit = _by_survey(bench, bench.survey, mean, root, settings)
     own = bench.survey.of_sensor(bench.beacon, bench.site.platform.magnetometer)
     whole = replace(fit, chi2=fit.chi2 + chi2, dof=fit.dof + dof)
-    return Solved(whole, mean, root, observability(own, fit.antenna), errors)
+    written = with_fit(bench.site, bench.beacon, fit)
+    beacon = next(b for b in written.beacons if b.name == bench.beacon.name)
+    elsewhere = turned_elsewhere(written, beacon, fit, bench.survey)
+    return Solved(whole, mean, root, observability(own, fit.antenna), errors, elsewhere)
 
 
 def _by_survey(

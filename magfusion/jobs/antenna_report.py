@@ -13,12 +13,10 @@ if TYPE_CHECKING:
     from magfusion.calibration.antenna import AntennaFit
     from magfusion.calibration.antenna_observability import Observability
     from magfusion.calibration.antenna_tracking import PoseErrors
-    from magfusion.files.probe import Side
-    from magfusion.jobs.antenna_fit import Bench
+    from magfusion.jobs.antenna_fit import Bench, Solved
     from magfusion.jobs.calibrate_antenna import AntennaSettings
     from magfusion.model.antenna import Antenna
     from magfusion.model.site import Site
-    from magfusion.units import Array
 
 _AXES = "xyz"
 
@@ -50,11 +48,9 @@ def read_figures(bench: Bench, dropped: int) -> Figures:
     return Figures(*found)
 
 
-def error_figures(
-    errors: tuple[PoseErrors, PoseErrors] | None, probed: dict[Side, tuple[Array, Array]]
-) -> Figures:
+def error_figures(errors: tuple[PoseErrors, PoseErrors] | None, solved: Solved) -> Figures:
     """Return errors before and after: of fixes at poses, and of what a probe reads at points."""
-    found = []
+    found, probed = [], solved.probed
     for k, (name, unit, size) in enumerate((("attitude", "deg", DEGREE), ("position", "m", 1.0))):
         for when, one in zip(("before", "after"), errors or (), strict=False):
             key = f"{name}_{unit}_{when}"
@@ -67,6 +63,9 @@ def error_figures(
             if when == "after":
                 known = float(one.rms_sigma[k]) / size
                 found.append(Figure(f"{key}_sigma", known, unit, label=f"{words}, known to"))
+                assert solved.elsewhere is not None
+                turned, words = float(solved.elsewhere[k]) / size, f"{name} error in any attitude"
+                found.append(Figure(f"{name}_{unit}_any_attitude", turned, unit, label=words))
     for side, (before, after) in probed.items():
         for when, value in (("before", before), ("after", after)):
             rms = float(np.sqrt(np.mean(value**2)))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magfusion.model.trust import Finding, Trust, Verdict
-from magfusion.units import DEGREE
+from magfusion.units import DEGREE, Array
 
 if TYPE_CHECKING:
     from magfusion.calibration.antenna import AntennaFit
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from magfusion.jobs.antenna_fit import Solved
     from magfusion.results.figures import Estimate
 
+ALIKE = 2.0  # expected errors in any attitude, by those at surveyed poses
 WORSE = 1.5  # errors at poses left out, by those of the declared antenna
 
 
@@ -57,6 +58,8 @@ def judged(
             " values and wide sigmas are kept there."
         )
         findings.append(Finding("geometry", text, Verdict.TRUSTWORTHY))
+    if errors and found.elsewhere is not None:
+        findings += _in_other_attitudes(found.elsewhere, errors[1])
     if errors is None:
         findings += _of_probe(found, estimates)
     trust, excess = trust_of(fitted, moved)
@@ -79,6 +82,20 @@ def _transferred(before: PoseErrors, after: PoseErrors) -> list[Finding]:
             )
             findings.append(Finding("transfer", text, weight=ratio))
     return findings
+
+
+def _in_other_attitudes(elsewhere: Array, after: PoseErrors) -> list[Finding]:
+    """Return whether fixes should be worse in attitudes that were not surveyed."""
+    ratio = elsewhere / np.maximum(after.rms, 1e-12)
+    if float(np.max(ratio)) <= ALIKE:
+        return []
+    (turn, place), (turned, placed) = elsewhere, after.rms
+    text = (
+        f"The surveyed poses are alike: in other attitudes fixes should err by"
+        f" {turn / DEGREE:.2g} deg and {1e3 * place:.2g} mm, and by {turned / DEGREE:.2g} deg and"
+        f" {1e3 * placed:.2g} mm in those. Survey attitudes turned about all axes."
+    )
+    return [Finding("transfer", text, weight=float(np.max(ratio)) / ALIKE)]
 
 
 def _of_probe(found: Solved, estimates: list[Estimate]) -> list[Finding]:

@@ -140,7 +140,7 @@ def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
         | trust_figures(trust)
         | Figures(Figure("beacon", beacon.name))
         | told.read_figures(bench, dropped)
-        | told.error_figures(errors, found.probed)
+        | told.error_figures(errors, found)
         | told.figures(fit, found.observed, start, settings)
         | (told.mounting_figures(site, declared) if settings.boresight else Figures())
         | determined_figures(estimates)

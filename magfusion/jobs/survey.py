@@ -55,7 +55,7 @@ def run_survey(settings: SurveySettings, output: Path) -> Figures:
     InputError
         Where the log has no pose, none of its epochs can be a point, or ``output`` is in the way.
     """
-    from magfusion.estimation.demodulation import phasors
+    from magfusion.estimation.demodulation import fix_inputs, phasors
     from magfusion.files.survey import write_survey
     from magfusion.jobs.inputs import claim, named, read_job
     from magfusion.results.plots.survey import write_survey_plot
@@ -66,7 +66,8 @@ def run_survey(settings: SurveySettings, output: Path) -> Figures:
     log, site = read_job(job)
     poses = _poses(job, settings, log)
     with named(job.log_path):
-        samples, windows_dropped = phasors(log, site, lockin)
+        slots, windows_dropped = phasors(log, site, lockin)
+    samples, _ = fix_inputs(slots, log, site)  # of coils driven in turn whole cycles
     survey, dropped = make_survey(
         samples, poses, log, site, points=settings.points, spacing=settings.spacing
     )
