@@ -1,4 +1,4 @@
-"""Beacons heard through rock and water that conduct: how far off it leads, and how far not.
+"""Beacons heard through rock and water that conduct: what an estimated conductivity is worth.
 
 Four beacons about a cave or a wreck, a platform that walks among them for 24 s, and ground whose
 conductivity is declared three times too high, with as much for its sigma, or not at all.  The
@@ -7,7 +7,9 @@ fields come demodulated from the simulator, of true sites drawn from the survey'
 The rule, made before: every log that estimates the conductivity has an rms error of the position of
 at most 3 cm through 100 m of rock at 1 kHz, and of at most 1 cm through 30 m of sea at 20 Hz; the
 conductivity is within three of its sigmas; and the mean NEES of the position over the logs lies
-between 1 and 6, where 3 is due.
+between 1 and 6, where 3 is due.  With ``--surface`` the ground ends, by empymod: 200 m above the
+middle in rock, 60 m in the sea, of which the model's full space knows nothing.  Such logs may err
+by twice as much, and the mean NEES may be small, but not large.
 """
 
 from dataclasses import dataclass, replace
@@ -24,6 +26,7 @@ from magfusion.model.samples import Log
 from magfusion.model.site import Beacon, BeaconSigma, Coil, Site
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.inertial import simulate_imu
+from magfusion.simulation.layers import Layers
 from magfusion.simulation.log import EPOCH_NS, interpolate, perturb_site, simulate_fields
 from magfusion.simulation.motion import random_walk_motion
 
@@ -45,10 +48,11 @@ class Place:
     moment: float  # A m^2
     sigma: float  # T, of a phasor's component
     bound: float  # m
+    surface: float  # m, above the middle, where the ground ends if it does
 
 
-ROCK = Place("rock, 100 m, 1 kHz", 100.0, 1000.0, 0.01, 2e3, 1e-13, 0.03)
-SEA = Place("sea, 30 m, 20 Hz", 30.0, 20.0, 4.0, 1e2, 2e-13, 0.01)
+ROCK = Place("rock, 100 m, 1 kHz", 100.0, 1000.0, 0.01, 2e3, 1e-13, 0.03, 200.0)
+SEA = Place("sea, 30 m, 20 Hz", 30.0, 20.0, 4.0, 1e2, 2e-13, 0.01, 60.0)
 PLACES = (ROCK, SEA)
 
 
@@ -60,6 +64,7 @@ class Config:
     every: float = 0.5  # s, between the windows
     seed: int = 10
     logs: int = 5
+    surface: bool = False
 
 
 def site_at(place: Place) -> Site:
@@ -110,7 +115,8 @@ def log_at(place: Place, config: Config, site: Site) -> Log:
     motion = random_walk_motion(rng, config.duration, np.array([-half, half]), 0.5)
     imu = simulate_imu(motion, site.platform.imu, site.gravity, 200.0, config.duration, rng)
     time = np.arange(config.every, config.duration - 0.5 * config.every, config.every)
-    fields = simulate_fields(site, motion.trajectory(time), place.sigma, rng)
+    layers = Layers((place.surface,), (conductivity_of(site),)) if config.surface else None
+    fields = simulate_fields(site, motion.trajectory(time), place.sigma, rng, layers=layers)
     truth = motion.trajectory(imu.samples.time)
     return Log("through_rock", EPOCH_NS, "simulation", imu.samples, None, fields, truth)
 
@@ -177,14 +183,17 @@ def run_place(place: Place, config: Config) -> list[Row]:
     return rows
 
 
-def judgement(place: Place, rows: list[Row]) -> Judgement:
+def judgement(place: Place, rows: list[Row], config: Config) -> Judgement:
     """Judge the logs of a place by the rule."""
     own = [row for row in rows if row.place == place.name and row.declared == ESTIMATED]
     worst = max(row.position_m for row in own)
     off = max(abs(row.off_in_sigmas or 0.0) for row in own)
     nees = float(np.mean([row.nees for row in own]))
-    good = worst <= place.bound and off <= 3.0 and LEAST_NEES <= nees <= MOST_NEES
-    return Judgement(place.name, worst, place.bound, off, nees, good)
+    bound = 2.0 * place.bound if config.surface else place.bound
+    # A half space has no conductivity of a full one: what is found is what stands in for it.
+    sure = config.surface or (off <= 3.0 and nees >= LEAST_NEES)
+    good = worst <= bound and sure and nees <= MOST_NEES
+    return Judgement(place.name, worst, bound, off, nees, good)
 
 
 def report(rows: list[Row], found: list[Judgement]) -> str:
@@ -207,11 +216,12 @@ def main() -> None:
     """Smooth logs of both places and judge them."""
     parser = scenario_parser(__doc__, Config.seed, output=None)
     parser.add_argument("--logs", type=int, default=Config.logs, help="of each place")
+    parser.add_argument("--surface", action="store_true", help="the ground ends; needs empymod")
     given = parser.parse_args()
-    config, rows = Config(seed=given.seed, logs=given.logs), list[Row]()
+    config, rows = Config(seed=given.seed, logs=given.logs, surface=given.surface), list[Row]()
     for place in PLACES:
         rows += run_place(place, config)
-    found = [judgement(place, rows) for place in PLACES]
+    found = [judgement(place, rows, config) for place in PLACES]
     conclude(report(rows, found), {"rows": rows, "judgements": found})
 
 

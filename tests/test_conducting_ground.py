@@ -228,7 +228,7 @@ def test_the_file_has_it_in_its_own_unit(tmp_path) -> None:
         load_site(path)
 
 
-DEEP = Place("deep", 100.0, 1000.0, 0.16, 2e3, 1e-18, 0.0)  # two and a half skin depths
+DEEP = Place("deep", 100.0, 1000.0, 0.16, 2e3, 1e-18, 0.0, 0.0)  # two and a half skin depths
 
 
 def test_a_fix_finds_its_way_through_the_lag() -> None:

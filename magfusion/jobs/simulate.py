@@ -58,6 +58,11 @@ class SimulateSettings(RandomSettings):
         most=1.0,
         note="alike within the site's model_error_correlation_m",
     )
+    ground: str | None = option(
+        None,
+        "Layers of ground under air, height:S/m from above, e.g. 0:0.01,-20:0.05",
+        note="default: the site's conductivity_s_m without end; needs empymod",
+    )
 
 
 def box_option(text: str | None) -> Array | None:
@@ -92,6 +97,7 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
     from magfusion.files.site import load_site
     from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
     from magfusion.simulation.disturbance import Ambient, FieldDrift, office_noise
+    from magfusion.simulation.layers import layers_option
     from magfusion.simulation.log import EPOCH_NS, SimulationConfig
     from magfusion.simulation.waveform import usual_rate_hz
 
@@ -109,6 +115,7 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
         ambient=Ambient(
             day_night=office_noise(EPOCH_NS) if settings.ambient == "day-night" else None,
             drift=FieldDrift(settings.drift, DRIFT_TIME) if settings.drift else None,
+            layers=None if settings.ground is None else layers_option(settings.ground),
         ),
     )
     return run_simulate(site, config, output, settings.seed)

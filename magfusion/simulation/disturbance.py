@@ -7,6 +7,7 @@ from scipy.interpolate import CubicSpline
 
 from magfusion.errors import InputError
 from magfusion.model.physics.disturbance import induced_field, sphere_polarizability
+from magfusion.simulation.layers import Layers
 from magfusion.units import AnyArray, Array, ComplexArray
 
 DAY = 86_400.0  # s
@@ -276,6 +277,7 @@ class Ambient:
     bending: Bending | None = None
     day_night: DayNight | None = None
     drift: FieldDrift | None = None
+    layers: Layers | None = None
 
     def background_world(self, time: Array, rate_hz: float, rng: np.random.Generator) -> Array:
         """Return noise and drift at the samples of an instrument.

@@ -1,6 +1,6 @@
 """The simulator's own field of a beacon: coils of their true size, not dipoles."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -8,6 +8,7 @@ from magfusion.model.physics.solenoid import solenoid_field
 from magfusion.model.site import Beacon, Coil, Site
 from magfusion.simulation.disturbance import Spheres
 from magfusion.simulation.ground import ground_effect
+from magfusion.simulation.layers import Layers, layered_effect
 from magfusion.units import AnyArray, Array, ComplexArray
 
 
@@ -66,21 +67,28 @@ def beacon_fields_world(beacon: Beacon, point_world: Array) -> AnyArray:
 
 
 def phasors_world(
-    beacon: Beacon, point_world: Array, spheres: Spheres | None = None
+    beacon: Beacon,
+    point_world: Array,
+    spheres: Spheres | None = None,
+    layers: Layers | None = None,
 ) -> ComplexArray:
     """Return the phasor of each tone without phase or drift of the drive, (n, tones, 3) (T).
 
-    With what the spheres, if any, add to it.
+    With what the spheres, if any, add to it; layers take the place of the beacon's full space.
     """
-    phasors = _primary_world(beacon, point_world)
+    phasors = _primary_world(beacon, point_world, layers)
     if spheres is not None:
-        at_spheres = _primary_world(beacon, spheres.position_world)
+        at_spheres = _primary_world(beacon, spheres.position_world, layers)
         phasors += spheres.secondary_world(at_spheres, beacon.tone_frequencies_hz, point_world)
     return phasors
 
 
-def _primary_world(beacon: Beacon, point_world: Array) -> ComplexArray:
-    fields = beacon_fields_world(beacon, point_world)
+def _primary_world(beacon: Beacon, point_world: Array, layers: Layers | None) -> ComplexArray:
+    if layers is None:
+        fields = beacon_fields_world(beacon, point_world)
+    else:
+        fields = beacon_fields_world(replace(beacon, conductivity=0.0), point_world)
+        fields = fields + layered_effect(beacon, point_world, layers)
     phasors = np.zeros((len(point_world), len(beacon.tones), 3), dtype=np.complex128)
     for j, coil in enumerate(beacon.coils):
         tone = beacon.tones.index((coil.frequency_hz or beacon.frequency_hz, coil.slot))

@@ -17,6 +17,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.disturbance import Ambient, Spheres, draw_bending, draw_spheres
 from magfusion.simulation.field import Drives, phasors_world, synchronised_drives
 from magfusion.simulation.inertial import BiasInstability, simulate_imu
+from magfusion.simulation.layers import Layers
 from magfusion.simulation.motion import (
     Motion,
     Rests,
@@ -186,6 +187,7 @@ def simulate_fields(
     drives: Drives | None = None,
     window: float = 0.4,
     spheres: Spheres | None = None,
+    layers: Layers | None = None,
 ) -> FieldSamples:
     """Return phasors with white noise directly, without a waveform and its receiver.
 
@@ -203,6 +205,8 @@ def simulate_fields(
         Length that the samples declare (s); the field is that of the instant.
     spheres : Spheres, optional
         Iron in the room.
+    layers : Layers, optional
+        Of the ground, in place of the full space that the site declares.
     """
     drives = drives or synchronised_drives(site)
     time = trajectory.time
@@ -214,7 +218,7 @@ def simulate_fields(
     drifts = np.repeat(drives.drift, [len(b.tones) for b in site.beacons])
     frequencies_hz = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
     phase = drives.phase + 2.0 * np.pi * drifts * frequencies_hz * time[:, None]
-    fields_world = [phasors_world(b, point_world, spheres) for b in site.beacons]
+    fields_world = [phasors_world(b, point_world, spheres, layers) for b in site.beacons]
     world = np.concatenate(fields_world, axis=1)
     turned = world * np.exp(1j * phase)[..., None]
     phasor = turned @ world_from_sensor @ magnetometer.matrix.T

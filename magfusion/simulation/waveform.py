@@ -125,7 +125,7 @@ def _beacons_world(
     field_world = np.zeros((len(time), 3))
     first = 0
     for i, (beacon, drift) in enumerate(zip(site.beacons, drives.drift, strict=True)):
-        phasors = phasors_world(beacon, point_world, ambient.spheres)
+        phasors = phasors_world(beacon, point_world, ambient.spheres, ambient.layers)
         if ambient.bending is not None:
             phasors = ambient.bending.bent_world(i, phasors, point_world)
         gates = slot_gates(beacon, time)
