@@ -11,12 +11,13 @@ from conftest import Refuse
 from scipy.spatial.transform import Rotation
 from test_antenna_job import make_survey, nominal
 from tracker_live import loop_field
-from tracker_site import tracker_site
+from tracker_site import body_poses, tracker_site
 
 from magfusion.files.plain_table import ANGLES, POSITION
 from magfusion.files.site import load_site, save_site
 from magfusion.files.survey import Survey, read_survey, write_survey
 from magfusion.jobs.calibrate_antenna import AntennaSettings, run_calibrate_antenna
+from magfusion.model.field import predict
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.site import Site
 from magfusion.units import DEGREE, Array
@@ -196,6 +197,23 @@ def test_the_boresight_is_found_whatever_the_site_says_of_it(bench: Path, true_s
     expected = true.matrix @ true.body_from_sensor.T
     gain = np.linalg.norm(sensed) / np.linalg.norm(expected)
     np.testing.assert_allclose(sensed, gain * expected, atol=2e-3)
+
+
+def test_poses_turned_alike_are_said_not_to_tell_of_others(bench: Path, true_site: Site) -> None:
+    rng = np.random.default_rng(6)
+    _, place = body_poses(true_site, 20, rng)
+    attitude = Rotation.from_rotvec(1e-5 * rng.standard_normal((20, 3))).as_matrix()
+    phasor = predict(true_site.beacons[0], true_site.platform.magnetometer, attitude, place)
+    sigma = np.full((20, 3), 1e-5 * float(np.max(np.abs(phasor))))
+    noise = rng.standard_normal((2, *phasor.shape))
+    phasor = phasor + sigma[..., None] * (noise[0] + 1j * noise[1])
+    survey = Survey(np.arange(20), place, attitude, true_site.channels, sigma, phasor)
+    write_survey(survey, bench / "survey.parquet")
+    exact = {"pose_rotation_deg": 0.0, "pose_position_m": 0.0}
+    _, told = calibrated(bench, survey=bench / "survey.parquet", **exact)
+    expected, after = (float(str(told[f"position_m_{n}"])) for n in ("any_attitude", "after"))
+    assert expected > 2.0 * after
+    assert "transfer" in str(told["reasons"])
 
 
 @pytest.mark.parametrize(
