@@ -146,6 +146,13 @@ def test_other_jobs_refuse_it_in_a_sentence(log: Path, tmp_path: Path, refuse: R
     assert "one axis leaves its roll open" in said
 
 
+def test_two_axes_are_refused_in_a_sentence(log: Path, tmp_path: Path, refuse: Refuse) -> None:
+    text = (log / "site.yaml").read_text()
+    (tmp_path / "site.yaml").write_text(text.replace("axes: [z]", "axes: [x, z]"))
+    said = refuse("fix", log, "--site", tmp_path / "site.yaml", "-o", tmp_path / "run")
+    assert "a receiver of two axes is not located yet" in said
+
+
 def test_what_does_not_fit_the_receiver_is_refused(
     log: Path, tmp_path: Path, refuse: Refuse
 ) -> None:

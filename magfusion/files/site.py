@@ -229,7 +229,7 @@ def _magnetometer(entry: MagnetometerEntry) -> Magnetometer:
         coil_kappa=entry.coil_kappa_m2,
         warming=None if entry.warming is None else entry.warming.warming(),
         response=response_of(entry.response),
-        axes="".join(sorted(set(entry.axes))),
+        axes="".join(sorted(set(entry.axes or Magnetometer.axes))),
     )
 
 
@@ -377,8 +377,7 @@ def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
         own["coil_kappa_m2"] = float(magnetometer.coil_kappa)
     if magnetometer.offset_walk != Magnetometer.offset_walk:
         own["offset_walk_t"] = float(magnetometer.offset_walk)
-    if magnetometer.axes != Magnetometer.axes:
-        own["axes"] = list(magnetometer.axes)
+    own |= {} if magnetometer.axes == Magnetometer.axes else {"axes": list(magnetometer.axes)}
     return (
         own
         | warming_entry(magnetometer.warming)

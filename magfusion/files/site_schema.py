@@ -61,13 +61,6 @@ def _zeros() -> Array:
     return np.zeros(3)
 
 
-_Letter = Literal["x", "y", "z"]
-
-
-def _letters() -> list[_Letter]:
-    return ["x", "y", "z"]
-
-
 _AboveZero = Annotated[float, Field(gt=0.0)]
 _FromZero = Annotated[float, Field(ge=0.0)]
 _Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -356,9 +349,7 @@ class MagnetometerEntry(StrictModel):
     offset_walk_t: Annotated[_NotNegative, tesla(LARGEST_OFFSET)] = 2e-8  # gained in an hour
     warming: SensorWarmingEntry | None = None
     response: Annotated[list[ResponseEntry], at_least_one("frequency")] | None = None
-    axes: Annotated[list[_Letter], Field(min_length=1, max_length=3)] = Field(
-        default_factory=_letters
-    )
+    axes: Annotated[list[Literal["x", "y", "z"]], Field(min_length=1, max_length=3)] | None = None
     sigma: MagnetometerSigmaEntry = Field(default_factory=MagnetometerSigmaEntry)
 
 
