@@ -92,6 +92,7 @@ def find_coil(
     report("done", 3, 3)
     fixes = poses_of(found, kept.time, site, signed=kept.signed)
     judged = judged_poses(fixes, found, int(np.sum(~enough)), signed=kept.signed)
+    fixes = judged.fixes
     first = (fixes.world_from_body, fixes.position_world, fixes.pose_cov)
     trust = judged.trust | Trust(of_place(site, fixes.time, *(part[:, 0] for part in first)))
     streams = replace(log, fields=None)  # the other axes are no silence

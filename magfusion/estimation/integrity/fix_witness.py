@@ -47,7 +47,7 @@ def judged_fixes(
     )
     factor = np.maximum(np.where(odd, excess, 1.0), whole.excess)
     cov = fixes.pose_cov.copy()
-    cov[:, 0] = factor[:, None, None] * cov[:, 0] + _spread(fixes, rival)
+    cov[:, 0] = factor[:, None, None] * cov[:, 0] + rival_spread(fixes, rival)
     doubtful = rival | open_pose | odd | bool(whole.findings)
     verdicts = tuple(
         worst((verdict, Verdict.DOUBTFUL)) if doubt else verdict
@@ -73,7 +73,7 @@ def _chi_square(fixes: Fixes, heard: IntArray) -> tuple[Array, Array]:
     return fixes.cost[:, 0], np.maximum(6.0 * heard + known - UNKNOWNS - found, 0.0)
 
 
-def _spread(fixes: Fixes, rival: BoolArray) -> Array:
+def rival_spread(fixes: Fixes, rival: BoolArray) -> Array:
     """Return what the rivals add to the covariance of the best pose, shape (n, 6, 6)."""
     weight = np.where(rival[:, None], fixes.probability, 0.0)[:, 1:]
     best = np.swapaxes(fixes.world_from_body[:, :1], 2, 3)

@@ -35,7 +35,7 @@ SOFT_EDGE = 0.02  # of the distance; nobody declares a plane more sharply
 LEAST_GAIN_SIGMA = 1e-4  # nobody knows it better
 UNKNOWNS = 6  # of place, direction and gain
 CHUNK = 200  # epochs refined at once
-REFINED, MIRRORED = 12, 4  # starts that go on of the rough ones, and of which the mirrors do
+REFINED, MIRRORED = 12, 3  # rough starts that go on, and ends whose mirrors are asked
 ROUGH_PASSES = 20
 ROUGH = 1e-4  # relative fall of the cost below which a start is good enough
 
@@ -127,6 +127,17 @@ class _Refined(NamedTuple):
     determined: BoolArray  # (n, starts)
     freedom: Array  # (n,)
 
+    def beside(self, other: "_Refined") -> "_Refined":
+        """Return these ends and others of the same epochs."""
+        return _Refined(
+            np.concatenate([self.state, other.state], axis=1),
+            np.concatenate([self.cov, other.cov], axis=1),
+            np.concatenate([self.cost, other.cost], axis=1),
+            np.concatenate([self.chi_square, other.chi_square], axis=1),
+            np.concatenate([self.determined, other.determined], axis=1),
+            self.freedom,
+        )
+
 
 def _refined(epochs: CoilEpochs, known: Calibration, gain: Gain, grid: Grid) -> _Refined:
     place, axis = grid.starts(epochs)
@@ -142,8 +153,21 @@ def _refined(epochs: CoilEpochs, known: Calibration, gain: Gain, grid: Grid) -> 
     rough = minimise(soft, start, relative=ROUGH, passes=ROUGH_PASSES)
     order = np.argsort(rough.cost.reshape(-1, count), axis=1, kind="stable")[:, :REFINED]
     best = np.take_along_axis(rough.state.reshape(-1, count, 6), order[..., None], axis=1)
-    start = np.concatenate([best, _mirrored(best[:, :MIRRORED], known.site)], axis=1)
-    count = start.shape[1]
+    found = _solved(problem, best)
+    order = np.argsort(found.cost, axis=1, kind="stable")[:, :MIRRORED]
+    best = np.take_along_axis(found.state, order[..., None], axis=1)
+    # An amplitude whose sign was taken wrongly holds it in a false minimum, which is shallow.
+    owner = np.repeat(np.arange(len(epochs)), best.shape[1])
+    soft = problem.of(owner, softened(epochs)[owner])
+    eased = minimise(soft, best.reshape(-1, 6), relative=ROUGH, passes=ROUGH_PASSES)
+    best = eased.state.reshape(best.shape)
+    other = _solved(problem, np.concatenate([best, _mirrored(best, known.site)], axis=1))
+    return found.beside(other)
+
+
+def _solved(problem: "_Problem", start: Array) -> _Refined:
+    """Return where starts end, shape (n, starts, 6), at the weights of these."""
+    epochs, site, count = problem.epochs, problem.calibration.site, start.shape[1]
     start = start.reshape(-1, 6)
     owner = np.repeat(np.arange(len(epochs)), count)
     sigma = problem.sigma(owner, start)
@@ -158,13 +182,13 @@ def _refined(epochs: CoilEpochs, known: Calibration, gain: Gain, grid: Grid) -> 
     square = unit[:, :, None] * unit[:, None, :]
     inverse, determined = open_inverse(solved.information * square)
     cov = (inverse * square).reshape(-1, count, 6, 6)
-    cost = cost + _outside(known.site, state[..., :3], cov[..., :3, :3])
+    cost = cost + _outside(site, state[..., :3], cov[..., :3, :3])
     if not epochs.signed:  # of both signs the one that points up
         sign = np.ones_like(state)
         sign[..., 3:] = np.where(state[..., 5:] < 0.0, -1.0, 1.0)
         state, cov = sign * state, sign[..., :, None] * cov * sign[..., None, :]
     there = epochs.heard * (2.0 if epochs.signed else 1.0)
-    freedom = np.asarray(there - UNKNOWNS + float(np.isfinite(gain.sigma)))
+    freedom = np.asarray(there - UNKNOWNS + float(np.isfinite(problem.gain.sigma)))
     return _Refined(state, cov, cost, chi_square, determined.reshape(-1, count), freedom)
 
 

@@ -1,10 +1,12 @@
 """The poses of a platform whose receiver has one axis, and what is to be said of them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.integrity.fix_witness import rival_spread
+from magfusion.estimation.integrity.priors import unexplained
 from magfusion.estimation.integrity.statistics import FALSE_ALARMS, log_p_chi_square
 from magfusion.estimation.snapshot.coil_fix import CoilFixes
 from magfusion.estimation.snapshot.fix import Fixes
@@ -134,8 +136,9 @@ def nearest_truth(truth: Trajectory, poses: Trajectory, site: Site, *, signed: b
 
 @dataclass(frozen=True, eq=False)
 class JudgedPoses:
-    """What is to be said of poses."""
+    """Poses whose covariances cover rivals and residuals, and what is to be said of them."""
 
+    fixes: Fixes
     states: StateTrust
     trust: Trust
 
@@ -158,7 +161,15 @@ def judged_poses(fixes: Fixes, found: CoilFixes, left_out: int, *, signed: bool)
         " any. Place and direction are told; of errors against a truth, these alone."
     )
     turned = "" if signed else " Amplitudes have no sign: the axis may point the other way."
-    findings = [Finding("roll_open", roll + turned, Verdict.TRUSTWORTHY)]
+    median = float(np.median(found.cost[:, 0])), float(np.median(found.freedom))
+    remedy = "Check the beacons; where the common gain is not as declared, --free gain."
+    whole = unexplained("the median epoch", *median, remedy)
+    excess = np.where(odd, found.cost[:, 0] / np.maximum(found.freedom, 1.0), 1.0)
+    cov = fixes.pose_cov.copy()
+    cov[:, 0] *= np.maximum(excess, whole.excess)[:, None, None]
+    cov[:, 0] += rival_spread(fixes, rival)
+    fixes = replace(fixes, pose_cov=cov)
+    findings = [Finding("roll_open", roll + turned, Verdict.TRUSTWORTHY), *whole.findings]
     for code, rows, what in (
         (
             "ambiguous",
@@ -173,19 +184,19 @@ def judged_poses(fixes: Fixes, found: CoilFixes, left_out: int, *, signed: bool)
         ),
         (
             "field_residuals",
-            odd,
-            "have residuals that noise and model error do not explain; look for iron, and for a"
-            " beacon that is not as declared.",
+            odd & ~bool(whole.findings),
+            "have residuals that noise and model error do not explain; their covariance has been"
+            " enlarged. Look for iron, and for a beacon that is not as declared.",
         ),
     ):
         findings += _share(code, rows, what)
     if left_out:
         text = f"{left_out} epochs hold too few beacons for place, direction and gain; left out."
         findings.append(Finding("few_data", text, Verdict.TRUSTWORTHY))
-    none, doubt = np.full(count, np.nan), rival | odd | open_
+    none, doubt = np.full(count, np.nan), rival | odd | open_ | bool(whole.findings)
     verdicts = tuple(Verdict.DOUBTFUL if d else Verdict.TRUSTWORTHY for d in doubt.tolist())
     states = StateTrust(verdicts, none, none.copy(), ((),) * count)
-    return JudgedPoses(states, Trust(tuple(findings)))
+    return JudgedPoses(fixes, states, Trust(tuple(findings)))
 
 
 def _share(code: str, rows: BoolArray, what: str) -> list[Finding]:
