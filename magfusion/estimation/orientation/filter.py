@@ -35,12 +35,12 @@ from magfusion.model.strapdown import triad
 from magfusion.units import Array
 
 GYRO_SCALE = 0.003  # usual error of a gyroscope's scale and axes
-AMBIENT = 0.02  # of the field's size: usual disturbance of each component, indoors
+AMBIENT = 0.05  # of the field's size: usual disturbance of each component, indoors
 SETTLED, MOVED = 10.0, 2.0  # s; over which it changes, at rest and in motion
 MEMORY = 5.0  # s; over which its size is learnt, and that of the speed
 NOISE_MEMORY, NOISE_FACTOR = 10.0, 20.0  # s; samples of the field are not independent
 SYNCHRONY = 0.003  # s; to which samples of field and rate belong together
-SPEED_TIME = 0.5  # s; so long a speed counts once
+SPEED_TIME = 1.0  # s; so long a speed counts once
 LEAKAGE = 1.0  # s; over which a speed is thought to vanish, to learn its size
 LEAST_SPEED = 0.3  # m/s
 REST_RATE = np.deg2rad(0.03)  # rad/s, of one second
@@ -49,6 +49,10 @@ LEAST_CHANGE, FREED = 3.0, 4.0  # uT; factor of the variance of what has changed
 TILT, HEADING = 0.05, 0.3  # rad; of the first attitude
 FAR_STRENGTH = 0.04  # of the field's size: what the declared one may be off by anywhere
 OFFSET_WALK = 0.01  # uT per square root of second
+# What is carried turns with the arm that carries it: its speed, and the field where it is, go with
+# its attitude, over and over, as false biases would.  In motion these take so much of them.
+SWUNG = 0.05  # of the speed: the accelerometer's bias
+SWEPT = 0.2  # of the field: what the field alone tells
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +79,19 @@ class Update:
     attitude: Array
     disturbance: float
     changed: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """Measured minus predicted (3,), its derivative (3, 40), and its variance (3,).
+
+    ``share`` (40,) is what each parameter takes of it, one unless it is correlated with the motion.
+    """
+
+    by_state: Array
+    error: Array
+    variance: Array
+    share: Array
 
 
 class OrientationFilter:
@@ -135,7 +152,7 @@ class OrientationFilter:
         if len(stretch.field_time):
             row, changed, predicted = self._of_field(predicted, stretch, turn)
             rows.append(row)
-        self.state = _updated(predicted, rows, self.measured_from_body)
+        self.state = updated(predicted, rows, self.measured_from_body)
         return Update(
             stretch, predicted, self.state, transition, turn.attitude, self.disturbance, changed
         )
@@ -230,7 +247,7 @@ class OrientationFilter:
         )
         return predicted, transition
 
-    def _of_speed(self, state: Orientation, stretch: Stretch) -> tuple[Array, Array, Array]:
+    def _of_speed(self, state: Orientation, stretch: Stretch) -> Row:
         by_state = np.zeros((3, SIZE))
         by_state[:, SPEED] = np.eye(3)
         if stretch.rests:
@@ -238,25 +255,28 @@ class OrientationFilter:
         else:
             length = max(float(np.sum(stretch.steps)), 1e-3)
             variance = max(self._speed, LEAST_SPEED**2) * max(1.0, SPEED_TIME / length)
-        return by_state, -state.velocity_world, np.full(3, variance)
+        share = np.ones(SIZE)
+        if not stretch.rests:
+            share[ACCEL_BIAS] = SWUNG
+        return Row(by_state, -state.velocity_world, np.full(3, variance), share)
 
     def _may_rest(self, state: Orientation, turn: Turned) -> bool:
         """Tell a bias from a slow and even turn: no larger one is likely."""
         sigma = np.sqrt(np.diag(state.cov)[GYRO_BIAS]) + self.site.platform.imu.gyro_bias_walk
         return bool(np.all(np.abs(np.mean(turn.rate, axis=0)) < 4.0 * sigma + 3.0 * REST_RATE))
 
-    def _of_rest(self, state: Orientation, stretch: Stretch) -> tuple[Array, Array, Array]:
+    def _of_rest(self, state: Orientation, stretch: Stretch) -> Row:
         rate = np.mean(stretch.gyro_body, axis=0)
         by_state = np.zeros((3, SIZE))
         by_state[:, GYRO_BIAS] = -np.eye(3)
         by_state[:, GYRO_MATRIX] = np.kron(np.eye(3), rate)
         still = rate @ (np.eye(3) + state.gyro_matrix).T - state.gyro_bias
         length = max(float(np.sum(stretch.steps)), 1e-3)
-        return by_state, -still, np.full(3, REST_RATE**2 / length)
+        return Row(by_state, -still, np.full(3, REST_RATE**2 / length), np.ones(SIZE))
 
     def _of_field(
         self, state: Orientation, stretch: Stretch, turn: Turned
-    ) -> tuple[tuple[Array, Array, Array], bool, Orientation]:
+    ) -> tuple[Row, bool, Orientation]:
         mean, by_lag = body_from_end(stretch, turn, state.lag)
         world_from_seen = state.world_from_body @ mean.T
         declared = self.earth + state.far
@@ -279,14 +299,19 @@ class OrientationFilter:
             measured_from_seen, error + seen.earth_world @ state.near
         )
         self._learn_deviation(off_world, variance, stretch)
+        share = np.ones(SIZE)
+        if not stretch.rests:
+            for part in (OFFSET, MATRIX, LAG, FAR):
+                share[part] = SWEPT
+        row = Row(by_state, error, np.full(3, variance), share)
         if apart <= GATE:
-            return (by_state, error, np.full(3, variance)), False, state
+            return row, False, state
         change = max(float(error @ error), LEAST_CHANGE**2)
         self._deviation = max(self._deviation, change)
         cov = state.cov.copy()
         cov[OFFSET, OFFSET] += FREED * change * np.eye(3)
         cov[NEAR, NEAR] += FREED * change * np.eye(3)
-        return (by_state, error, np.full(3, variance)), True, replace(state, cov=cov)
+        return row, True, replace(state, cov=cov)
 
     def _field_variance(self, stretch: Stretch, turn: Turned) -> float:
         """Return the variance of a component of the mean field, as it scatters (uT^2)."""
@@ -319,12 +344,19 @@ class OrientationFilter:
         self._deviation += share * (found - self._deviation)
 
 
-def _updated(
-    state: Orientation, rows: list[tuple[Array, Array, Array]], measured_from_body: Array
-) -> Orientation:
-    by_state, error, variance = (np.concatenate(part) for part in zip(*rows, strict=True))
-    cross = by_state @ state.cov
-    gain = np.linalg.solve(cross @ by_state.T + np.diag(variance), cross).T
-    kept = np.eye(SIZE) - gain @ by_state
-    cov = kept @ state.cov @ kept.T + (gain * variance) @ gain.T
-    return replace(state.moved(gain @ error, measured_from_body), cov=0.5 * (cov + cov.T))
+def updated(state: Orientation, rows: list[Row], measured_from_body: Array) -> Orientation:
+    """Return the state with what was measured; each parameter takes its share of it.
+
+    A share below one is a partial update (Brink, "Partial-update Schmidt-Kalman filter", J. Guid.
+    Control Dyn. 40(9), 2017).
+    """
+    step, cov = np.zeros(SIZE), state.cov
+    for row in rows:
+        cross = row.by_state @ cov
+        gain = np.linalg.solve(cross @ row.by_state.T + np.diag(row.variance), cross).T
+        step = step + row.share * (gain @ (row.error - row.by_state @ step))
+        kept = np.eye(SIZE) - gain @ row.by_state
+        all_of_it = kept @ cov @ kept.T + (gain * row.variance) @ gain.T
+        left = np.outer(1.0 - row.share, 1.0 - row.share)
+        cov = left * cov + (1.0 - left) * all_of_it
+    return replace(state.moved(step, measured_from_body), cov=0.5 * (cov + cov.T))

@@ -12,7 +12,7 @@ from magfusion.units import DEGREE, Array, BoolArray
 OPEN = 20.0 * DEGREE  # rad; sigma of a heading that is none
 DISTURBED = 0.05  # of the field's size
 TOLD = 2.0  # s; so long a change is told online
-MOVED = 6.0  # sigma of an offset that has changed
+MOVED = 3.0  # sigma of an offset that has changed, all components: one in a hundred thousand
 LATE = 4.0  # sigma of a lag that is said
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -45,7 +46,7 @@ class Stretch:
     field: Array
     rests: bool
 
-    @property
+    @cached_property
     def steps(self) -> Array:
         """Duration of each step (s), shape (n,)."""
         first = 0.0 if np.isnan(self.begin) else self.time[0] - self.begin

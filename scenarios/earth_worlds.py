@@ -1,0 +1,238 @@
+"""Simulated logs of a hand-held sensor in the Earth's field alone, and what disturbs it indoors.
+
+Motions are turning, shaking to and fro (a hand that carries, with little turning), and both; slow
+and fast; at a stretch or with pauses.  The building's iron is dipoles far off, a magnet beside the
+path is one near, and one on the sensor is a constant of its axes, from the beginning or from some
+time on.  The sensors err by what their site declares, or by a share of it, as those do whose maker
+is careful: rates are means over the step that ends at a stamp, the magnetometer lags, its samples
+repeat.  Nothing here knows the estimator.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.model.samples import ImuSamples, Log, Waveform
+from magfusion.model.site import (
+    EarthModel,
+    ImuModel,
+    Magnetometer,
+    MagnetometerSigma,
+    Platform,
+    Site,
+)
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import DEGREE, Array
+
+EARTH_WORLD = np.array([0.0, 1.64e-5, -4.14e-5])  # T
+GRAVITY = 9.8  # m/s^2
+RATE = 100.0  # Hz
+REST = 6.0  # s; before it moves
+REPEATED = 0.3  # of the magnetometer's samples
+IMU = ImuModel(2e-3, 2e-2, 1e-5, 1e-3, 1e-2, 0.1)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """How a sensor is moved, and what is near.
+
+    Parameters
+    ----------
+    turning : float
+        Usual rate of turning about any axis, all round (rad/s, each component).
+    wobble : float
+        Usual angle of turning to and fro (rad, each component).
+    shaking : float
+        Usual acceleration by carrying (m/s^2, each component).
+    hertz : float
+        Of turning and carrying, about.
+    pauses : bool
+        Whether it rests now and then.
+    magnet : {'none', 'near', 'attached', 'from the start'}
+    """
+
+    turning: float = 0.0
+    wobble: float = 0.0
+    shaking: float = 0.0
+    hertz: float = 0.5
+    pauses: bool = False
+    magnet: str = "none"
+
+
+KINDS = {
+    "slow turning": Kind(turning=0.7, shaking=0.3, hertz=0.4),
+    "fast turning": Kind(turning=4.0, shaking=2.0, hertz=1.2),
+    "slow carrying": Kind(wobble=0.06, shaking=1.0, hertz=0.35),
+    "fast carrying": Kind(wobble=0.08, shaking=8.0, hertz=0.9),
+    "fast carrying, pauses": Kind(wobble=0.08, shaking=8.0, hertz=0.9, pauses=True),
+    "both, pauses": Kind(turning=2.0, shaking=3.0, hertz=0.8, pauses=True),
+    "magnet beside": Kind(turning=0.8, shaking=1.0, hertz=0.3, magnet="near"),
+    "magnet attached": Kind(turning=1.5, shaking=1.5, hertz=0.6, magnet="attached"),
+    "magnet from the start": Kind(turning=1.5, shaking=1.5, hertz=0.6, magnet="from the start"),
+}
+
+
+def site_as_declared(offset_sigma: float = 2e-6, matrix_sigma: float = 0.02) -> Site:
+    """Return a site as a careful user would write it (offset in T)."""
+    sigma = MagnetometerSigma(
+        np.full((3, 3), matrix_sigma), np.full(3, offset_sigma), np.zeros(3), np.zeros(3)
+    )
+    sensor = Magnetometer(
+        position_body=np.zeros(3),
+        body_from_sensor=np.eye(3),
+        noise_density=5e-8,
+        matrix=np.eye(3),
+        offset=np.zeros(3),
+        sigma=sigma,
+    )
+    return Site(
+        gravity=GRAVITY,
+        model_error=0.005,
+        beacons=(),
+        platform=Platform(IMU, sensor),
+        earth_field_world=EARTH_WORLD,
+        earth=EarthModel(),
+    )
+
+
+def simulated(
+    name: str, seed: int, duration: float = 45.0, rate: float = RATE, share: float = 0.3
+) -> tuple[Log, Site]:
+    """Return a log and its site.
+
+    Parameters
+    ----------
+    name : str
+        One of `KINDS`.
+    share : float
+        Of what the site declares: usual errors of the instruments.
+    """
+    kind, rng = KINDS[name], np.random.default_rng([seed, *name.encode()])
+    time = np.arange(0.0, duration, 1.0 / rate)
+    truth, place = _motion(kind, rng, time)
+    world = EARTH_WORLD + _building(rng, place, share)
+    body = np.tile(2e-6 * share * rng.normal(size=3), (len(time), 1))
+    if kind.magnet == "near":
+        world += _magnet_near(rng, place)
+    elif kind.magnet != "none":
+        begun = 0.0 if kind.magnet == "from the start" else 0.4 * duration
+        body[time >= begun] += _some_way(rng) * rng.uniform(5e-6, 30e-6)
+    site = site_as_declared()
+    imu = _inertial(rng, time, truth, place, share)
+    wave = _field(rng, time, truth, world, body, share)
+    poses = Trajectory(time, truth.as_matrix(), place)
+    return Log(f"{name} x{share:g} {seed}", 0, "simulated", imu, wave, truth=poses), site
+
+
+def _some_way(rng: np.random.Generator) -> Array:
+    way = rng.normal(size=3)
+    return np.asarray(way / np.linalg.norm(way))
+
+
+def _wave(rng: np.random.Generator, time: Array, hertz: float) -> Array:
+    """Return a band-limited motion of unit variance, shape (n, 3)."""
+    out = np.zeros((len(time), 3))
+    for frequency in hertz * rng.uniform(0.4, 1.4, size=16):
+        phase = rng.uniform(0.0, 2.0 * np.pi, size=3)
+        out += rng.normal(size=3) * np.sin(2.0 * np.pi * frequency * time[:, None] + phase)
+    return out / np.sqrt(8.0)
+
+
+def _activity(kind: Kind, rng: np.random.Generator, time: Array) -> Array:
+    """Return how much of the motion takes place: 0 at rest, 1 in motion, shape (n, 1)."""
+    edges, now = [REST], REST
+    while kind.pauses and now < time[-1]:
+        moves, rests = rng.uniform(6.0, 12.0), rng.uniform(3.0, 6.0)
+        edges += [now + moves, now + moves + rests]
+        now += moves + rests
+    active = np.zeros(len(time))
+    for k, edge in enumerate(edges):
+        ramp = np.clip((time - edge) / 1.5, 0.0, 1.0)
+        active += (-1.0) ** k * ramp**2 * (3.0 - 2.0 * ramp)
+    return active[:, None]
+
+
+def _motion(kind: Kind, rng: np.random.Generator, time: Array) -> tuple[Rotation, Array]:
+    active = _activity(kind, rng, time)
+    step = time[1] - time[0]
+    spin = kind.turning * _wave(rng, time, kind.hertz) * active
+    turns = [Rotation.from_rotvec([*rng.uniform(-0.5, 0.5, size=2), rng.uniform(-3.0, 3.0)])]
+    if kind.turning > 0.0:
+        for turn in Rotation.from_rotvec(spin[1:] * step):
+            turns.append(turns[-1] * turn)
+        truth = Rotation.concatenate(turns)
+    else:
+        angle = np.cumsum(_wave(rng, time, kind.hertz) * active, axis=0) * step
+        truth = turns[0] * Rotation.from_rotvec(kind.wobble * angle * 2.0 * np.pi * kind.hertz)
+    push = _wave(rng, time, kind.hertz) / (2.0 * np.pi * kind.hertz) ** 2
+    lever = 0.1 * rng.normal(size=3)
+    carried = kind.shaking * push * active
+    # A hand swings about an elbow or a shoulder: what is carried to a side turns with it.
+    arm = rng.uniform(0.4, 0.8) * _some_way(rng)
+    truth = Rotation.from_rotvec(np.cross(arm, carried) / (arm @ arm)) * truth
+    place = carried + truth.apply(lever)
+    return truth, np.asarray(place - place[0])
+
+
+def _dipole(offset: Array, moment: Array) -> Array:
+    """Return the field (T) of a dipole (A m^2) at places so far from it, shape (n, 3)."""
+    far = np.linalg.norm(offset, axis=1)[:, None]
+    along = offset @ moment
+    return np.asarray(1e-7 * (3.0 * along[:, None] * offset / far**5 - moment / far**3))
+
+
+def _building(rng: np.random.Generator, place: Array, share: float) -> Array:
+    """Return what iron far off adds: much the same everywhere, a little more here than there."""
+    added, strength = np.zeros_like(place), np.exp(rng.uniform(np.log(1.5e-7), np.log(8e-7)))
+    for far in rng.uniform(1.2, 3.0, size=4):
+        moment = _some_way(rng) * strength * far**3 / 1e-7
+        added += _dipole(place - far * _some_way(rng), moment)
+    usual = np.mean(added, axis=0)
+    # The user turned the world's axes to the field of the room, within the declination.
+    east = 0.5 * DEGREE * EARTH_WORLD[1] * rng.normal() * max(share, 0.5)
+    return np.asarray(added - np.array([usual[0] - east, 0.0, 0.0]))
+
+
+def _magnet_near(rng: np.random.Generator, place: Array) -> Array:
+    """Return the field of a magnet beside the path: tens of microteslas where it is closest."""
+    away = place[int(np.argmax(np.linalg.norm(place, axis=1)))]
+    centre = away + rng.uniform(0.1, 0.2) * _some_way(rng)
+    if np.linalg.norm(centre) < np.linalg.norm(away):  # it begins far from it
+        centre = 2.0 * away - centre
+    found = _dipole(place - centre, _some_way(rng))
+    return np.asarray(found * rng.uniform(1e-5, 4e-5) / np.max(np.linalg.norm(found, axis=1)))
+
+
+def _inertial(
+    rng: np.random.Generator, time: Array, truth: Rotation, place: Array, share: float
+) -> ImuSamples:
+    rate = 1.0 / (time[1] - time[0])
+    spin = (truth[:-1].inv() * truth[1:]).as_rotvec() * rate
+    gyro = np.concatenate([spin[:1], spin])
+    push = np.gradient(np.gradient(place, time, axis=0), time, axis=0)
+    force = truth.inv().apply(push + np.array([0.0, 0.0, GRAVITY]))
+    gyro = gyro @ (np.eye(3) + 3e-3 * rng.normal(size=(3, 3))).T
+    gyro += 2e-4 * share * force @ rng.normal(size=(3, 3))  # by the force
+    gyro += IMU.gyro_bias_sigma * share * rng.normal(size=3)
+    walk = IMU.gyro_bias_walk / np.sqrt(rate) * rng.normal(size=gyro.shape)
+    gyro += np.cumsum(walk, axis=0)
+    gyro += share * IMU.gyro_noise * np.sqrt(rate / 2.0) * rng.normal(size=gyro.shape)
+    force = force @ (np.eye(3) + 3e-3 * share * rng.normal(size=(3, 3))).T
+    force += IMU.accel_bias_sigma * share * rng.normal(size=3)
+    force += share * IMU.accel_noise * np.sqrt(rate / 2.0) * rng.normal(size=force.shape)
+    return ImuSamples(time, gyro, force)
+
+
+def _field(
+    rng: np.random.Generator, time: Array, truth: Rotation, world: Array, body: Array, share: float
+) -> Waveform:
+    matrix = np.eye(3) + 0.02 * share * rng.normal(size=(3, 3))
+    field = truth.inv().apply(world) @ matrix.T + body
+    late = rng.uniform(0.0, 0.005)  # s
+    field = np.stack([np.interp(time - late, time, c) for c in field.T], axis=1)
+    field += 4e-7 * rng.normal(size=field.shape)
+    shown = np.arange(len(time))
+    again = np.flatnonzero(rng.random(len(time) - 1) < REPEATED) + 1
+    shown[again] = again - 1
+    return Waveform(time, field[shown])
