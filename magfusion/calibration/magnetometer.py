@@ -19,7 +19,7 @@ from magfusion.units import DEGREE, Array
 
 POINTED = 45.0 * DEGREE  # an axis nearer to the vertical than this pointed up, or down
 WIDE_MATRIX = 0.1  # prior sigma where the site declares none: an instrument nobody calibrated
-WIDE_OFFSET = 1e-5  # T; a fifth of the Earth's field
+WIDE_OFFSET = 1e-4  # T; the iron of a robot, twice the Earth's field
 
 _AXES = ("x", "y", "z")
 

@@ -1,5 +1,6 @@
 """A magnetometer calibrated from the log of slow turning by hand, or of stops all round."""
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -17,6 +18,7 @@ from magfusion.calibration.magnetometer import (
     spread,
 )
 from magfusion.calibration.magnetometer_graph import Epochs, GraphFit, Prior, fit_graph
+from magfusion.calibration.magnetometer_start import likeliest, rival_offset, saying, starts
 from magfusion.calibration.steady_field import LONGEST, SteadyField, average, steady_field
 from magfusion.calibration.stops import distinct, find_stops
 from magfusion.errors import EstimationError, InputError
@@ -63,6 +65,8 @@ class LogCalibration:
         on the other half; None where a half is not enough.
     shape_kept : bool
         Whether the declared shape and offset did as well on the unseen half, and were kept.
+    rival : ndarray, shape (3,), optional
+        Another offset (T), far from the one found, that explains the readings nearly as well.
     """
 
     magnetometer: Magnetometer
@@ -74,6 +78,7 @@ class LogCalibration:
     scale_known: bool
     spread_unseen: float | None
     shape_kept: bool
+    rival: Array | None = None
 
 
 def calibrate_log(
@@ -104,7 +109,7 @@ def calibrate_log(
     _refuse_one_axis(readings, known, site.earth_field_world, missing)
     prior = _prior(site, readings)
     turns = _turns(imu, site, readings.time)
-    start = _start(readings, up_sensor, prior, missing)
+    begun = _starts(readings, imu, site, up_sensor, prior, missing)
     sigma = FIRST_SIGMA * float(np.linalg.norm(prior.field_world))
     for _ in range(PASSES):
         epochs = Epochs(
@@ -114,13 +119,17 @@ def calibrate_log(
             accel_sigma=_accel_sigma(readings, site, at_stops),
             turns=turns,
         )
-        graph = fit_graph(epochs, prior, start)
+        with saying(missing):
+            graph = likeliest(epochs, prior, begun)
         start = graph.fit
         if site.earth_field_world is None:
-            prior, start = _scaled_as_declared(prior, start)
+            with saying(missing):
+                prior, start = _scaled_as_declared(prior, start)
         found = replace(known, matrix=start.matrix, offset=start.offset)
         readings = _readings(waveform, imu, site, found, at_stops)
         sigma = _field_sigma(readings, found, prior)
+        begun = (start,)
+    rival = rival_offset(epochs, prior, graph)
     if at_stops:
         _refuse_few_stops(distinct(graph.world_from_body), missing)
     if site.earth_field_world is None:
@@ -139,6 +148,7 @@ def calibrate_log(
         scale_known=site.earth_field_world is not None,
         spread_unseen=unseen,
         shape_kept=kept,
+        rival=rival,
     )
 
 
@@ -217,17 +227,21 @@ def _prior(site: Site, readings: SteadyField) -> Prior:
     )
 
 
-def _start(
-    readings: SteadyField, up_sensor: Array, prior: Prior, missing: list[str]
-) -> MagnetometerFit | None:
-    """Return where to begin: by the ellipsoid where the readings go all round."""
-    if missing:
-        return None
-    size = float(np.linalg.norm(prior.field_world))
-    try:
-        return fit_ellipsoid_gravity(readings.measured_sensor, up_sensor, size)
-    except EstimationError:
-        return None
+def _starts(
+    readings: SteadyField,
+    imu: ImuSamples,
+    site: Site,
+    up_sensor: Array,
+    prior: Prior,
+    missing: list[str],
+) -> tuple[MagnetometerFit, ...]:
+    """Return where to begin: by the ellipsoid where the readings go all round, else by the gyro."""
+    known, size = site.platform.magnetometer, float(np.linalg.norm(prior.field_world))
+    if not missing:
+        with suppress(EstimationError):
+            return (fit_ellipsoid_gravity(readings.measured_sensor, up_sensor, size),)
+    lag = site.platform.imu.time_offset
+    return starts(readings, imu, lag, known, prior.cov[9:, 9:], size)
 
 
 def _accel_sigma(readings: SteadyField, site: Site, at_rest: bool) -> Array:
@@ -289,7 +303,7 @@ def _scaled_as_declared(prior: Prior, fit: MagnetometerFit) -> tuple[Prior, Magn
     if not FIELD_SCALES[0] < scale < FIELD_SCALES[1]:
         raise EstimationError(
             f"the scale of the magnetometer comes out {scale:.3g} times the declared one; declare"
-            " its offset, or the Earth field (earth_field_t), or turn it about all its axes"
+            " its offset, or the Earth field (earth_field_t)"
         )
     prior = replace(prior, field_world=scale * prior.field_world)
     return prior, replace(fit, matrix=fit.matrix / scale)

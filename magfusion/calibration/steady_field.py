@@ -19,7 +19,11 @@ from magfusion.units import Array, BoolArray
 PERIODS = 8.0  # of the lowest tone in a window; its taper leaves 6e-4 of it, less of the others
 SHORTEST = 0.2  # s; ten periods of the mains
 LONGEST = 2.0  # s; over which a gyro's bias turns less than it matters
-GAP = 1.5  # a gap is this many times the usual sampling interval
+GAP = 2.5  # a gap is this many times what intervals are up to; one lost sample is none
+UP_TO = 95.0  # percent of the intervals, so that stamps of a host make no gaps
+SHORTEST_ALONE, FEWEST_ALONE = 0.05, 5.0  # s, samples; of a window without a gyro
+TURNED = 0.05  # of all that the field changes by
+MOST_OF_WINDOW = 0.5  # that may pass without a sample, however long intervals are
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +94,36 @@ def steady_field(
     return average(waveform, imu, offset, known, centre, window)
 
 
+def steady_alone(waveform: Waveform, site: Site) -> SteadyField:
+    """Average a waveform that no gyro tells the turning of, over windows as short as may be.
+
+    Windows in which the field turns by more than `TURNED` are left out: its mean is too small.
+
+    Raises
+    ------
+    InputError
+        Where no window is left.
+    """
+    time = waveform.time
+    usual = float(np.median(np.diff(time)))
+    length = window_length(site) if site.beacons else max(SHORTEST_ALONE, FEWEST_ALONE * usual)
+    centre = np.arange(time[0] + 0.5 * length, time[-1] - 0.5 * length, length)
+    window = np.full(len(centre), length)
+    whole = _whole(time, centre, window)
+    if np.sum(whole) < 2:
+        raise InputError(
+            "magnetometer: no stretch is long enough without a gap; record at least a minute of"
+            " slow turning"
+        )
+    centre, window = centre[whole], window[whole]
+    mean = _tapered_means(time, waveform.measured_sensor, centre, window)
+    rate = np.linalg.norm(np.gradient(mean, centre, axis=0), axis=1)
+    far = float(np.linalg.norm(np.ptp(mean, axis=0)))
+    slow = rate * length < TURNED * far
+    centre, window, mean = centre[slow], window[slow], mean[slow]
+    return SteadyField(centre, window, mean, np.zeros_like(mean))
+
+
 def average(
     waveform: Waveform,
     imu: ImuSamples,
@@ -142,8 +176,10 @@ def _turned_means(
 
 def _whole(time: Array, centre: Array, window: Array) -> BoolArray:
     """Tell which windows lie in a stream without a gap."""
-    usual = float(np.median(np.diff(time)))
-    gaps = np.flatnonzero(np.diff(time) > GAP * usual)
+    step = np.diff(time)
+    usual = max(float(np.median(step)), float(np.percentile(step, UP_TO)))
+    longest = min(GAP * usual, MOST_OF_WINDOW * float(np.min(window)))
+    gaps = np.flatnonzero(step > longest)
     first, last = centre - 0.5 * window, centre + 0.5 * window
     inside = (first > time[0] - usual) & (last < time[-1] + usual)
     met = np.searchsorted(time[gaps], last) > np.searchsorted(time[gaps + 1], first)

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 
 JOB = "calibrate magnetometer"
 SCALE = 0.3  # of the matrix, by which it contradicts the site, however wide its sigmas
+SCALE_SIGMAS, LEAST_SCALE = 5.0, 0.01  # of the declared sigma; and what is never an error
+FIRST = 1e3  # weight of what is the cause of other findings
+LOOSE = 0.02  # of the field; an offset that is no more certain than that is not determined
+USELESS = 0.06  # and here nothing is gained by it: three degrees of heading
 SMALLEST, LARGEST = 1.5e-5, 1e-4  # T; the Earth's field, with what steel does to it
 _AXES = "xyz"
 
@@ -47,7 +51,7 @@ def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
     Parameters
     ----------
     job : Job
-        Its log holds inertial samples and the raw waveform.
+        Its log holds the raw waveform; inertial samples tell more than the field's size.
     positions : bool
         Use only the stops, twelve of them, instead of all the turning.
 
@@ -59,26 +63,25 @@ def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
     EstimationError
         Where the calibration has no solution.
     """
-    from magfusion.calibration.magnetometer_log import calibrate_log
     from magfusion.files.site import save_site
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed, require_imu
     from magfusion.results.report import write_report
 
     claimed = claim(job.output, JOB)
     log, site = read_job(job, without=True)
-    require_imu(job, log, "gravity and gyro tell how the magnetometer turned")
+    if positions:
+        require_imu(job, log, "it tells the stops of --positions; leave the option away")
     if log.waveform is None:
         raise InputError(
             f"{job.log_path}: holds no waveform, only phasors, which do not hold the Earth's field;"
             " give the log with magnetometer.parquet"
         )
     with named(job.log_path):
-        found = calibrate_log(log.waveform, log.imu, site, at_stops=positions)
+        found, trust = calibrated(log, site, positions=positions)
     declared = site.platform.magnetometer
-    found, trust = judged(found, site, log)
     before, after = _fields(found, declared), _fields(found, found.magnetometer)
     size = float(np.linalg.norm(found.prior.field_world))
-    estimates = _estimates(found, declared)
+    estimates = estimates_of(found, declared)
     figures = _figures(log, found, estimates, before, after, trust)
     with claimed as whole:
         directory = found_in(whole, trust)
@@ -117,7 +120,8 @@ def _refined_site(
     )
 
 
-def _estimates(found: LogCalibration, declared: Magnetometer) -> list[Estimate]:
+def estimates_of(found: LogCalibration, declared: Magnetometer) -> list[Estimate]:
+    """Return the twelve numbers as found, beside those that a site declared."""
     from magfusion.results.figures import Estimate
 
     fit, prior = found.graph.fit, found.prior
@@ -128,7 +132,9 @@ def _estimates(found: LogCalibration, declared: Magnetometer) -> list[Estimate]:
     change = np.concatenate([(fit.matrix - declared.matrix).ravel(), fit.offset - declared.offset])
     former = np.concatenate([declared.matrix.ravel(), declared.offset])
     variances = np.diagonal(fit.cov), np.diagonal(prior.cov)
-    rows = zip(names, vectors, change, *variances, former, strict=True)
+    loose = np.full(12, np.inf)
+    loose[9:] = LOOSE * float(np.linalg.norm(prior.field_world))
+    rows = zip(names, vectors, change, *variances, former, loose, strict=True)
     return [
         Estimate(
             name,
@@ -137,9 +143,10 @@ def _estimates(found: LogCalibration, declared: Magnetometer) -> list[Estimate]:
             label=label,
             sigma=float(np.sqrt(variance) / scale),
             prior_sigma=float(np.sqrt(before) / scale),
+            is_open=bool(variance > limit**2),
             declared=float(value / scale),
         )
-        for name, (label, unit, scale), moved, variance, before, value in rows
+        for name, (label, unit, scale), moved, variance, before, value, limit in rows
     ]
 
 
@@ -185,6 +192,25 @@ def _figures(
     )
 
 
+def calibrated(log: Log, site: Site, *, positions: bool = False) -> tuple[LogCalibration, Trust]:
+    """Return what a log's waveform says of the magnetometer, and what is to be said of that.
+
+    Raises
+    ------
+    InputError, EstimationError
+        As `run_calibrate_magnetometer`.
+    """
+    from magfusion.calibration.magnetometer_log import calibrate_log
+    from magfusion.calibration.magnetometer_size import calibrate_alone
+
+    assert log.waveform is not None
+    if log.inertial:
+        found = calibrate_log(log.waveform, log.imu, site, at_stops=positions)
+    else:
+        found = calibrate_alone(log.waveform, site)
+    return judged(found, site, log)
+
+
 def judged(found: LogCalibration, site: Site, log: Log) -> tuple[LogCalibration, Trust]:
     """Return a calibration with sigmas that its witnesses allow, and what they say."""
     from magfusion.calibration.magnetometer import refined
@@ -193,7 +219,7 @@ def judged(found: LogCalibration, site: Site, log: Log) -> tuple[LogCalibration,
     from magfusion.model.trust import Trust
 
     declared, prior, fit = site.platform.magnetometer, found.prior, found.graph.fit
-    estimates = _estimates(found, declared)
+    estimates = estimates_of(found, declared)
     change = np.concatenate([(fit.matrix - declared.matrix).ravel(), fit.offset - declared.offset])
     own = contradiction(
         [one.key for one in estimates],
@@ -211,7 +237,7 @@ def judged(found: LogCalibration, site: Site, log: Log) -> tuple[LogCalibration,
     )
     platform = replace(site.platform, magnetometer=found.magnetometer)
     streams = recorded(log, replace(site, platform=platform), BRIDGED)
-    return found, trust | Trust((*_doubts(found, site), *_remarks(found), *streams))
+    return found, trust | Trust((*_doubts(found, site), *_remarks(found, log), *streams))
 
 
 def _beside(found: LogCalibration) -> Contradiction:
@@ -233,17 +259,26 @@ def _beside(found: LogCalibration) -> Contradiction:
 def _doubts(found: LogCalibration, site: Site) -> Iterator[Finding]:
     from magfusion.model.trust import Finding, Verdict
 
-    declared = site.platform.magnetometer.matrix
-    ratio = float(np.cbrt(np.linalg.det(found.graph.fit.matrix) / np.linalg.det(declared)))
-    if not 1.0 / (1.0 + SCALE) < ratio < 1.0 + SCALE:
+    yield from _of_another_scale(found, site)
+    if found.rival is not None:
+        own, other = (_microtesla(b) for b in (found.magnetometer.offset, found.rival))
         yield Finding(
-            "earth_field",
-            f"The scale of the magnetometer came out {ratio:.3g} times the declared one: the"
-            " readings are in another unit, or the site's Earth field is of another size.",
+            "ambiguous",
+            f"Two offsets explain the readings, {own} and {other} uT, each the other's mirror"
+            " image: the sensor turned about one axis only. Turn it about a second.",
             Verdict.FAILED,
-            abs(ratio - 1.0) / SCALE,
         )
     yield from _of_another_size(found, site)
+    sigma = float(np.max(found.magnetometer.sigma.offset))
+    size = float(np.linalg.norm(found.prior.field_world))
+    if sigma > LOOSE * size:
+        yield Finding(
+            "few_data",
+            f"The offset is known to {1e6 * sigma:.2g} uT only, {100.0 * sigma / size:.2g} % of the"
+            " field, and is not determined: turn the sensor further, about all its axes.",
+            Verdict.FAILED if sigma > USELESS * size else Verdict.DOUBTFUL,
+            weight=sigma / (LOOSE * size),
+        )
     disturbed = found.field_sigma / float(np.linalg.norm(found.prior.field_world))
     if disturbed > site.earth.strength_sigma:
         yield Finding(
@@ -253,6 +288,38 @@ def _doubts(found: LogCalibration, site: Site) -> Iterator[Finding]:
             " (world.earth.strength_sigma). Turn the sensor in one place, away from iron.",
             weight=disturbed / site.earth.strength_sigma,
         )
+
+
+def _microtesla(offset: Array) -> str:
+    return "[" + ", ".join(f"{1e6 * axis:.1f}" for axis in offset) + "]"
+
+
+def _of_another_scale(found: LogCalibration, site: Site) -> Iterator[Finding]:
+    """Yield that only another scale of the sensor makes the readings the declared field's.
+
+    It is said before what the calibration says against its prior, of which it is the cause.
+    """
+    from magfusion.model.trust import Finding, Verdict
+
+    declared = site.platform.magnetometer.matrix
+    ratio = float(np.cbrt(np.linalg.det(found.graph.fit.matrix) / np.linalg.det(declared)))
+    sigma = float(np.sqrt(np.mean(np.diagonal(found.prior.cov)[[0, 4, 8]]) / 3.0))
+    far = abs(ratio - 1.0) / min(SCALE, SCALE_SIGMAS * max(sigma, LEAST_SCALE))
+    if far < 1.0:
+        return
+    text = (
+        f"The scale of the magnetometer came out {ratio:.3g} times the declared one: the"
+        " readings are in another unit, or the site's Earth field is of another size."
+    )
+    if site.earth_field_world is not None and abs(ratio - 1.0) < 1.0:
+        size = 1e6 * float(np.linalg.norm(site.earth_field_world))
+        text = (
+            f"The readings are of a field of {ratio * size:.3g} uT where the sensor is as declared,"
+            f" and the site declares {size:.3g} uT: steel is near, the field is another place's, or"
+            " the readings are in another unit. Calibrate away from steel, or declare the field"
+            " that is there (earth_field_t)."
+        )
+    yield Finding("earth_field", text, Verdict.FAILED, FIRST + far)
 
 
 def _of_another_size(found: LogCalibration, site: Site) -> Iterator[Finding]:
@@ -286,11 +353,17 @@ def _of_another_size(found: LogCalibration, site: Site) -> Iterator[Finding]:
         )
 
 
-def _remarks(found: LogCalibration) -> Iterator[Finding]:
+def _remarks(found: LogCalibration, log: Log) -> Iterator[Finding]:
     from magfusion.model.trust import Finding, Verdict
 
     for sentence in found.missing:
         text = f"{sentence[0].upper()}{sentence[1:]}."
+        yield Finding("few_data", text, Verdict.TRUSTWORTHY)
+    if not log.inertial:
+        text = (
+            "The log has no IMU: the field's size alone tells no rotation of the sensor, which"
+            " stays as declared. Record an IMU beside it to find that too."
+        )
         yield Finding("few_data", text, Verdict.TRUSTWORTHY)
     if not found.scale_known:
         yield Finding(

@@ -339,7 +339,7 @@ def read_recording(job: Job, report: Report = quiet) -> tuple[Log, Site | None]:
         site = load_site(job.declared_path, unknown=True, without=True)
         if site.beacons:
             return read_job(job, unknown=True, report=report)
-        return _open(job, report), site
+        return mended(_open(job, report), site), site
     return open_log(job.log_path, job.start, job.end, job.topics, report), None
 
 

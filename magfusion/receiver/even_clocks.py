@@ -7,10 +7,14 @@ import numpy as np
 
 from magfusion.model.samples import Log, StreamClock
 from magfusion.model.site import Site
+from magfusion.receiver.bursts import LONGEST, spread_bursts
 from magfusion.receiver.lockin import unexplained
-from magfusion.receiver.sampling_clock import SamplingClock, sampling_clock
+from magfusion.receiver.sampling_clock import SamplingClock, sampling_clock, smooth_clock
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import default_settings
+from magfusion.units import Array
+
+ASTRAY = 4.0  # steps, by which counted samples may be off where a bus hands over several
 
 
 def on_even_clocks(log: Log, site: Site) -> Log:
@@ -19,9 +23,9 @@ def on_even_clocks(log: Log, site: Site) -> Log:
     Whether the samples were taken at the ticks or at the stamps the magnetometer decides: at the
     right times tones and turn leave less of it.  An IMU tells no such thing, and follows.
     """
-    found = {"imu": sampling_clock(log.imu.time)}
+    found = {"imu": _clock(log.imu.time, site)}
     if log.waveform is not None:
-        found["magnetometer"] = sampling_clock(log.waveform.time)
+        found["magnetometer"] = _clock(log.waveform.time, site)
     clocks = {name: clock for name, clock in found.items() if clock is not None}
     if not clocks:
         return log
@@ -32,6 +36,22 @@ def on_even_clocks(log: Log, site: Site) -> Log:
         for name, clock in clocks.items()
     }
     return replace(even if replaced else log, clocks=notes)
+
+
+def _clock(stamps: Array, site: Site) -> SamplingClock | None:
+    """Return the even clock under stamps, which a bus may have bundled."""
+    apart = None if has_schedule(site) else spread_bursts(stamps)
+    if apart is None:
+        return sampling_clock(stamps)
+    # Where none is lost, samples are counted; a lost one moves those behind it by a step at most.
+    steps = np.diff(apart)
+    step = float(np.mean(steps[steps < LONGEST]))
+    breaks = np.flatnonzero(steps >= LONGEST) + 1
+    parts = np.split(apart, breaks)
+    time = np.concatenate([smooth_clock(np.arange(len(part)), part) for part in parts])
+    if np.any(np.diff(time) <= 0.0) or np.max(np.abs(time - apart)) > ASTRAY * step:
+        time = apart
+    return SamplingClock(time, step, float(np.sqrt(np.mean((time - stamps) ** 2))), 0)
 
 
 def _at(log: Log, clocks: Mapping[str, SamplingClock]) -> Log:

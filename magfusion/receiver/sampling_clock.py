@@ -103,7 +103,7 @@ def _phasor(stamps: Array, step: float) -> ComplexArray:
 
 def _of_stretch(stamps: Array, step: float) -> SamplingClock:
     tick = _ticks(stamps, step)
-    time = _smooth_clock(tick, stamps)
+    time = smooth_clock(tick, stamps)
     lost = int(tick[-1] - tick[0] + 1 - len(tick))
     return SamplingClock(time, step, 0.0, lost)
 
@@ -172,7 +172,7 @@ def _slips(late: Array, sigma: float) -> IntArray:
     return slip
 
 
-def _smooth_clock(tick: IntArray, stamps: Array) -> Array:
+def smooth_clock(tick: IntArray, stamps: Array) -> Array:
     """Return the time of each tick (s): straight lines that bend no oftener than stamps demand.
 
     A bend that they do not tell of (Schwarz's criterion) only hands their scatter on to the clock,

@@ -1,0 +1,142 @@
+"""Where the calibration of a magnetometer begins: by what the gyro says of its turning.
+
+A field that stays in the world turns in the sensor as the gyro does, and a hard iron does not.  Of
+two readings a few seconds apart that is linear in the offset, however large it is and however
+little was turned.  About the one direction that the turning tells least of, the field's size gives
+two places, each the other's mirror image.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.calibration.magnetometer import MagnetometerFit, field_from_measured
+from magfusion.calibration.magnetometer_graph import Epochs, GraphFit, Prior, fit_graph
+from magfusion.calibration.steady_field import SteadyField
+from magfusion.errors import EstimationError
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import Magnetometer
+from magfusion.model.strapdown import attitude_from_gyro_at
+from magfusion.units import Array
+
+LAGS = (1.0, 2.0, 4.0, 8.0)  # s; over which a gyro's bias turns little
+NEAR = 0.3  # of a lag, by which two readings may be nearer or farther
+FARTHEST, STEPS = 4e-4, 801  # T; hard iron along the direction that is told least
+APART, UNLIKELY = 16.0, 25.0  # chi square by which an offset is another one, and by which it is out
+FLAT = 0.15  # of the field, by which readings leave their plane; beyond, none mistakes its sides
+READING = 0.02  # of the field: how wrong turned readings are, against the prior of the offset
+
+
+def starts(
+    readings: SteadyField,
+    imu: ImuSamples,
+    time_offset: float,
+    known: Magnetometer,
+    offset_cov: Array,
+    size: float,
+) -> tuple[MagnetometerFit, ...]:
+    """Return the offsets to begin with, one or several, with the matrix as it was declared.
+
+    Parameters
+    ----------
+    time_offset : float
+        Added to the IMU's stamps (s).
+    offset_cov : ndarray, shape (3, 3)
+        Prior (T^2).
+    size : float
+        Of the field (T).
+    """
+    to_body = known.body_from_sensor @ np.linalg.inv(known.matrix)
+    body = (readings.measured_sensor - known.offset) @ to_body.T
+    attitude = attitude_from_gyro_at(imu.time + time_offset, imu.gyro_body, readings.time)
+    turn = attitude.as_matrix()
+    square, side = np.zeros((3, 3)), np.zeros(3)
+    for lag in LAGS:
+        other = np.searchsorted(readings.time, readings.time + lag)
+        first = np.flatnonzero(other < len(readings))
+        other = other[first]
+        near = readings.time[other] - readings.time[first] < (1.0 + NEAR) * lag
+        first, other = first[near], other[near]
+        back = np.swapaxes(turn[other], 1, 2) @ turn[first]  # then_from_first
+        by_offset = np.eye(3) - back
+        moved = body[other] - np.einsum("nij,nj->ni", back, body[first])
+        square += np.einsum("nji,njk->ik", by_offset, by_offset)
+        side += np.einsum("nji,nj->i", by_offset, moved)
+    noise = (READING * size) ** 2
+    prior = np.linalg.inv(to_body @ offset_cov @ to_body.T)
+    middle = np.linalg.solve(square / noise + prior, side / noise)
+    least = np.linalg.eigh(square / noise + prior)[1][:, 0]
+    back_to_sensor = np.linalg.inv(to_body)
+    return tuple(
+        MagnetometerFit(
+            known.matrix, known.offset + back_to_sensor @ (middle + far * least), np.zeros((12, 12))
+        )
+        for far in places(body - middle, least, size)
+    )
+
+
+def mirrored(measured: Array, fit: MagnetometerFit) -> MagnetometerFit | None:
+    """Return the calibration beyond the plane of the readings (n, 3); None where they leave it."""
+    field = field_from_measured(measured, fit.matrix, fit.offset)
+    spread, axes = np.linalg.eigh(np.cov(field.T))
+    size = float(np.mean(np.linalg.norm(field, axis=1)))
+    if np.sqrt(max(float(spread[0]), 0.0)) > FLAT * size:
+        return None
+    far = float(np.mean(field @ axes[:, 0]))
+    return replace(fit, offset=fit.offset + 2.0 * far * fit.matrix @ axes[:, 0])
+
+
+def likeliest(epochs: Epochs, prior: Prior, begun: tuple[MagnetometerFit, ...]) -> GraphFit:
+    """Return the likeliest of the solutions that are reached from several places."""
+    found, failure = [], EstimationError("")
+    for start in begun:
+        try:
+            found.append(fit_graph(epochs, prior, start))
+        except EstimationError as error:
+            failure = error
+    if not found:
+        raise failure
+    return min(found, key=lambda graph: graph.chi_square)
+
+
+def rival_offset(epochs: Epochs, prior: Prior, graph: GraphFit) -> Array | None:
+    """Return another offset (T) that explains the readings nearly as well, if there is one.
+
+    Of readings in one plane the mirror image is as good: the field is of one size on either side.
+    """
+    fit = graph.fit
+    mirror = mirrored(epochs.measured_sensor, fit)
+    if mirror is None:
+        return None
+    try:
+        other = fit_graph(epochs, prior, mirror)
+    except EstimationError:
+        return None
+    off = other.fit.offset - fit.offset
+    elsewhere = off @ np.linalg.solve(fit.cov[9:, 9:], off) > APART
+    return (
+        other.fit.offset if elsewhere and other.chi_square < graph.chi_square + UNLIKELY else None
+    )
+
+
+@contextmanager
+def saying(missing: list[str]) -> Iterator[None]:
+    """Add to a failure which orientations were not there, and what to do."""
+    try:
+        yield
+    except EstimationError as failure:
+        lack = "".join(f", {sentence}" for sentence in missing)
+        raise EstimationError(f"{failure}{lack}; turn it slowly about all its axes") from failure
+
+
+def places(field: Array, direction: Array, size: float) -> Array:
+    """Return how far along a direction a field (n, 3) has its size best (T): one place, or two."""
+    tried = np.linspace(-FARTHEST, FARTHEST, STEPS)
+    along = field @ direction
+    across = np.sum(field**2, axis=1) - along**2
+    sizes = np.sqrt(np.maximum(across, 0.0) + (along - tried[:, None]) ** 2)
+    cost = np.mean((sizes - size) ** 2, axis=1)
+    found = tried[1:-1][(cost[1:-1] < cost[:-2]) & (cost[1:-1] <= cost[2:])]
+    return found if len(found) else tried[[int(np.argmin(cost))]]
