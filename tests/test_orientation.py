@@ -197,7 +197,8 @@ def test_in_the_mean_it_is_better_than_vqf_and_claims_no_more_than_is_true():
     pytest.importorskip("vqf")
     rows = []
     for kind in ("slow turning", "fast carrying", "both, pauses", "magnet attached"):
-        rows += scenario.rows_of(*worlds.simulated(kind, 1, 30.0, 50.0, 1.0))
+        for seed in range(3):
+            rows += scenario.rows_of(*worlds.simulated(kind, seed, 30.0, 50.0, 1.0))
     for way in ("online", "offline"):
         ours, theirs = ([r for r in rows if r.way == w] for w in (way, f"VQF {way}"))
         mean = [np.mean([np.hypot(r.heading_deg, r.tilt_deg) for r in o]) for o in (ours, theirs)]

@@ -35,7 +35,7 @@ from magfusion.model.strapdown import triad
 from magfusion.units import Array
 
 GYRO_SCALE = 0.003  # usual error of a gyroscope's scale and axes
-AMBIENT = 0.05  # of the field's size: usual disturbance of each component, indoors
+AMBIENT = 0.02  # of the field's size: usual disturbance of each component, indoors
 SETTLED, MOVED = 10.0, 2.0  # s; over which it changes, at rest and in motion
 MEMORY = 5.0  # s; over which its size is learnt, and that of the speed
 NOISE_MEMORY, NOISE_FACTOR = 10.0, 20.0  # s; samples of the field are not independent
@@ -49,10 +49,9 @@ LEAST_CHANGE, FREED = 3.0, 4.0  # uT; factor of the variance of what has changed
 TILT, HEADING = 0.05, 0.3  # rad; of the first attitude
 FAR_STRENGTH = 0.04  # of the field's size: what the declared one may be off by anywhere
 OFFSET_WALK = 0.01  # uT per square root of second
-# What is carried turns with the arm that carries it: its speed, and the field where it is, go with
-# its attitude, over and over, as false biases would.  In motion these take so much of them.
+# What is carried turns with the arm that carries it: its speed goes with its attitude, over and
+# over, as a false bias would.  In motion the accelerometer's bias takes so much of it.
 SWUNG = 0.05  # of the speed: the accelerometer's bias
-SWEPT = 0.2  # of the field: what the field alone tells
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,11 +298,7 @@ class OrientationFilter:
             measured_from_seen, error + seen.earth_world @ state.near
         )
         self._learn_deviation(off_world, variance, stretch)
-        share = np.ones(SIZE)
-        if not stretch.rests:
-            for part in (OFFSET, MATRIX, LAG, FAR):
-                share[part] = SWEPT
-        row = Row(by_state, error, np.full(3, variance), share)
+        row = Row(by_state, error, np.full(3, variance), np.ones(SIZE))
         if apart <= GATE:
             return row, False, state
         change = max(float(error @ error), LEAST_CHANGE**2)
