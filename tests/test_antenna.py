@@ -176,6 +176,9 @@ def test_coils_at_one_place_change_nothing() -> None:
     plain, _, _ = _observe(sensor)
     apart, _, _ = _observe(replace(sensor, coil_centres_sensor=np.zeros((3, 3))))
     for name, value in vars(plain).items():
+        if value is None:
+            assert getattr(apart, name) is None
+            continue
         np.testing.assert_allclose(getattr(apart, name), value, rtol=1e-12, atol=1e-22)
     # All three moved alike are a lever arm.
     shift = np.array([0.01, -0.02, 0.03])

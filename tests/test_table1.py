@@ -114,7 +114,7 @@ def _table(tmp_path: Path) -> pa.Table:
         ("amplitude", 4, -1.0, "column amplitude, row 4: found -1.0; write a positive number"),
         ("sigma", 0, float("nan"), "column sigma, row 0: found nan; write a finite number"),
         ("position_x", 1, 0.7, "row 1: found 1; write the same pose in all rows of a point"),
-        ("qw", 2, 0.5, "write the same pose in all rows of a point"),
+        ("qw", 2, 0.5, "columns qw to qz, row 2: found 0.5; write unit length"),
         ("tone", 3, -1.0, "column tone, row 3: found -1; write an integer from 0"),
         ("point", 3, 1.0, "write one row per point and channel"),
     ],

@@ -35,8 +35,13 @@ MEASUREMENTS: tuple[type[Measurement], ...] = (FieldPhasors, EarthField, ZeroVel
 ROUNDING = 1e-6  # of a rotation, and of a correlation's least eigenvalue
 
 
+def _made_again(data: Any) -> Predictions:
+    _check(data is None, "holds predictions, which are not kept")
+    return Predictions()
+
+
 # What is only kept to be shared is made again.
-_FORGOTTEN = Rules({Predictions: lambda _: None}, {Predictions: lambda _: Predictions()})
+_FORGOTTEN = Rules({Predictions: lambda _: None}, {Predictions: _made_again})
 
 
 def navigator_rules(
