@@ -112,7 +112,7 @@ def read_survey(path: Path, list_of_poses: Path | None = None) -> Survey:
         of one point disagree on its pose, or a point is not in the list of poses.
     """
     table = read_whole(path, "survey")
-    own = poses(table, path) if list_of_poses is None else None
+    pose = None if list_of_poses is not None else poses(table, path)
     values = ("amplitude",) if "amplitude" in table.column_names else _PHASOR
     number = {name: numbers(table, name, path) for name in (*values, "sigma")}
     for name in {"amplitude", "sigma"} & number.keys():
@@ -120,7 +120,9 @@ def read_survey(path: Path, list_of_poses: Path | None = None) -> Survey:
     point, tone = (integers(table, name, path) for name in ("point", "tone"))
     refuse_rows(tone < 0, path, "column tone", tone, "an integer from 0")
     names = [str(name) for name in column(table, "beacon", path).to_pylist()]
-    pose = _listed(point, path, list_of_poses) if own is None else own
+    if list_of_poses is not None:
+        pose = _listed(point, path, list_of_poses)
+    assert pose is not None
     return _arranged(path, point, list(zip(names, tone.tolist(), strict=True)), number, *pose)
 
 
