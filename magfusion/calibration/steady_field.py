@@ -19,7 +19,7 @@ from magfusion.units import Array, BoolArray
 PERIODS = 8.0  # of the lowest tone in a window; its taper leaves 6e-4 of it, less of the others
 SHORTEST = 0.2  # s; ten periods of the mains
 LONGEST = 2.0  # s; over which a gyro's bias turns less than it matters
-GAP = 2.5  # a gap is this many times what intervals are up to; one lost sample is none
+GAP = 3.5  # a gap is this many times what intervals are up to; two lost samples are none
 UP_TO = 95.0  # percent of the intervals, so that stamps of a host make no gaps
 SHORTEST_ALONE, FEWEST_ALONE = 0.05, 5.0  # s, samples; of a window without a gyro
 TURNED = 0.05  # of all that the field changes by
