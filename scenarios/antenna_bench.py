@@ -15,6 +15,7 @@ is off by more than a third, which is three sigmas of the chance of so few poses
 import csv
 import json
 import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,7 +32,7 @@ from magfusion.units import DEGREE, Array
 CARRIERS_HZ = (5000.0, 6000.0, 7000.0)
 WITHIN, SEED_WITHIN = 0.2, 1.0 / 3.0
 DISC = 6  # points on each of two rings of a receiving coil's disc
-Table = dict[str, Array | list[str]]
+Table = dict[str, Array | Sequence[object]]
 
 
 @dataclass(frozen=True)
@@ -241,12 +242,12 @@ class World:
         write_csv(path / "truth.csv", truth | dict(zip(QUATERNION, quaternion.T, strict=True)))
 
 
-def write_csv(path: Path, table: Table) -> None:
+def write_csv(path: Path, table: Mapping[str, Array | Sequence[object]]) -> None:
     """Write columns of one length."""
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(table)
-        columns = [c if isinstance(c, list) else c.tolist() for c in table.values()]
+        columns = [c.tolist() if isinstance(c, np.ndarray) else c for c in table.values()]
         writer.writerows(zip(*columns, strict=True))
 
 

@@ -12,20 +12,18 @@ and the verdict is trustworthy.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from both_estimators import Row, rows_of, table
 from harness import conclude, scenario_parser
-from warming import filtered, smoothed
 
 from magfusion.estimation.drive_reference import with_drives
 from magfusion.model.drive import DriveSamples
 from magfusion.model.samples import Log
 from magfusion.model.site import Beacon, Site
-from magfusion.model.trajectory import Trajectory
-from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.field import Drives
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.simulation.waveform import simulate_waveform
-from magfusion.units import DEGREE, Array
+from magfusion.units import Array
 
 CURRENT = 2.0  # A
 NOISE = 1e-3  # A, of a sample
@@ -90,17 +88,6 @@ def _current(beacon: Beacon, time: Array, phase: float, drift: float) -> Array:
     return CURRENT * np.cos(turned + phase + beacon.coils[0].phase)
 
 
-@dataclass(frozen=True)
-class Row:
-    """What an estimator makes of a log."""
-
-    currents: str
-    estimator: str
-    position_mm: float
-    attitude_deg: float
-    verdict: str
-
-
 def run(config: Config) -> list[Row]:
     """Estimate with steady currents, with recorded ones, and without a record of them."""
     wandering = wandering_log(config, steady=False)
@@ -112,28 +99,7 @@ def run(config: Config) -> list[Row]:
         "recorded": with_drives(wandering, with_currents(demo_site())),
         "not recorded": (replace(wandering, drive=None), alone),
     }
-    rows = []
-    for name, (log, site) in cases.items():
-        for estimator, estimate in (("smooth", smoothed), ("navigate (ekf)", filtered)):
-            rows.append(_row(name, estimator, log, *estimate(log, site)))
-    return rows
-
-
-def _row(name: str, estimator: str, log: Log, states: Trajectory, verdict: str) -> Row:
-    assert log.truth is not None
-    found = trajectory_errors(states, log.truth)
-    size = float(np.sqrt(np.mean(np.sum(found.position_world**2, axis=1))))
-    turn = float(np.sqrt(np.mean(found.attitude**2))) / DEGREE
-    return Row(name, estimator, 1e3 * size, turn, verdict)
-
-
-def report(rows: list[Row]) -> str:
-    """Return the table of the errors."""
-    lines = [f"{'currents':16}{'estimator':16}{'position':>12}{'attitude':>12}"]
-    for row in rows:
-        errors = f"{row.position_mm:9.2f} mm{row.attitude_deg:8.3f} deg"
-        lines.append(f"{row.currents:16}{row.estimator:16}{errors}  {row.verdict}")
-    return "\n".join(lines)
+    return [row for name, case in cases.items() for row in rows_of(name, *case)]
 
 
 def main() -> None:
@@ -142,7 +108,7 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=Config.duration, help="of the walk (s)")
     given = parser.parse_args()
     rows = run(Config(given.duration, given.seed))
-    conclude(report(rows), rows)
+    conclude(table("currents", rows), rows)
 
 
 if __name__ == "__main__":

@@ -8,23 +8,16 @@ with a site that declares both and with one that does not.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from harness import conclude, rms, scenario_parser
+from both_estimators import Row, rows_of, table
+from harness import conclude, scenario_parser
 
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.integrity.judge import judged
-from magfusion.estimation.integrity.judgement import JudgedState
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import as_trajectory
 from magfusion.estimation.warming import at_reference
-from magfusion.jobs.replay import Replay, feed
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.temperature import MAGNETOMETER, SensorWarming, Temperatures, Warming
-from magfusion.model.trajectory import Trajectory
-from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
-from magfusion.units import DEGREE, Array
+from magfusion.units import Array
 
 PER_K = -3.9e-3  # copper at a constant voltage
 MATRIX_PER_K = 1e-4 * np.array([[5.0, 0.3, 0.0], [0.0, -4.0, 0.2], [0.1, 0.0, 3.0]])
@@ -80,55 +73,11 @@ def warm_log(duration: float, seed: int) -> Log:
     return replace(logs[0], waveform=wave, temperatures=degrees)
 
 
-@dataclass(frozen=True)
-class Row:
-    """What an estimator makes of the log by a site."""
-
-    site: str
-    estimator: str
-    position_mm: float
-    attitude_deg: float
-    verdict: str
-
-
-def smoothed(log: Log, site: Site) -> tuple[Trajectory, str]:
-    """Smooth a log; return its states and the verdict."""
-    result, trust = judged(smooth(log, site, SmootherSettings()), log)
-    return result.states, str(trust.verdict)
-
-
-def filtered(log: Log, site: Site) -> tuple[Trajectory, str]:
-    """Navigate along a log by the filter; return its states and the worst that was said of them."""
-    navigator, replayed = Navigator(site, NavigatorSettings("ekf")), Replay(log)
-    states: list[JudgedState] = []
-    for k in range(len(replayed)):
-        feed(navigator, replayed.piece(k))
-        states += navigator.take()
-    return as_trajectory(states), str(navigator.summary.trust.verdict)
-
-
 def run(config: Config) -> list[Row]:
     """Estimate by both sites."""
-    log, rows = warm_log(config.duration, config.seed), []
-    for name, site in (("declared", warming_site()), ("not declared", demo_site())):
-        known = at_reference(log, site)
-        for estimator, estimate in (("smooth", smoothed), ("navigate (ekf)", filtered)):
-            states, verdict = estimate(*known)
-            assert log.truth is not None
-            found = trajectory_errors(states, log.truth)
-            size = rms(np.linalg.norm(found.position_world, axis=1))
-            turn = rms(found.attitude) / DEGREE
-            rows.append(Row(name, estimator, 1e3 * size, turn, verdict))
-    return rows
-
-
-def report(rows: list[Row]) -> str:
-    """Return the table of the errors."""
-    lines = [f"{'temperatures':16}{'estimator':16}{'position':>12}{'attitude':>12}"]
-    for row in rows:
-        errors = f"{row.position_mm:9.2f} mm{row.attitude_deg:8.3f} deg"
-        lines.append(f"{row.site:16}{row.estimator:16}{errors}  {row.verdict}")
-    return "\n".join(lines)
+    log = warm_log(config.duration, config.seed)
+    cases = {"declared": warming_site(), "not declared": demo_site()}
+    return [row for name, site in cases.items() for row in rows_of(name, *at_reference(log, site))]
 
 
 def main() -> None:
@@ -137,7 +86,7 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=Config.duration, help="of the walk (s)")
     given = parser.parse_args()
     rows = run(Config(given.duration, given.seed))
-    conclude(report(rows), rows)
+    conclude(table("temperatures", rows), rows)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from antenna_bench import KINDS, Config, holds, run_seed, write_csv
+from antenna_bench import KINDS, Config, Table, holds, run_seed, write_csv
 from conftest import Refuse
 from scipy.spatial.transform import Rotation
 from test_antenna_job import make_survey, nominal
@@ -34,7 +34,7 @@ def points(coil: int, *, on_axis: bool) -> Array:
 
 def probe_table(
     moments: Array, centres: Array, *, on_axis: bool, three: bool, side: str = "transmitter"
-) -> dict[str, object]:
+) -> Table:
     """Return readings of a probe of one axis, that of the coil, or of all three."""
     rows: list[tuple[int, Array, Array, float]] = []
     for coil in range(3):
@@ -62,14 +62,20 @@ def bench(tmp_path: Path, true_site: Site) -> Path:
     return tmp_path
 
 
-def calibrated(bench: Path, *probes: str, **given: object) -> tuple[Site, dict[str, object]]:
-    """Return the site that is written, and the report."""
+def calibrated(
+    bench: Path, *probes: str, survey: bool = False, boresight: bool = False, sizes: bool = False
+) -> tuple[Site, dict[str, object]]:
+    """Return the site that is written, and the report; poses of a survey are exact."""
     settings = AntennaSettings(
         site=bench / "site.yaml",
         probe=tuple(bench / name for name in probes),
         probe_position_m=0.0,
         probe_tilt_deg=0.0,
-        **given,  # type: ignore[arg-type]
+        pose_rotation_deg=0.0,
+        pose_position_m=0.0,
+        survey=bench / "survey.parquet" if survey else None,
+        boresight=boresight,
+        sizes=sizes,
     )
     run_calibrate_antenna(settings, bench / "out")
     told = json.loads((bench / "out" / "report.json").read_text())
@@ -81,7 +87,7 @@ def test_six_points_of_one_axis_after_the_other_find_all_of_a_source(
 ) -> None:
     beacon = true_site.beacons[0]
     table = probe_table(beacon.moments_beacon, beacon.centres_beacon, on_axis=True, three=True)
-    write_csv(bench / "probe.csv", table)  # type: ignore[arg-type]
+    write_csv(bench / "probe.csv", table)
     site, told = calibrated(bench, "probe.csv")
     found = site.beacons[0]
     np.testing.assert_allclose(found.moments_beacon, beacon.moments_beacon, atol=1e-5)
@@ -101,7 +107,7 @@ def test_four_points_along_the_coils_axis_do_not_tell_what_they_do_not_see(
     """Paper 000's bench: a probe along each coil's axis at four points across it."""
     beacon = true_site.beacons[0]
     table = probe_table(beacon.moments_beacon, beacon.centres_beacon, on_axis=False, three=False)
-    write_csv(bench / "probe.csv", table)  # type: ignore[arg-type]
+    write_csv(bench / "probe.csv", table)
     site, told = calibrated(bench, "probe.csv")
     undetermined = told["undetermined"]
     assert isinstance(undetermined, list)
@@ -124,7 +130,7 @@ def test_a_receiver_is_driven_with_whatever_current(bench: Path, true_site: Site
     table = probe_table(
         driven, sensor.coil_centres_sensor, on_axis=True, three=True, side="receiver"
     )
-    write_csv(bench / "probe.csv", table)  # type: ignore[arg-type]
+    write_csv(bench / "probe.csv", table)
     found = calibrated(bench, "probe.csv")[0].platform.magnetometer
     gain = np.exp(np.mean(np.log(np.linalg.norm(sensor.matrix, axis=1))))
     np.testing.assert_allclose(found.matrix, sensor.matrix / gain, atol=1e-4)
@@ -147,7 +153,7 @@ def test_windings_of_different_size_are_found_by_six_points(bench: Path) -> None
                 rows[f"field_{name}"].append(float(value))
             rows["coil"].append(coil)
             rows["sigma"].append(1e-12)
-    write_csv(bench / "probe.csv", rows)  # type: ignore[arg-type]
+    write_csv(bench / "probe.csv", rows)
     found = calibrated(bench, "probe.csv", sizes=True)[0].beacons[0]
     for coil, radius in zip(found.coils, radii, strict=True):
         assert coil.radius == pytest.approx(radius, rel=0.02)
@@ -180,8 +186,7 @@ def test_the_boresight_is_found_whatever_the_site_says_of_it(bench: Path, true_s
         bench / "site.yaml",
     )
     write_survey(make_survey(true_site, 25, 4, exact=True), bench / "survey.parquet")
-    exact = {"pose_rotation_deg": 0.0, "pose_position_m": 0.0}
-    site, told = calibrated(bench, survey=bench / "survey.parquet", boresight=True, **exact)
+    site, told = calibrated(bench, survey=True, boresight=True)
     true, found = true_site.platform.magnetometer, site.platform.magnetometer
     turn = Rotation.from_matrix(true.body_from_sensor.T @ found.body_from_sensor).magnitude()
     # What of three coils is a turn and what a shape is told by the matrix that was declared.
@@ -209,8 +214,7 @@ def test_poses_turned_alike_are_said_not_to_tell_of_others(bench: Path, true_sit
     phasor = phasor + sigma[..., None] * (noise[0] + 1j * noise[1])
     survey = Survey(np.arange(20), place, attitude, true_site.channels, sigma, phasor)
     write_survey(survey, bench / "survey.parquet")
-    exact = {"pose_rotation_deg": 0.0, "pose_position_m": 0.0}
-    _, told = calibrated(bench, survey=bench / "survey.parquet", **exact)
+    _, told = calibrated(bench, survey=True)
     expected, after = (float(str(told[f"position_m_{n}"])) for n in ("any_attitude", "after"))
     assert expected > 2.0 * after
     assert "transfer" in str(told["reasons"])
@@ -230,7 +234,11 @@ def test_poses_turned_alike_are_said_not_to_tell_of_others(bench: Path, true_sit
     ids=lambda value: "" if isinstance(value, str) else "-".join(value),
 )
 def test_bad_readings_are_refused_by_the_row(
-    bench: Path, true_site: Site, refuse: Refuse, change: dict[str, object], sentence: str
+    bench: Path,
+    true_site: Site,
+    refuse: Refuse,
+    change: dict[str, float | str | None],
+    sentence: str,
 ) -> None:
     beacon = true_site.beacons[0]
     table = probe_table(beacon.moments_beacon, beacon.centres_beacon, on_axis=True, three=False)
@@ -238,10 +246,10 @@ def test_bad_readings_are_refused_by_the_row(
         if value is None:
             del table[name]
             continue
-        column = list(table.get(name, [1.0] * len(table["coil"])))  # type: ignore[arg-type,call-overload]
+        column: list[object] = list(table.get(name, [1.0] * len(table["coil"])))
         column[0] = int(value) if name == "coil" else value
         table[name] = column
-    write_csv(bench / "probe.csv", table)  # type: ignore[arg-type]
+    write_csv(bench / "probe.csv", table)
     out = ["--site", bench / "site.yaml", "--probe", bench / "probe.csv", "-o", bench / "out"]
     assert sentence in refuse("calibrate", "antenna", *out)
 

@@ -131,7 +131,7 @@ def test_a_run_that_goes_on_knows_how_warm_it_is() -> None:
 
 @pytest.mark.slow
 def test_a_warm_log_is_as_good_as_a_cold_one() -> None:
-    rows = {(row.site, row.estimator): row for row in run(Config(DURATION))}
+    rows = {(row.case, row.estimator): row for row in run(Config(DURATION))}
     smooth, online = (rows["declared", name] for name in ("smooth", "navigate (ekf)"))
     assert smooth.verdict == online.verdict == "trustworthy"
     assert smooth.position_mm < 2.0
