@@ -151,6 +151,17 @@ def test_the_pipe_hears_the_currents(wandering: Log, tmp_path: Path) -> None:
     assert last["verdict"] == "trustworthy"
 
 
+def test_online_a_column_in_milliamperes_is_said_as_offline(wandering: Log) -> None:
+    assert wandering.drive is not None
+    wrong = {name: 1e3 * values for name, values in wandering.drive.current.items()}
+    currents = replace(wandering.drive, current=wrong).rows(slice(0, 1000))
+    navigator, offline = Navigator(SITE), replace(wandering, drive=currents)
+    navigator.add_drive(currents)
+    said = [finding.text for finding in navigator.of_currents]
+    assert len(said) == 4
+    assert said == [f.text for f in with_drives(offline, SITE)[0].noticed]
+
+
 def test_a_run_goes_on_with_its_currents(wandering: Log) -> None:
     assert wandering.drive is not None
     first = Navigator(SITE)

@@ -83,6 +83,7 @@ class EpochUpdate:
     ) -> None:
         self.site, self.blocks, self.bank = site, blocks, bank
         self.gate = Gate(site.channels, blocks)
+        self.of_currents: tuple[Finding, ...] = ()
         self.metal, self._reckoned = NearMetal(site, blocks), Reckoned(blocks)
         self.witness = OnlineWitness(site, estimated)
         self.score = OnlineScore(site, estimated, blocks[len(estimated) :], steady=earth)
@@ -232,7 +233,9 @@ class EpochUpdate:
     def _judged(self, state: State, since: float | None) -> Judgement:
         held = self.score.said_of(state)
         said = self.witness.judgement(state, self.gate, since, held)
-        said = said.beside(*self.metal.said().findings, *_of_place(self.site, state))
+        said = said.beside(
+            *self.metal.said().findings, *self.of_currents, *_of_place(self.site, state)
+        )
         return said if self.bank is None else self.bank.heard(said, state)
 
     def _compare(self, samples: FieldSamples, state: State) -> None:

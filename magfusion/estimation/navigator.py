@@ -12,6 +12,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.carried import Departure
+from magfusion.estimation.drive_reference import drive_findings
 from magfusion.estimation.ekf import ErrorStateFilter
 from magfusion.estimation.epoch_update import EpochUpdate, Estimator
 from magfusion.estimation.fixed_lag import SlidingWindow
@@ -40,6 +41,7 @@ from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.samples import FieldSamples, SteadyFields
 from magfusion.model.site import Site
 from magfusion.model.temperature import Temperatures
+from magfusion.model.trust import Finding
 from magfusion.model.without_imu import on_motion_prior, require_motion_prior
 from magfusion.receiver.drive import DriveReceiver
 from magfusion.receiver.receiver import Receiver
@@ -160,6 +162,7 @@ class Navigator:
         """
         self._currents.push(samples)
         self._drives.forget()
+        self._update.of_currents = tuple(drive_findings(self._currents, self.site))
 
     def add_temperature(self, part: str, time: float, degc: float) -> None:
         """Take the temperature of a beacon, or of the ``magnetometer``: of what comes after it."""
@@ -253,6 +256,11 @@ class Navigator:
         if wanted <= last.time:
             return judged_state(last, self._judgement, self._resets.counter)
         return self._now.at(self._arrived, wanted)
+
+    @property
+    def of_currents(self) -> tuple[Finding, ...]:
+        """What is said of the currents of coils; every state says it, too."""
+        return self._update.of_currents
 
     @property
     def distortion(self) -> dict[str, float]:

@@ -21,6 +21,7 @@ from magfusion.units import Array, ComplexArray
 LEAST_SAMPLES = 0.9  # of a whole window
 A_STEP = 4  # windows that begin within a step of the lock-in: shares are linear in between
 EDGE = 0.05  # of a slot, at each end: there the current rises and falls
+LEARNT = 0.02  # of what a window says of the noise
 SILENT = 0.2  # of the current; noise beyond is no reading
 
 
@@ -202,7 +203,8 @@ class DriveReceiver:
             if noise > SILENT:
                 continue
             key = DriveShares.key(channel.beacon, channel.tone)
-            self.noise[key] = max(float(noise), self.noise.get(key, 0.0))
+            known = self.noise.get(key, float(noise))
+            self.noise[key] = known + LEARNT * (float(noise) - known)
             turn = np.exp(-2j * np.pi * channel.frequency_hz * centre)
             yield channel, complex(value * turn / channel.declared)
 
