@@ -4,8 +4,10 @@ VQF (D. Laidig, T. Seel, Information Fusion 91, 2023) is what orientation filter
 Both have the same samples: simulated ones of every kind of `earth_worlds`, of sensors as good as
 their site declares and ten times better, and real ones (BROAD, where they are at hand).  VQF knows
 no Earth field but its direction, and no calibration; what the site declares is its offset here,
-zero.  Errors are root mean squares against the truth, in its own frame; the last column is the
-squared error of the heading by its claimed variance, one where the claim is exact.
+zero.  Errors are root mean squares against the truth, in its own frame; that of the heading stands
+beside its scatter about its own mean, since a constant part is a matter of the declared calibration
+and of how the frame of the truth was found (BROAD: by the uncalibrated field).  The last column is
+the squared error of the heading by its claimed variance, one where the claim is exact.
 
 The filter's constants were chosen by the simulated logs alone.
 """
@@ -38,18 +40,19 @@ class Row:
     log: str
     way: str
     heading_deg: float
+    scatter_deg: float
     tilt_deg: float
     heading_nees: float | None = None
 
 
-def errors(time: Array, attitude: Array, truth: Trajectory) -> tuple[float, float]:
-    """Return heading and tilt error (deg, rms)."""
+def errors(time: Array, attitude: Array, truth: Trajectory) -> tuple[float, float, float]:
+    """Return the heading's error, its scatter about its mean, and the tilt's error (deg, rms)."""
     known, exists = interpolate(truth, time, 0.1)
     off = Rotation.from_matrix(attitude[exists] @ np.swapaxes(known.world_from_body, 1, 2))
     x, y, z, w = off.as_quat().T
     head = 2.0 * np.arctan(z / w)
     tilt = 2.0 * np.arctan2(np.hypot(x, y), np.hypot(z, w))
-    return rms(head) / DEGREE, rms(tilt) / DEGREE
+    return rms(head) / DEGREE, float(np.std(head)) / DEGREE, rms(tilt) / DEGREE
 
 
 def heading_nees(found: Oriented, truth: Trajectory) -> float:
@@ -111,7 +114,7 @@ def main() -> None:
     for log, site in _cases(arguments.seeds, arguments.shares, arguments.logs):
         for row in rows_of(log, site):
             rows.append(row)
-            text = f"heading {row.heading_deg:6.2f} tilt {row.tilt_deg:5.2f}"
+            text = f"heading {row.heading_deg:6.2f} ({row.scatter_deg:5.2f}) tilt {row.tilt_deg:5.2f}"
             claim = "" if row.heading_nees is None else f"  nees {row.heading_nees:5.2f}"
             print(f"{row.log:34} {row.way:12} {text}{claim}", flush=True)
     means: dict[str, dict[str, float]] = {}
