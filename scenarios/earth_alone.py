@@ -114,7 +114,8 @@ def main() -> None:
     for log, site in _cases(arguments.seeds, arguments.shares, arguments.logs):
         for row in rows_of(log, site):
             rows.append(row)
-            text = f"heading {row.heading_deg:6.2f} ({row.scatter_deg:5.2f}) tilt {row.tilt_deg:5.2f}"
+            head = f"heading {row.heading_deg:6.2f} ({row.scatter_deg:5.2f})"
+            text = f"{head} tilt {row.tilt_deg:5.2f}"
             claim = "" if row.heading_nees is None else f"  nees {row.heading_nees:5.2f}"
             print(f"{row.log:34} {row.way:12} {text}{claim}", flush=True)
     means: dict[str, dict[str, float]] = {}
