@@ -8,10 +8,12 @@ from example_site import mixed_site
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from magfusion.estimation.integrity.fix_separation import separate_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Risk
 from magfusion.results.coverage import (
     best_extra_beacon,
     boundary_places,
@@ -77,6 +79,42 @@ def test_the_maximum_likelihood_fix_scatters_as_the_bound_says(
     low, high = np.sqrt(chi2.ppf([5e-4, 1 - 5e-4], DRAWS) / DRAWS)
     assert low < np.sqrt(np.mean(shift**2)) / bound.position_sigma[0] < high
     assert low < np.sqrt(np.mean(turn**2)) / bound.attitude_sigma[0] < high
+
+
+@pytest.mark.parametrize("place", [(1.5, 1.5, 0.8), (4.6, 3.5, 1.0)])
+def test_the_protection_level_is_the_one_that_fixes_have(place: tuple[float, ...]) -> None:
+    site, point = room(), np.array([place])
+    noise = float(np.sqrt(phasor_variance(site, WINDOW)[0]))
+    still = Trajectory(
+        WINDOW * np.arange(20), np.tile(np.eye(3), (20, 1, 1)), np.repeat(point, 20, axis=0)
+    )
+    samples = simulate_fields(site, still, noise, np.random.default_rng(5))
+    calibration = initial_calibration(site, 0.0)
+    fixes = fix_epochs(samples, calibration, survey_error=False)
+    states = separate_fixes(samples, calibration, fixes, survey_error=False).states
+    bound = coverage(site, point, WINDOW, survey=False, risk=Risk())
+    # Where the fix scattered to, its own covariance is a little another.
+    assert bound.protection_level_m == pytest.approx(np.median(states.protection_level_m), rel=0.02)
+    degrees = np.median(states.protection_level_deg)
+    assert bound.protection_level_deg == pytest.approx(degrees, rel=0.02)
+
+
+def test_there_is_no_protection_level_where_one_beacon_is_all_that_determines_the_pose() -> None:
+    bound = coverage(room(1), POINTS, WINDOW, risk=Risk())
+    assert np.all(bound.determined)
+    assert bound.protection_level_m is not None
+    assert np.all(np.isinf(bound.protection_level_m))
+
+
+def test_a_protection_level_grows_with_what_it_promises() -> None:
+    plain, surer, worse = (
+        coverage(room(), POINTS, WINDOW, risk=risk).protection_level_m
+        for risk in (Risk(), Risk(total=1e-6, fault=1e-4), Risk(fault=1e-2))
+    )
+    assert plain is not None
+    assert np.all(surer > plain)
+    assert np.all(worse > plain)
+    assert np.all(plain > 3.0 * sigma(room(), survey=True))
 
 
 def test_the_noise_of_a_tone_is_what_least_squares_leave_of_a_window() -> None:

@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.jobs.settings import Command, Settings, argument, option
+from magfusion.jobs.settings import Command, RiskSettings, argument, option
 from magfusion.jobs.simulate import box_option
 from magfusion.model.site import Site
 from magfusion.units import Array
 
 if TYPE_CHECKING:
     from magfusion.results.coverage import Coverage, ExtraBeacon
-    from magfusion.results.figures import Figures
+    from magfusion.results.figures import Figure, Figures
 
 
 MOST_POINTS = 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class CoverageSettings(Settings):
+class CoverageSettings(RiskSettings):
     """Where and how to bound; None takes what fits the site."""
 
     site: Path = argument("Site file of the installation")
@@ -70,14 +70,14 @@ def run_coverage(settings: CoverageSettings, output: Path) -> Figures:
     spacing = _spacing(box, settings)
     heights = None if settings.height is None else np.array([settings.height])
     points = volume(box, spacing, heights)
-    found = coverage(site, points, window)
+    found = coverage(site, points, window, risk=settings.risks)
     extra = None
     if settings.extra_beacon:
         extra = best_extra_beacon(site, box, lambda s, p: coverage(s, p, window), points)
     figures = _figures(site_path, site, window, spacing, found, extra)
     beacon = None if extra is None else extra.beacon
     with claimed as directory:
-        _write_points(directory / "coverage.parquet", found)
+        write_points(directory / "coverage.parquet", found)
         write_plot(directory / "coverage.png", site, found, beacon)
         write_coverage_recording(directory / "run.rrd", site, found, spacing, beacon)
         write_report(directory, figures)
@@ -138,9 +138,7 @@ def _figures(
         Figure("share_below_1_cm", float(np.mean(found.position_sigma < 0.01))),
         Figure("share_below_10_cm", float(np.mean(found.position_sigma < 0.1))),
         *(
-            Figure(
-                f"{name}_sigma_{unit}_{key}", _finite(value), unit, label=f"{name} sigma, {word}"
-            )
+            Figure(f"{name}_sigma_{unit}_{key}", finite(value), unit, label=f"{name} sigma, {word}")
             for name, unit, quantile in (
                 ("position", "m", position),
                 ("attitude", "deg", lambda q: np.rad2deg(attitude(q))),
@@ -150,6 +148,7 @@ def _figures(
                 ("p90", "90th percentile", quantile(0.9)),
             )
         ),
+        *level_figures(found),
         Figure("beacons_heard_least", int(np.min(found.beacons)), label="beacons in reach, least"),
     ]
     if extra is not None:
@@ -158,18 +157,44 @@ def _figures(
                 Figure(f"extra_beacon_{axis}_m", float(value), "m")
                 for axis, value in zip("xyz", extra.beacon.position_world, strict=True)
             ),
-            Figure("median_without_extra_m", _finite(extra.before), "m"),
-            Figure("median_with_extra_m", _finite(extra.after), "m"),
+            Figure("median_without_extra_m", finite(extra.before), "m"),
+            Figure("median_with_extra_m", finite(extra.after), "m"),
         ]
     return heading("coverage", site_path.stem) | trust_figures(Trust()) | Figures(*figures)
 
 
-def _finite(value: float) -> float | None:
+def level_figures(found: Coverage) -> list[Figure]:
+    """Return median and worst of the protection levels, and where there is one."""
+    from magfusion.results.figures import Figure
+
+    parts = (
+        ("m", "position", found.protection_level_m),
+        ("deg", "attitude", found.protection_level_deg),
+    )
+    figures = [
+        Figure(
+            f"protection_level_{unit}_{key}",
+            finite(float(np.quantile(level, share, method="higher"))),
+            unit,
+            label=f"protection level, {name}, {key}",
+        )
+        for unit, name, level in parts
+        if level is not None
+        for key, share in (("median", 0.5), ("worst", 1.0))
+    ]
+    if found.protection_level_m is not None:
+        share = float(np.mean(np.isfinite(found.protection_level_m)))
+        figures.append(Figure("share_protected", share))
+    return figures
+
+
+def finite(value: float) -> float | None:
     """Return a number as JSON has it: none where the pose is not determined."""
     return float(value) if np.isfinite(value) else None
 
 
-def _write_points(path: Path, found: Coverage) -> None:
+def write_points(path: Path, found: Coverage) -> None:
+    """Write every point with its bounds."""
     from magfusion.files.table import write_table
 
     columns: dict[str, object] = dict(
@@ -178,6 +203,9 @@ def _write_points(path: Path, found: Coverage) -> None:
     columns |= {"position_sigma": found.position_sigma, "attitude_sigma": found.attitude_sigma}
     columns |= dict(zip(("worst_x", "worst_y", "worst_z"), found.worst_world.T, strict=True))
     columns |= {"beacons": found.beacons, "determined": found.determined}
+    if found.protection_level_m is not None and found.protection_level_deg is not None:
+        columns["protection_level_m"] = found.protection_level_m
+        columns["protection_level_deg"] = found.protection_level_deg
     write_table(columns, path)
 
 

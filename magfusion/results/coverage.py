@@ -11,27 +11,22 @@ from itertools import product
 
 import numpy as np
 
-from magfusion.model.field import model_error_cov
-from magfusion.model.noise import model_error, paired_whitening
-from magfusion.model.parameters import (
-    PHASE,
-    Block,
-    Calibration,
-    choose_blocks,
-    initial_calibration,
-    linearize_channels,
-)
-from magfusion.model.prior import prior_sqrt_covariance
+from magfusion.model.parameters import choose_blocks, initial_calibration
 from magfusion.model.site import Beacon, Site
+from magfusion.model.trust import Risk
+from magfusion.results.pose_information import (
+    NEAREST,
+    SURVEY_GROUPS,
+    bound,
+    prior_of,
+    protected,
+    root_information,
+    whitened,
+)
+from magfusion.results.pose_information import phasor_variance as phasor_variance
 from magfusion.units import Array, BoolArray, IntArray
 
-SURVEY_GROUPS = ("beacons", "moments", "phase", "magnetometer", "extrinsics", "ground")
 CHUNK = 500  # points linearised at once
-NEAREST = 0.2  # m from a beacon's centre; nearer, coils are no dipoles
-OPEN = 1e-6  # of the best determined direction, in sigmas: what counts as no information
-DETECTION_CHI_SQUARE = (
-    3.0  # phasor against the noise of one component, from where a beacon contributes
-)
 COMPARED = 400  # points at which candidates for one more beacon are compared
 
 
@@ -53,6 +48,9 @@ class Coverage:
         How many beacons are detected above the noise.
     determined : bool ndarray, shape (n,)
         False where a direction of the pose is open, or a beacon is too near to be a dipole.
+    protection_level_m, protection_level_deg : ndarray, shape (n,), optional
+        What position and attitude stay within though one beacon may be false unnoticed; infinite
+        where nothing is promised.  None where no risk was given.
     """
 
     position_world: Array
@@ -61,6 +59,8 @@ class Coverage:
     worst_world: Array
     beacons: IntArray
     determined: BoolArray
+    protection_level_m: Array | None = None
+    protection_level_deg: Array | None = None
 
     def __len__(self) -> int:
         return len(self.position_world)
@@ -119,19 +119,6 @@ def usual_box(site: Site) -> Array:
     return box
 
 
-def phasor_variance(site: Site, window: float) -> Array:
-    """Return the variance that white noise leaves in each phasor component, (channels,) (T^2).
-
-    A tone fitted to ``N = T rate`` samples of variance ``d^2 rate / 2`` (``d`` the one-sided
-    density) has the variance ``2 / N`` of theirs in its cosine and in its sine: ``d^2 / T``,
-    whatever the rate.  Coils driven in turn share the window.
-    """
-    slots = [slot for b in site.beacons for _, slot in b.tones]
-    turns = 1 + max((slot for slot in slots if slot is not None), default=0)
-    dwell = np.array([window if slot is None else window / turns for slot in slots])
-    return site.platform.magnetometer.noise_density**2 / dwell
-
-
 def coverage(
     site: Site,
     position_world: Array,
@@ -140,6 +127,7 @@ def coverage(
     survey: bool = True,
     attitude_known: bool = False,
     world_from_body: Array | None = None,
+    risk: Risk | None = None,
 ) -> Coverage:
     """Return the Cramér-Rao bound of the pose at each point, from the fields of one window.
 
@@ -160,10 +148,13 @@ def coverage(
         Take the attitude from elsewhere, without error.
     world_from_body : ndarray, shape (3, 3), optional
         Level and along the world's axes where it is not given.
+    risk : Risk, optional
+        What protection levels are to promise; they are found only where it is given.
     """
     attitude = np.eye(3) if world_from_body is None else world_from_body
     variance, calibration = phasor_variance(site, window), initial_calibration(site, 0.0)
     blocks = choose_blocks(site, SURVEY_GROUPS if survey else ("phase",))
+    prior = prior_of(site, blocks)
     sensor = position_world + attitude @ site.platform.magnetometer.position_body
     centres = np.array([b.position_world for b in site.beacons])
     apart = np.linalg.norm(sensor[:, None] - centres, axis=2).min(axis=1)
@@ -171,14 +162,23 @@ def coverage(
     cov = np.full((len(position_world), 6, 6), np.inf)
     detected = np.full(len(position_world), len(site.beacons))
     determined = np.zeros(len(position_world), dtype=bool)
+    level = None if risk is None else np.full((len(position_world), 2), np.inf)
     for start in range(0, len(far), CHUNK):
         rows = far[start : start + CHUNK]
-        by_pose, by_nuisance, detected[rows] = _whitened(
-            calibration, blocks, variance, attitude, position_world[rows]
-        )
-        by_pose = by_pose[..., 3:] if attitude_known else by_pose
-        cov[rows], determined[rows] = _bound(_root_information(by_pose, by_nuisance, site, blocks))
-    return _summary(position_world, attitude, cov, detected, determined)
+        seen = whitened(calibration, blocks, variance, attitude, position_world[rows])
+        seen = seen.at_known_attitude() if attitude_known else seen
+        detected[rows] = seen.detected
+        cov[rows], determined[rows] = bound(root_information(seen, *prior))
+        if risk is not None and level is not None:
+            without = [
+                bound(root_information(seen.without(beacon), *prior))
+                for beacon in range(len(site.beacons))
+            ]
+            level[rows] = protected((cov[rows], determined[rows]), without, risk)
+    found = _summary(position_world, attitude, cov, detected, determined)
+    if level is None:
+        return found
+    return replace(found, protection_level_m=level[:, 0], protection_level_deg=level[:, 1])
 
 
 def best_extra_beacon(
@@ -232,72 +232,6 @@ def _copy(site: Site, place: Array) -> Beacon:
 def _quantile(sigma: Array, share: float) -> float:
     # Of the sorted values themselves: between a finite and an infinite one nothing lies.
     return float(np.quantile(sigma, share, method="higher"))
-
-
-def _whitened(
-    calibration: Calibration,
-    blocks: tuple[Block, ...],
-    variance: Array,
-    attitude: Array,
-    position_world: Array,
-) -> tuple[Array, Array, IntArray]:
-    """Whitened Jacobians, (n, rows, 6) and (n, rows, nuisances); beacons detected."""
-    site, count = calibration.site, len(position_world)
-    rotation = np.broadcast_to(attitude, (count, 3, 3))
-    value, by_pose, by_nuisance = linearize_channels(
-        calibration, blocks, np.zeros(count), rotation, position_world
-    )
-    phasor = value[..., :3] + 1j * value[..., 3:]
-    noise = variance[:, None, None] * np.eye(3)
-    sensor_world = position_world + attitude @ site.platform.magnetometer.position_body
-    cov = noise + model_error_cov(phasor, model_error(site, sensor_world))
-    sqrt_information = paired_whitening(cov, np.ones(cov.shape[:2], dtype=bool))
-    strong = np.linalg.norm(value, axis=2) > DETECTION_CHI_SQUARE * np.sqrt(variance)
-    owners = np.array([[name == b.name for name, _ in site.channels] for b in site.beacons])
-    detected = np.sum((strong[:, None] & owners).any(axis=2), axis=1)
-    rows = (count, 6 * value.shape[1])
-    return (
-        (sqrt_information @ by_pose).reshape(*rows, 6),
-        (sqrt_information @ by_nuisance).reshape(*rows, by_nuisance.shape[-1]),
-        detected,
-    )
-
-
-def _root_information(
-    by_pose: Array, by_nuisance: Array, site: Site, blocks: tuple[Block, ...]
-) -> Array:
-    """Triangular root of the pose's information with the nuisances marginalised.
-
-    By QR of Jacobian and prior: where the survey is fine and the field strong, the difference of
-    normal matrices would leave only rounding.
-    """
-    free = np.array([b.parameter == PHASE for b in blocks for _ in b.sigma], dtype=bool)
-    spread = prior_sqrt_covariance(site, blocks)
-    spread[free, free] = 1.0
-    count, _, width = by_nuisance.shape
-    prior = np.zeros((count, width, width + by_pose.shape[-1]))
-    prior[:, np.arange(width), np.arange(width)] = ~free
-    stacked = np.concatenate([by_nuisance @ spread, by_pose], axis=2)
-    rows = np.concatenate([stacked, prior], axis=1)
-    missing = max(rows.shape[2] - rows.shape[1], 0)  # fewer channels than unknowns
-    rows = np.pad(rows, ((0, 0), (0, missing), (0, 0)))
-    triangle = np.asarray(np.linalg.qr(rows, mode="r"))
-    return triangle[:, width : rows.shape[2], width:]
-
-
-def _bound(sqrt_information: Array) -> tuple[Array, BoolArray]:
-    """Covariance (n, 6, 6), with no variance for an attitude that is known; infinite where open."""
-    length = np.linalg.norm(sqrt_information, axis=1)
-    length = np.where(length > 0.0, length, 1.0)
-    _, size, axes = np.linalg.svd(sqrt_information / length[:, None])
-    determined = size[:, -1] > OPEN * size[:, 0]
-    spread = np.swapaxes(axes, 1, 2) / np.where(determined[:, None], size, 1.0)[:, None]
-    spread = spread / length[..., None]
-    cov = np.zeros((len(sqrt_information), 6, 6))
-    known = 6 - sqrt_information.shape[-1]
-    cov[:, known:, known:] = spread @ np.swapaxes(spread, 1, 2)
-    cov[~determined] = np.inf
-    return cov, determined
 
 
 def _summary(
