@@ -1,12 +1,12 @@
 """Import of bags of ROS 2, SQLite or MCAP, and of ROS 1, without ROS."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Connection
-from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
@@ -21,6 +21,10 @@ from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
 from magfusion.units import Array, IntArray
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
 
 BAG_SUFFIXES = (".mcap", ".db3", ".bag")
 
@@ -43,7 +47,7 @@ class _Stream:
     time_ns: IntArray
     values: Array
 
-    def within(self, span: Span) -> "_Stream":
+    def within(self, span: Span) -> _Stream:
         begin, end = np.searchsorted(self.time_ns, span.bounds_ns)
         return _Stream(self.place, self.msgtype, self.time_ns[begin:end], self.values[begin:end])
 
@@ -87,6 +91,9 @@ def read_bag(
         Where the bag cannot be read, has no topic of a sensor or several of one kind of which
         none was named, or holds messages that no instrument gives.
     """
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
     chosen = topics or Topics()
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:

@@ -6,12 +6,12 @@ out of the bytes.  One message of every part is read by the library, too; where 
 the same to the last bit, or messages are not alike, the library reads them all.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Connection
 
 from magfusion.files.messages import (
     FIELD,
@@ -26,6 +26,10 @@ from magfusion.files.messages import (
 )
 from magfusion.model.progress import Report, quiet
 from magfusion.units import Array, IntArray
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+    from rosbags.interfaces import Connection
 
 PART = 1 << 14  # messages whose bytes are kept
 _DOUBLE = 8  # bytes

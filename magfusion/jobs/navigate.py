@@ -159,7 +159,6 @@ def _refuse_without_beacons(given: set[str]) -> None:
 def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
     from magfusion.files.site import load_site
     from magfusion.files.standard_streams import binary_input, binary_output, until_closed
-    from magfusion.jobs.orientation import run_orientation_stream
     from magfusion.jobs.stream import StreamSettings, run_stream
 
     if settings.site is None:
@@ -171,6 +170,8 @@ def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
         )
     site = load_site(settings.site, without=True)
     if not site.beacons:
+        from magfusion.jobs.orientation import run_orientation_stream
+
         _refuse_without_beacons(given)
         with until_closed():
             streams = (binary_input(), binary_output(), sys.stderr)
