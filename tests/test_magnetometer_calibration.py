@@ -279,9 +279,9 @@ def test_the_rows_of_the_graph_are_the_derivatives_of_their_residuals() -> None:
     mounting = Rotation.random(rng=rng).as_matrix()
     matrix = np.eye(3) + 0.1 * rng.standard_normal((3, 3))
     offset = 1e-6 * rng.standard_normal(3)
-    prior = Prior(mounting, matrix, offset, PRIOR_COV, FIELD_LEVEL, 0.1, 9.8, 0.1)
+    prior = Prior(mounting, matrix, offset, PRIOR_COV, FIELD_LEVEL, 0.1, 9.8, 0.1, size_sigma=1.0)
     problem = Readings(epochs, prior)
-    calibration = problem.declared + 0.1 * rng.standard_normal(16)
+    calibration = problem.declared + 0.1 * rng.standard_normal(17)
 
     def state(turn: np.ndarray, step: np.ndarray) -> Estimate:
         values = gtsam.Values()
@@ -290,11 +290,11 @@ def test_the_rows_of_the_graph_are_the_derivatives_of_their_residuals() -> None:
             values.insert(gtsam.symbol("x", i), moved)
         return Estimate(values, calibration + step)
 
-    still, no_step = np.zeros(3), np.zeros(16)
+    still, no_step = np.zeros(3), np.zeros(17)
     _, by_attitude, by_calibration = problem.rows(state(still, no_step))
     turned = central_difference(lambda w: problem.rows(state(w, no_step))[0], 3, 1e-5)
     np.testing.assert_allclose(by_attitude, turned, rtol=1e-6, atol=1e-6)
-    stepped = central_difference(lambda s: problem.rows(state(still, s))[0], 16, 1e-5)
+    stepped = central_difference(lambda s: problem.rows(state(still, s))[0], 17, 1e-5)
     np.testing.assert_allclose(by_calibration, stepped, rtol=1e-6, atol=1e-6)
 
 

@@ -20,7 +20,7 @@ from magfusion.model.strapdown import triad
 from magfusion.units import Array
 
 GYRO_BIAS_KEY = gtsam.symbol("g", 0)
-COLUMNS = 16  # matrix, offset, dip, accelerometer bias
+COLUMNS = 17  # matrix, offset, dip, accelerometer bias, size of the field
 MOST_STEPS = 40
 SETTLED = 1e-9  # relative decrease of the cost that ends the loop
 ATTITUDE_STEP, GYRO_BIAS_STEP = np.full(3, 0.3), np.full(3, 0.01)  # rad, rad/s
@@ -72,9 +72,11 @@ class Prior:
     cov : ndarray, shape (12, 12)
         Of the matrix, row by row, and the offset (1, T).
     field_world : ndarray, shape (3,)
-        Earth field (T); its size is fixed, which sets the scale of the matrix.
+        Earth field (T); where its size is fixed it sets the scale of the matrix.
     dip_sigma : float
         Of the angle between field and vertical (rad).
+    size_sigma : float
+        Of the size of the field, over its size.
     gravity : float
         (m/s^2)
     accel_bias_sigma, gyro_bias_sigma : float
@@ -90,6 +92,7 @@ class Prior:
     gravity: float = 9.80665
     accel_bias_sigma: float = 0.0
     gyro_bias_sigma: float = 0.0
+    size_sigma: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +111,8 @@ class GraphFit:
         Predicted less measured, over sigma.
     chi_square : float
         Of all factors.
+    size_ratio : float
+        Size of the field, as found, over that of the prior.
     """
 
     fit: MagnetometerFit
@@ -118,12 +123,13 @@ class GraphFit:
     field_residual: Array
     chi_square: float
     iterations: int
+    size_ratio: float = 1.0
 
 
 class Readings:
     """What all epochs read, in units of the field and of gravity, which keep all numbers near one.
 
-    The calibration is what is estimated of the sixteen columns.
+    The calibration is what is estimated of the seventeen columns.
     """
 
     def __init__(self, epochs: Epochs, prior: Prior) -> None:
@@ -136,11 +142,13 @@ class Readings:
         if epochs.accel_body is not None and epochs.accel_sigma is not None:
             self.force = epochs.accel_body / prior.gravity
             self.force_weight = prior.gravity / epochs.accel_sigma[:, None]
-        self.unit = np.concatenate([np.ones(9), np.full(3, 1.0 / self.size), np.ones(4)])
+        self.unit = np.concatenate([np.ones(9), np.full(3, 1.0 / self.size), np.ones(5)])
         self.active = np.ones(COLUMNS, dtype=bool)
         self.active[12] = prior.dip_sigma > 0.0
-        self.active[13:] = self.force is not None and prior.accel_bias_sigma > 0.0
+        self.active[13:16] = self.force is not None and prior.accel_bias_sigma > 0.0
+        self.active[16] = prior.size_sigma > 0.0
         self.declared = np.zeros(COLUMNS)
+        self.declared[16] = 1.0
         self.declared[:12] = np.concatenate([prior.matrix.ravel(), prior.offset / self.size])
 
     def prior_cov(self) -> Array:
@@ -148,11 +156,12 @@ class Readings:
         cov = np.zeros((COLUMNS, COLUMNS))
         cov[:12, :12] = self.prior.cov * np.outer(self.unit[:12], self.unit[:12])
         cov[12, 12] = self.prior.dip_sigma**2
-        cov[13:, 13:] = (self.prior.accel_bias_sigma / self.prior.gravity) ** 2 * np.eye(3)
+        cov[13:16, 13:16] = (self.prior.accel_bias_sigma / self.prior.gravity) ** 2 * np.eye(3)
+        cov[16, 16] = self.prior.size_sigma**2
         return cov[np.ix_(self.active, self.active)]
 
     def all_columns(self, estimate: Estimate) -> Array:
-        """Return the sixteen columns: what is estimated among what is fixed."""
+        """Return the seventeen columns: what is estimated among what is fixed."""
         out = self.declared.copy()
         out[self.active] = estimate.calibration
         return out
@@ -169,7 +178,7 @@ class Readings:
         """Return whitened residuals (n, m) with derivatives by attitude and calibration."""
         c, mounting = self.all_columns(estimate), self.prior.body_from_sensor
         body_from_world = np.swapaxes(_attitudes(estimate.values, self.n), -1, -2)
-        field_world, by_dip = self.field_at(c[12])
+        field_world, by_dip = (c[16] * of_size_one for of_size_one in self.field_at(c[12]))
         field_body = body_from_world @ field_world
         matrix, field_sensor = c[:9].reshape(3, 3), field_body @ mounting
         sensor_from_body = matrix @ mounting.T
@@ -179,15 +188,16 @@ class Readings:
         by_calibration[:, :, :9] = by_matrix(field_sensor)
         by_calibration[:, :, 9:12] = np.eye(3)
         by_calibration[:, :, 12] = body_from_world @ by_dip @ sensor_from_body.T
+        by_calibration[:, :, 16] = field_sensor @ matrix.T / c[16]
         weight = self.field_weight
         if self.force is None:
             return weight * error, weight * by_attitude, weight * by_calibration[..., self.active]
         up_body = body_from_world[:, :, 2]
         by_bias = np.zeros((self.n, 3, COLUMNS))
-        by_bias[:, :, 13:] = np.eye(3)
+        by_bias[:, :, 13:16] = np.eye(3)
         own = self.force_weight
         return (
-            np.concatenate([weight * error, own * (up_body + c[13:] - self.force)], axis=1),
+            np.concatenate([weight * error, own * (up_body + c[13:16] - self.force)], axis=1),
             np.concatenate([weight * by_attitude, own[..., None] * skew(up_body)], axis=1),
             np.concatenate([weight * by_calibration, own[..., None] * by_bias], axis=1)[
                 ..., self.active
@@ -230,11 +240,12 @@ def fit_graph(epochs: Epochs, prior: Prior, start: MagnetometerFit | None = None
         fit=MagnetometerFit(c[:9].reshape(3, 3), c[9:12], cov[:12, :12]),
         world_from_body=_attitudes(values, readings.n),
         dip_change=float(c[12]),
-        accel_bias_body=prior.gravity * c[13:],
+        accel_bias_body=prior.gravity * c[13:16],
         gyro_bias_body=values.atVector(GYRO_BIAS_KEY) if turned else np.zeros(3),
         field_residual=readings.rows(found.estimate)[0][:, :3],
         chi_square=2.0 * found.cost,
         iterations=found.iterations,
+        size_ratio=float(c[16]),
     )
 
 

@@ -32,6 +32,7 @@ FEWEST_EPOCHS = 20  # of slow turning
 ONE_AXIS = 1.5 * DEGREE  # RMS; a field that wanders less in its second direction saw no turning
 KNOWN_DIP = 3.0 * DEGREE  # sigma; what steel in a building does to a reference field
 UNKNOWN_DIP = 1.0  # rad
+WIDE_SIZE = 10.0  # of the field's size, where nobody declared it
 ACCEL_FLOOR = 0.03  # m/s^2; scale errors of MEMS accelerometers
 GYRO_SCALE = 0.001  # relative; errors of scale and axes of a calibrated MEMS gyro
 SHAKEN = 5  # epochs over which disturbed specific force is looked for
@@ -119,12 +120,11 @@ def calibrate_log(
             accel_sigma=_accel_sigma(readings, site, at_stops),
             turns=turns,
         )
-        with saying(missing):
+        with saying(missing, field_known=site.earth_field_world is not None):
             graph = likeliest(epochs, prior, begun)
-        start = graph.fit
-        if site.earth_field_world is None:
-            with saying(missing):
-                prior, start = _scaled_as_declared(prior, start)
+            start = graph.fit
+            if site.earth_field_world is None:
+                prior = _sized(prior, graph)
         found = replace(known, matrix=start.matrix, offset=start.offset)
         readings = _readings(waveform, imu, site, found, at_stops)
         sigma = _field_sigma(readings, found, prior)
@@ -132,8 +132,6 @@ def calibrate_log(
     rival = rival_offset(epochs, prior, graph)
     if at_stops:
         _refuse_few_stops(distinct(graph.world_from_body), missing)
-    if site.earth_field_world is None:
-        graph = replace(graph, fit=_with_unknown_scale(graph.fit, prior))
     unseen = None if at_stops else _spread_unseen(epochs, prior, graph.fit)
     kept = unseen is not None and _no_better(unseen, readings, known, site.earth_field_world)
     if kept:
@@ -205,7 +203,7 @@ def _refuse_few_stops(found: int, missing: list[str]) -> None:
 
 def _prior(site: Site, readings: SteadyField) -> Prior:
     known, imu = site.platform.magnetometer, site.platform.imu
-    field, dip_sigma = site.earth_field_world, KNOWN_DIP
+    field, dip_sigma, size_sigma = site.earth_field_world, KNOWN_DIP, 0.0
     if field is None:
         field_sensor = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
         field_body = field_sensor @ known.body_from_sensor.T
@@ -213,7 +211,7 @@ def _prior(site: Site, readings: SteadyField) -> Prior:
         up = readings.accel_body / np.linalg.norm(readings.accel_body, axis=1, keepdims=True)
         vertical = float(np.clip(np.median(np.sum(up * field_body, axis=1)) / size, -0.99, 0.99))
         field = size * np.array([0.0, np.sqrt(1.0 - vertical**2), vertical])
-        dip_sigma = UNKNOWN_DIP
+        dip_sigma, size_sigma = UNKNOWN_DIP, WIDE_SIZE
     return Prior(
         body_from_sensor=known.body_from_sensor,
         matrix=known.matrix,
@@ -224,6 +222,7 @@ def _prior(site: Site, readings: SteadyField) -> Prior:
         gravity=site.gravity,
         accel_bias_sigma=imu.accel_bias_sigma,
         gyro_bias_sigma=imu.gyro_bias_sigma,
+        size_sigma=size_sigma,
     )
 
 
@@ -294,26 +293,17 @@ def _turns(
     return tuple(out)
 
 
-def _scaled_as_declared(prior: Prior, fit: MagnetometerFit) -> tuple[Prior, MagnetometerFit]:
-    """Return prior and fit with the field's size that leaves the declared scale.
+def _sized(prior: Prior, graph: GraphFit) -> Prior:
+    """Return the prior about the field's size as it was found.
 
     The first guess of that size is as wrong as the declared offset.
     """
-    scale = float(np.cbrt(np.linalg.det(fit.matrix) / np.linalg.det(prior.matrix)))
-    if not FIELD_SCALES[0] < scale < FIELD_SCALES[1]:
+    if not FIELD_SCALES[0] < graph.size_ratio < FIELD_SCALES[1]:
         raise EstimationError(
-            f"the scale of the magnetometer comes out {scale:.3g} times the declared one; declare"
-            " its offset, or the Earth field (earth_field_t)"
+            f"the size of the field comes out {graph.size_ratio:.3g} times that of the readings;"
+            " declare the offset of the magnetometer, or the Earth field (earth_field_t)"
         )
-    prior = replace(prior, field_world=scale * prior.field_world)
-    return prior, replace(fit, matrix=fit.matrix / scale)
-
-
-def _with_unknown_scale(fit: MagnetometerFit, prior: Prior) -> MagnetometerFit:
-    """Add the scale, which only the declared matrix gives, to the covariance."""
-    variance = float(np.mean(np.diagonal(prior.cov)[[0, 4, 8]])) / 3.0
-    direction = np.concatenate([fit.matrix.ravel(), np.zeros(3)])
-    return replace(fit, cov=fit.cov + variance * np.outer(direction, direction))
+    return replace(prior, field_world=graph.size_ratio * prior.field_world)
 
 
 def _spread_unseen(epochs: Epochs, prior: Prior, start: MagnetometerFit) -> float | None:

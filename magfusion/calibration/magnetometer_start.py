@@ -122,13 +122,17 @@ def rival_offset(epochs: Epochs, prior: Prior, graph: GraphFit) -> Array | None:
 
 
 @contextmanager
-def saying(missing: list[str]) -> Iterator[None]:
+def saying(missing: list[str], *, field_known: bool) -> Iterator[None]:
     """Add to a failure which orientations were not there, and what to do."""
     try:
         yield
     except EstimationError as failure:
         lack = "".join(f", {sentence}" for sentence in missing)
-        raise EstimationError(f"{failure}{lack}; turn it slowly about all its axes") from failure
+        remedy = "turn it slowly about all its axes"
+        if not field_known:
+            remedy += ", or give the Earth field (earth_field_t): without its size, turning about"
+            remedy += " one axis leaves the offset along that axis open"
+        raise EstimationError(f"{failure}{lack}; {remedy}") from failure
 
 
 def places(field: Array, direction: Array, size: float) -> Array:
