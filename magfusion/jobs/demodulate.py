@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magfusion.errors import InputError
-from magfusion.jobs.settings import Command, LogSettings, WindowSettings
+from magfusion.jobs.settings import Command, LogSettings, RestSettings, WindowSettings
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figure, Figures, heading
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DemodulateSettings(LogSettings, WindowSettings):
+class DemodulateSettings(LogSettings, WindowSettings, RestSettings):
     """How a waveform becomes phasors."""
 
 
@@ -36,8 +36,10 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     from magfusion.estimation.integrity.recording import passed_on
     from magfusion.files.log import write_log
     from magfusion.files.site import save_site
-    from magfusion.jobs.inputs import claim, named, read_job
+    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.model.trust import Trust
     from magfusion.results.report import dropped_figures, write_report
+    from magfusion.results.rest_figures import rest_figures
     from magfusion.results.verdict import trust_figures
 
     claimed, job = claim(output, "demodulate"), settings.job(output)
@@ -49,13 +51,20 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
         )
     report("demodulating", 0, 1)
     with named(job.log_path):
-        samples, dropped = phasors(log, site, lockin)
+        rested = settings.integrated(log, site, lockin)
+        if rested is None:
+            samples, dropped = phasors(log, site, lockin)
+        else:
+            samples, dropped = rested.fields, rested.dropped
         samples = referred(samples, site)
     report("done", 1, 1)
+    trust = passed_on(log, site)
+    if rested is not None:
+        trust |= Trust(rested.findings)
     sigma = np.sqrt(np.trace(samples.phasor_cov, axis1=2, axis2=3) / 3.0)
     figures = (
         heading("demodulate", log.name)
-        | trust_figures(passed_on(log, site))
+        | trust_figures(trust)
         | Figures(
             Figure("epochs", len(samples)),
             Figure("window_s", float(np.median(samples.window)), "s"),
@@ -72,10 +81,14 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
         )
     )
     figures |= dropped_figures(dropped)
-    with claimed as directory:
+    if rested is not None:
+        figures |= rest_figures(rested)
+    with claimed as whole:
+        directory = found_in(whole, trust)
         write_log(replace(log, waveform=None, fields=samples, drive=None), directory)
         save_site(_freed(log, site), directory / "site.yaml")
-        write_report(directory, figures)
+        write_report(whole, figures)
+    refuse_failed(job.log_path, job.output, trust)
     return figures
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from magfusion.errors import InputError
+from magfusion.errors import EstimationError, InputError
 from magfusion.jobs.region import RegionSettings
-from magfusion.jobs.settings import Command, RiskSettings, WindowSettings, option
+from magfusion.jobs.settings import Command, RestSettings, RiskSettings, WindowSettings, option
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figure, Figures, heading
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FixSettings(RegionSettings, WindowSettings, RiskSettings):
+class FixSettings(RegionSettings, WindowSettings, RestSettings, RiskSettings):
     """How an epoch is located.
 
     Parameters
@@ -68,6 +68,8 @@ class FixSettings(RegionSettings, WindowSettings, RiskSettings):
             )
         if self.method != "paper-lines" and self.block is not None:
             raise InputError("--block belongs to --method paper-lines")
+        if self.method != "likelihood" and self.at_rest:
+            raise InputError("--at-rest belongs to --method likelihood; leave one of the two out")
         if self.method != "likelihood" and self.survey is None:
             raise InputError(
                 f"--method {self.method} locates by a survey; name one with --survey SURVEY"
@@ -81,7 +83,7 @@ def run(settings: FixSettings, output: Path, report: Report = quiet) -> Figures:
         return run_published_fix(job, settings)
     free = _free(settings.free)
     lockin = settings.lockin(job)
-    return run_fix(job, lockin=lockin, free=free, risk=settings.risks, report=report)
+    return run_fix(job, lockin=lockin, free=free, risk=settings.risks, rest=settings, report=report)
 
 
 def _free(text: str | None) -> tuple[str, ...]:
@@ -104,6 +106,7 @@ def run_fix(
     lockin: LockinSettings | None = None,
     free: tuple[str, ...] = (),
     risk: Risk | None = None,
+    rest: RestSettings | None = None,
     report: Report = quiet,
 ) -> Figures:
     """Fix the pose at every epoch on its own: every hypothesis, best first.
@@ -115,6 +118,8 @@ def run_fix(
         `magfusion.estimation.integrity.explained_fixes`.
     risk : Risk, optional
         What the protection levels promise.
+    rest : RestSettings, optional
+        Whether each rest is one epoch.
 
     Raises
     ------
@@ -130,6 +135,7 @@ def run_fix(
     from magfusion.model.parameters import initial_calibration
     from magfusion.model.trust import Trust
     from magfusion.results.report import dropped_figures, fix_figures, where_found
+    from magfusion.results.rest_figures import rest_figures
     from magfusion.results.verdict import level_figures, trust_figures
 
     claimed = claim(job.output, "smooth", "fix")
@@ -137,9 +143,18 @@ def run_fix(
     began = time.perf_counter()
     report("demodulating", 0, 3)
     if len(site.platform.magnetometer.axes) == 1:
+        if rest is not None and rest.at_rest:
+            raise InputError(
+                "--at-rest integrates samples of three axes; leave it out for one axis"
+            )
         return _run_coil(claimed, job, log, site, free, report)
     with named(job.log_path):
+        rested = None if rest is None else rest.integrated(log, site, lockin)
+        recording, log = log, log if rested is None else rested.log(log)
         phasor_samples, dropped = phasors(log, site, lockin)
+    hearing = None if rested is None else rested.hearing(site)
+    if rested is not None and not np.any(rested.heard):
+        raise EstimationError(f"{job.log_path}: {rested.findings[0].text}")
     report("fixing", 1, 3)
     calibration = initial_calibration(site, float(np.mean(phasor_samples.time)))
     samples, gravity = fix_inputs(phasor_samples, log, site)
@@ -150,9 +165,11 @@ def run_fix(
     fixes, states = found.fixes, found.states
     first = (fixes.world_from_body, fixes.position_world, fixes.pose_cov)
     trust = found.trust | Trust(of_place(site, fixes.time, *(part[:, 0] for part in first)))
-    trust |= Trust(recorded(log, site, BRIDGED, beacons=True))
+    trust |= Trust(recorded(recording, site, BRIDGED, beacons=True, hearing=hearing))
+    trust |= Trust(() if rested is None else rested.findings)
     figures = heading("fix", log.name) | trust_figures(trust) | fix_figures(fixes, site)
-    figures |= dropped_figures(dropped) | level_figures(states)
+    figures |= dropped_figures(dropped if rested is None else rested.dropped)
+    figures |= level_figures(states) | (Figures() if rested is None else rest_figures(rested))
     figures |= Figures(where_found("gain_spread", found.gain_spread > 0.0, found.gain_spread))
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     with claimed as whole:

@@ -1,0 +1,325 @@
+"""Whole rests as one epoch each: what hours of integration make of beacons far below the noise."""
+
+import itertools
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.integrity.signal import Heard
+from magfusion.model.samples import FieldSamples, Log, Waveform
+from magfusion.model.site import Beacon, Site
+from magfusion.model.strapdown import resting
+from magfusion.model.trust import Finding, Verdict
+from magfusion.receiver.hum import Hum, hum_of
+from magfusion.receiver.integration import (
+    LEAST_LENGTHS,
+    Integrated,
+    Search,
+    chance_of_any,
+    integrated,
+    searched,
+)
+from magfusion.receiver.pieces import Pieces, pieces
+from magfusion.receiver.slots import has_schedule
+from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz, default_settings
+from magfusion.units import Array, BoolArray
+
+HOUR = 3600.0  # s
+TOO_SHORT = "rest too short"
+LONGEST_PIECE = 8.0  # s
+PIECE_TURNS = 8.0  # of the closest tones against each other, in a piece
+UNKNOWN_TURN = 0.2  # of a tone, that an unknown clock may make in a piece that is searched
+LARGEST_WALK = 0.1  # rad; of a phase against its mean, in a rest that is one epoch
+LEAST_RATE = 1e-3  # rad/s; a bias of the gyroscope may look like that
+
+
+@dataclass(frozen=True, eq=False)
+class AtRest:
+    """The rests of a log, an epoch each.
+
+    Parameters
+    ----------
+    fields : FieldSamples
+        Synchronised beacons are there whether or not they are heard; of others a phase that is not
+        heard is none.
+    chance : ndarray, shape (n, channels)
+        Probability that noise alone is so loud, with all frequencies that were tried.
+    heard : bool ndarray, shape (n, channels)
+        Where that is less than was asked.
+    dropped : mapping
+        Reason to number of rests.
+    findings : tuple of Finding
+        What is not heard, and how weak it must be.
+    """
+
+    fields: FieldSamples
+    chance: Array
+    heard: BoolArray
+    dropped: Mapping[str, int]
+    findings: tuple[Finding, ...] = ()
+
+    def log(self, log: Log) -> Log:
+        """Return a log with these epochs in place of its waveform."""
+        noticed = (*log.noticed, *self.findings)
+        return replace(log, waveform=None, fields=self.fields, drive=None, noticed=noticed)
+
+    def amplitude(self) -> Array:
+        """Return the sizes of phasors, freed of what noise adds to a square, (n, channels) (T)."""
+        size = np.sum(np.abs(self.fields.phasor_sensor) ** 2, axis=-1)
+        noise = 2.0 * np.trace(self.fields.phasor_cov, axis1=-2, axis2=-1)
+        return np.sqrt(np.maximum(size - noise, 0.0))
+
+    def hearing(self, site: Site) -> Heard:
+        """Return how each beacon is heard, by its loudest tone."""
+        names = tuple(b.name for b in site.beacons)
+        size = self.amplitude()
+        sigma = np.sqrt(np.trace(self.fields.phasor_cov, axis1=-2, axis2=-1) / 3.0)
+        own = [[c for c, (b, _) in enumerate(site.channels) if b == name] for name in names]
+        loudest = [np.nanmax(np.nan_to_num(size[:, c]), axis=1) for c in own]
+        snr = [np.nanmax(np.nan_to_num(size[:, c] / sigma[:, c]), axis=1) for c in own]
+        loud = [np.any(self.heard[:, c], axis=1) for c in own]
+        return Heard(
+            self.fields.time,
+            names,
+            np.stack(snr, axis=1),
+            np.stack(loudest, axis=1),
+            np.stack(loud, axis=1),
+        )
+
+
+def at_rest(
+    log: Log, site: Site, lockin: LockinSettings | None = None, false_alarm: float = 1e-3
+) -> AtRest:
+    """Return the rests of a log with a waveform, an epoch each.
+
+    Parameters
+    ----------
+    lockin : LockinSettings, optional
+        Length of the pieces, and the mains; chosen by the tones where there is none.
+    false_alarm : float
+        Probability that a rest without a beacon is taken for one with it.
+
+    Raises
+    ------
+    InputError
+        Where there is no waveform, no long rest, or coils are driven in time slots.
+    """
+    waveform = log.waveform
+    if waveform is None:
+        raise InputError("holds no magnetometer.parquet to integrate at rest; give the raw log")
+    if has_schedule(site):
+        raise InputError("--at-rest integrates tones, and a beacon has time slots; leave it out")
+    usual = default_settings(site)
+    given = usual if lockin is None else lockin
+    longest = _coherent(site)
+    dropped = Counter[str]()
+    parts = []
+    for span in rests(log, site):
+        length = _piece(site, usual, lockin, span[1] - span[0])
+        if length is None:
+            dropped[TOO_SHORT] += 1
+            continue
+        count = int(np.ceil((span[1] - span[0]) / longest))
+        ends = np.linspace(*span, count + 1)
+        for begin, end in itertools.pairwise(ends):
+            parts.append(_rest(waveform, (float(begin), float(end)), site, length, given.mains_hz))
+    if not parts:
+        need = LEAST_LENGTHS * usual.window
+        short = f" ({dropped[TOO_SHORT]} are shorter)" if dropped else ""
+        raise InputError(
+            f"--at-rest: the log has no rest of {need:.3g} s{short}; leave the platform longer, or"
+            " declare platform.motion by how it vibrates"
+        )
+    fields = FieldSamples.joined([fields for fields, _ in parts])
+    chance = np.concatenate([chance for _, chance in parts])
+    heard = chance < false_alarm
+    findings = _unheard(fields, heard, site, false_alarm)
+    free = np.array([not _beacon(site, name).synchronised for name, _ in site.channels])
+    gone = free & ~heard
+    phasor = np.where(gone[..., None], np.nan, fields.phasor_sensor)
+    fields = replace(fields, phasor_sensor=phasor)
+    return AtRest(fields, chance, heard, dropped, findings)
+
+
+def rests(log: Log, site: Site) -> list[tuple[float, float]]:
+    """Return beginning and end of each stretch in which the platform rests (s).
+
+    Without inertial samples who asks for rest is believed: it is the whole log.
+    """
+    assert log.waveform is not None
+    first, last = float(log.waveform.time[0]), float(log.waveform.time[-1])
+    if not log.inertial:
+        return [(first, last)]
+    stamps = log.imu.time + site.platform.imu.time_offset
+    gyro, motion = log.imu.gyro_body, site.platform.motion
+    still = resting(stamps, gyro, log.imu.accel_body, motion=motion)
+    still[1:] &= np.diff(stamps) < motion.rest_span
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
+    slow = max(LEAST_RATE, 5.0 * site.platform.imu.gyro_bias_sigma)
+    found = []
+    for begin, end in edges.reshape(-1, 2):
+        # A turn that is even has a quiet gyroscope, too.
+        turns = np.linalg.norm(np.mean(gyro[begin:end], axis=0)) > slow
+        span = max(float(stamps[begin]), first), min(float(stamps[end - 1]), last)
+        # What a half span before the first sample was quiet, too, is at rest.
+        ends = begin == np.argmax(still), end == len(still) - np.argmax(still[::-1])
+        half = 0.5 * motion.rest_span
+        span = (
+            first if ends[0] and span[0] - first < 2.0 * half else span[0],
+            last if ends[1] and last - span[1] < 2.0 * half else span[1],
+        )
+        if not turns and span[1] > span[0]:
+            found.append(span)
+    return found
+
+
+def _beacon(site: Site, name: str) -> Beacon:
+    return next(b for b in site.beacons if b.name == name)
+
+
+def _piece(
+    site: Site, usual: LockinSettings, lockin: LockinSettings | None, duration: float
+) -> float | None:
+    """Return the length of pieces for a rest (s); None where it is too short for any."""
+    most = duration / LEAST_LENGTHS
+    if lockin is not None and lockin.window != usual.window:
+        return lockin.window if lockin.window <= most else None
+    lines = np.sort(np.append(channel_frequencies_hz(site), 0.0))
+    spacing = float(np.min(np.diff(lines)))
+    wanted = min(max(PIECE_TURNS / spacing, usual.window), LONGEST_PIECE)
+    for beacon in site.beacons:
+        if not beacon.synchronised:
+            highest = float(np.max(beacon.tone_frequencies_hz))
+            wanted = min(wanted, UNKNOWN_TURN / (site.clock.drift_largest * highest))
+    length = min(max(wanted, usual.window), most)
+    return length if length >= usual.window else None
+
+
+def _coherent(site: Site) -> float:
+    """Return how long a rest may be one epoch (s): as long as phases and clocks stay."""
+    duration = 1000.0 * HOUR
+    while _walk(site, float(np.max(channel_frequencies_hz(site))), duration) > LARGEST_WALK**2:
+        duration *= 0.9
+    return duration
+
+
+def _walk(site: Site, frequency_hz: float, duration: float) -> float:
+    """Return the variance of a phase's mean over a rest against that at its middle (rad^2).
+
+    Of a random walk of phase, and of one of frequency.
+    """
+    clock = site.clock
+    phase = clock.phase_walk**2 / HOUR * duration / 12.0
+    drift = (2.0 * np.pi * frequency_hz * clock.drift_walk) ** 2 / HOUR * duration**3 / 320.0
+    return float(phase + drift + clock.log_moment_walk**2 / HOUR * duration / 12.0)
+
+
+def _rest(
+    waveform: Waveform, span: tuple[float, float], site: Site, length: float, mains_hz: float
+) -> tuple[FieldSamples, Array]:
+    """Return the epoch of a rest, and the chance of each channel to be noise, (1, channels)."""
+    rows = slice(*np.searchsorted(waveform.time, span))
+    wave = Waveform(waveform.time[rows], waveform.measured_sensor[rows])
+    hum = hum_of(wave, mains_hz)
+    time, nominal_hz = 0.5 * (span[0] + span[1]), channel_frequencies_hz(site)
+    found, sent_hz, searches = _at_their_frequencies(wave, span, site, length, hum)
+    found = _at_declared_drives(found, site, time)
+    single = [integrated(found, c, time) for c in range(len(nominal_hz))]
+    phase = np.exp(2j * np.pi * (sent_hz - nominal_hz) * time)
+    cov = np.stack(
+        [
+            one.cov + _wandered(one, site, float(nominal_hz[c]), span[1] - span[0], name)
+            for c, (one, (name, _)) in enumerate(zip(single, site.channels, strict=True))
+        ]
+    )
+    fields = FieldSamples(
+        time=np.array([time]),
+        window=np.array([span[1] - span[0]]),
+        channels=site.channels,
+        phasor_sensor=(np.stack([one.phasor for one in single]) * phase[:, None])[None],
+        phasor_cov=cov[None],
+    )
+    return fields, _chances(single, site, searches)[None]
+
+
+def _at_their_frequencies(
+    wave: Waveform, span: tuple[float, float], site: Site, length: float, hum: Hum | None
+) -> tuple[Pieces, Array, dict[str, Search]]:
+    """Return the pieces of a rest by the frequencies that are sent, these, and how found (Hz)."""
+    sent_hz = channel_frequencies_hz(site).copy()
+    found = pieces(wave, span, sent_hz, length, hum)
+    searches = {}
+    for beacon in site.beacons:
+        if beacon.synchronised:
+            continue
+        tones = [c for c, (name, _) in enumerate(site.channels) if name == beacon.name]
+        search = searched(found, tones, sent_hz, site.clock.drift_largest)
+        searches[beacon.name] = search
+    for c, (name, _) in enumerate(site.channels):
+        if name in searches:
+            sent_hz[c] *= 1.0 + searches[name].drift
+    return (pieces(wave, span, sent_hz, length, hum) if searches else found), sent_hz, searches
+
+
+def _at_declared_drives(found: Pieces, site: Site, time: float) -> Pieces:
+    """Return pieces as they were at the currents of a rest's middle, where these were recorded."""
+    if site.drives is None:
+        return found
+    phasor = found.phasor.copy()
+    for c, (name, tone) in enumerate(site.channels):
+        own = site.drives.at(name, tone, np.append(found.centre, time))
+        if own is not None:
+            share = np.exp(own[0] + 1j * own[1])
+            phasor[:, c] *= (share[-1] / share[:-1])[:, None]
+    return replace(found, phasor=phasor)
+
+
+def _wandered(
+    one: Integrated, site: Site, frequency_hz: float, duration: float, name: str
+) -> Array:
+    """Return the covariance of what the drive wanders within a rest, shape (3, 3) (T^2)."""
+    variance = _walk(site, frequency_hz, duration)
+    square = np.real(np.outer(one.phasor, np.conj(one.phasor)))
+    if not _beacon(site, name).synchronised:
+        solved = np.linalg.solve(one.cov, one.phasor)
+        ratio = float(np.real(np.conj(one.phasor) @ solved))
+        variance += (one.centroid / one.spread) ** 2 / max(ratio, 1.0)
+    return np.asarray(variance * square)
+
+
+def _chances(single: list[Integrated], site: Site, searches: Mapping[str, Search]) -> Array:
+    own = [one.chance for one in single]
+    for name, search in searches.items():
+        tones = [c for c, (beacon, _) in enumerate(site.channels) if beacon == name]
+        together = chance_of_any([own[c] for c in tones], search.trials)
+        for c in tones:
+            own[c] = together
+    return np.array(own)
+
+
+def _unheard(
+    fields: FieldSamples, heard: BoolArray, site: Site, false_alarm: float
+) -> tuple[Finding, ...]:
+    """Return what is said of the tones that are not told from noise, in no rest."""
+    below = []
+    sigma = np.sqrt(np.trace(fields.phasor_cov, axis1=-2, axis2=-1) / 3.0)
+    size = np.sqrt(np.sum(np.abs(fields.phasor_sensor) ** 2, axis=-1))
+    for c in np.flatnonzero(~heard.any(axis=0)).tolist():
+        name, tone = site.channels[c]
+        most = float(np.min(size[:, c] + 2.0 * sigma[:, c]))
+        which = f"{name}, tone {tone}" if (name, 1) in site.channels else name
+        below.append(f"{which} (below {most:.2g} T)")
+    if not below:
+        return ()
+    none = not np.any(heard)
+    text = (
+        f"Below the noise, at a false-alarm rate of {false_alarm:g} a rest: {', '.join(below)}."
+        " Rest longer, come nearer, or send louder."
+    )
+    if none:
+        text = f"no beacon is heard. {text}"
+    verdict = Verdict.FAILED if none else Verdict.TRUSTWORTHY
+    return (Finding("low_signal", text, verdict, 1e3 if none else 1.0),)

@@ -1,0 +1,89 @@
+"""Hum of the mains that wanders: its frequency is followed, so that its harmonics can be fitted."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.model.samples import Waveform
+from magfusion.units import Array, ComplexArray
+
+SPAN = 1.0  # s; of the looks by which it is followed, which overlap by half
+MOST_ORDERS = 6
+HIGHEST = 0.95  # of half the sampling rate
+COHERENT = 0.5  # of one look with the next; noise has a sixth
+SMOOTHED = 5  # looks
+
+
+@dataclass(frozen=True, eq=False)
+class Hum:
+    """The mains through a record.
+
+    Parameters
+    ----------
+    frequency_hz : float
+        Its mean.
+    orders : ndarray, shape (harmonics,)
+        That the sampling rate shows.
+    time, turns : ndarray, shape (n,)
+        How many turns it has made at times (s).
+    """
+
+    frequency_hz: float
+    orders: Array
+    time: Array
+    turns: Array
+
+    def angle(self, time: Array) -> Array:
+        """Return the phase of the fundamental at times, of their shape (rad)."""
+        beyond = np.maximum(time - self.time[-1], 0.0) + np.minimum(time - self.time[0], 0.0)
+        inside = np.interp(time, self.time, self.turns)
+        return np.asarray(2.0 * np.pi * (inside + self.frequency_hz * beyond))
+
+
+def hum_of(waveform: Waveform, mains_hz: float) -> Hum | None:
+    """Return the mains of a waveform at rest: followed where they stand out of the noise.
+
+    Parameters
+    ----------
+    mains_hz : float
+        About its frequency; none where it is zero.
+    """
+    step = float(np.median(np.diff(waveform.time)))
+    orders = np.arange(1.0, MOST_ORDERS + 1.0)
+    orders = orders[orders * mains_hz < HIGHEST * 0.5 / step]
+    if mains_hz <= 0.0 or not len(orders):
+        return None
+    begin, end = float(waveform.time[0]), float(waveform.time[-1])
+    nominal = Hum(mains_hz, orders, np.array([begin, end]), mains_hz * np.array([begin, end]))
+    centre = np.arange(begin + 0.5 * SPAN, end - 0.5 * SPAN, 0.5 * SPAN)
+    if len(centre) < 2 * SMOOTHED:
+        return nominal
+    looks = _looks(waveform, centre, mains_hz * orders, step)
+    beside = np.sum(np.conj(looks[:-1]) * looks[1:], axis=-1)
+    power = np.sum(np.abs(looks) ** 2, axis=(0, 2))
+    coherence = np.abs(np.sum(beside, axis=0)) / np.maximum(power, 1e-300)
+    best = int(np.argmax(np.where(coherence > COHERENT, power, -1.0)))
+    if coherence[best] <= COHERENT:
+        return nominal
+    smooth = np.apply_along_axis(np.convolve, 0, beside[:, best], np.ones(SMOOTHED), "same")
+    off = np.angle(smooth) / (2.0 * np.pi * orders[best] * 0.5 * SPAN)
+    turns = np.concatenate([[0.0], np.cumsum(0.5 * SPAN * (mains_hz + off))])
+    return Hum(mains_hz + float(np.mean(off)), orders, centre, turns)
+
+
+def _looks(waveform: Waveform, centre: Array, frequencies_hz: Array, step: float) -> ComplexArray:
+    """Return the phasors of short looks, shape (looks, frequencies, 3)."""
+    reach = int(SPAN / step)
+    first = np.searchsorted(waveform.time, centre - 0.5 * SPAN)
+    out = np.zeros((len(centre), len(frequencies_hz), 3), dtype=np.complex128)
+    for begin in range(0, len(centre), 256):
+        rows = slice(begin, begin + 256)
+        index = np.minimum(first[rows, None] + np.arange(reach), len(waveform) - 1)
+        time, field = waveform.time[index], waveform.measured_sensor[index]
+        elapsed = time - centre[rows, None]
+        taper = np.where(np.abs(elapsed) < 0.5 * SPAN, np.cos(np.pi * elapsed / SPAN) ** 2, 0.0)
+        field = field - np.mean(field, axis=1, keepdims=True)
+        for k, frequency in enumerate(frequencies_hz):
+            carrier = taper * np.exp(-2j * np.pi * frequency * time)
+            out[rows, k] = np.einsum("nm,nmx->nx", carrier, field)
+    return out

@@ -1,0 +1,199 @@
+"""Pieces of a rest to one phasor a tone, with a covariance that the record itself tells.
+
+The noise about a tone is measured where it is: in the spectrum of the weighted pieces, a few
+resolutions of the whole rest away.  So it need not be white, and what rises towards the tone, as
+its own wandering does, counts as noise.  Pieces that stand out weigh less (Huber), and so do loud
+stretches.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import median_filter
+from scipy.special import gammaln
+from scipy.stats import chi2, f
+
+from magfusion.receiver.pieces import Pieces
+from magfusion.units import Array, ComplexArray
+
+NEAREST, MOST_BESIDE = 2, 12  # resolutions of the rest: the first whose power is noise; how many
+LEAST_BESIDE = 3
+FARTHEST = 0.4  # of the inverse length of a piece, at which its taper still hears
+LEAST_LENGTHS = (NEAREST + LEAST_BESIDE) / FARTHEST  # of a piece, that a rest needs
+LEVEL = 31  # pieces over which the loudness is taken
+HUBER = 2.0  # times the loudness, beyond which a piece weighs less
+ROUNDS = 3
+PER_RESOLUTION = 4  # frequencies that are tried
+
+
+@dataclass(frozen=True, eq=False)
+class Integrated:
+    """One tone of a whole rest.
+
+    Parameters
+    ----------
+    phasor : complex ndarray, shape (3,)
+        (T)
+    cov : ndarray, shape (3, 3)
+        Of its real, and of its imaginary part (T^2).
+    freedom : int
+        Readings behind the covariance.
+    centroid, spread : float
+        Of the weights in time (s).
+    """
+
+    phasor: ComplexArray
+    cov: Array
+    freedom: int
+    centroid: float
+    spread: float
+
+    @property
+    def chance(self) -> float:
+        """Probability that noise alone is so loud: of a trace of Lawley and Hotelling."""
+        white = np.linalg.solve(np.linalg.cholesky(self._sample_cov()), self.phasor)
+        return trace_chance(float(np.sum(np.abs(white) ** 2)), self.freedom)
+
+    def _sample_cov(self) -> Array:
+        return self.cov * (self.freedom - 4.0) / self.freedom
+
+
+def trace_chance(trace: float, freedom: int) -> float:
+    """Return the probability of a larger trace of two vectors of three against their covariance.
+
+    McKeon's approximation by F, with the moments of Lawley's and Hotelling's trace.
+
+    Parameters
+    ----------
+    freedom : int
+        Of the covariance; more than five.
+    """
+    p, q = 3, 2
+    half = 0.5 * (freedom - p - 1)
+    b = (p + 2 * half) * (q + 2 * half) / (2 * (2 * half + 1) * (half - 1))
+    second = 4.0 + (p * q + 2) / (b - 1)
+    c = (2.0 + (p * q + 2) / (b - 1)) / (2 * half)
+    return float(f.sf(trace / freedom / c * second / (p * q), p * q, second))
+
+
+def integrated(found: Pieces, tone: int, time: float) -> Integrated:
+    """Return a tone of a rest, referred as its pieces are.
+
+    Parameters
+    ----------
+    time : float
+        From which centroid and spread are counted (s).
+    """
+    phasor = found.phasor[:, tone]
+    elapsed = found.centre - time
+    weight = _weights(phasor)
+    mean = np.asarray(weight @ phasor)
+    span = float(np.ptp(elapsed)) + found.length
+    most = int(FARTHEST * span / found.length) - NEAREST
+    beside = NEAREST + np.arange(int(np.clip(most, LEAST_BESIDE, MOST_BESIDE)))
+    offsets_hz = np.concatenate([-beside, beside]) / span
+    heard = _heard(offsets_hz * found.length)
+    carrier = np.exp(-2j * np.pi * offsets_hz[:, None] * elapsed)
+    power = ((carrier * weight) @ (phasor - mean)) / heard[:, None]
+    freedom = 2 * len(offsets_hz)
+    sample = np.real(power.T @ np.conj(power)) / freedom
+    # What is left of few readings is too small as often as too large; its inverse is not.
+    cov = sample * freedom / (freedom - 4.0)
+    centroid = float(weight @ elapsed)
+    spread = float(np.sqrt(weight @ (elapsed - centroid) ** 2))
+    return Integrated(mean, cov, freedom, centroid, spread)
+
+
+def _heard(bins: Array) -> Array:
+    """Return how much of a tone a Hann taper hears so many bins away."""
+    return np.asarray(np.sinc(bins) / (1.0 - bins**2))
+
+
+def _weights(phasor: ComplexArray) -> Array:
+    """Return the weights of pieces, of which the sum is one, shape (n,)."""
+    centre = np.median(phasor.real, axis=0) + 1j * np.median(phasor.imag, axis=0)
+    weight = np.ones(len(phasor))
+    for _ in range(ROUNDS):
+        off = np.sum(np.abs(phasor - centre) ** 2, axis=1)
+        usual = float(np.median(off))
+        level = np.maximum(median_filter(off, LEVEL, mode="nearest"), 1e-3 * usual + 1e-300)
+        weight = np.minimum(1.0, HUBER * np.sqrt(level / np.maximum(off, 1e-300))) / level
+        weight /= np.sum(weight)
+        centre = weight @ phasor
+    return np.asarray(weight)
+
+
+@dataclass(frozen=True)
+class Search:
+    """What a search for the frequency of a beacon found.
+
+    Parameters
+    ----------
+    drift : float
+        Relative error of its clock.
+    trials : float
+        Range that was searched (Hz), times the root of the variance of a component's slope by it.
+    """
+
+    drift: float
+    trials: float
+
+
+def searched(found: Pieces, tones: list[int], frequencies_hz: Array, largest: float) -> Search:
+    """Return the relative error of a clock under which tones are loudest.
+
+    Parameters
+    ----------
+    frequencies_hz : ndarray, shape (tones,)
+        By which the pieces were demodulated; of all.
+    largest : float
+        Relative error that is searched, on either side.
+    """
+    centre, half = found.centre, float(np.ptp(found.centre)) + found.length
+    elapsed = centre - np.mean(centre)
+    highest = float(np.max(frequencies_hz[tones]))
+    own = []
+    for tone in tones:
+        phasor = found.phasor[:, tone]
+        weight = _weights(phasor)
+        noise = float(np.median(np.sum(np.abs(phasor) ** 2, axis=1)))
+        own.append(weight[:, None] * phasor / np.sqrt(noise))
+    fine = 1.0 / (PER_RESOLUTION * half * highest)
+    drifts = fine * np.arange(-np.ceil(largest / fine), np.ceil(largest / fine) + 1)
+    best = float(drifts[np.argmax(_loudness(own, tones, frequencies_hz, elapsed, drifts))])
+    for finer in (fine / 4.0, fine / 32.0):
+        near = np.asarray(best + finer * np.arange(-6.0, 7.0))
+        best = float(near[np.argmax(_loudness(own, tones, frequencies_hz, elapsed, near))])
+    slope = float(np.pi * half / np.sqrt(3.0))
+    return Search(best, 2.0 * largest * highest * slope)
+
+
+def _loudness(
+    own: list[ComplexArray], tones: list[int], frequencies_hz: Array, elapsed: Array, drifts: Array
+) -> Array:
+    total = np.zeros(len(drifts))
+    for begin in range(0, len(drifts), 256):
+        rows = slice(begin, begin + 256)
+        for tone, phasor in zip(tones, own, strict=True):
+            turns = frequencies_hz[tone] * drifts[rows, None] * elapsed
+            total[rows] += np.sum(np.abs(np.exp(-2j * np.pi * turns) @ phasor) ** 2, axis=1)
+    return total
+
+
+def chance_of_any(chances: list[float], trials: float) -> float:
+    """Return the probability that noise alone is so loud at some frequency that was searched.
+
+    Davies' bound of the maximum of a chi-square process.
+
+    Parameters
+    ----------
+    chances : list of float
+        Of each tone of a beacon, at its frequency.
+    trials : float
+        As of `Search`.
+    """
+    square = float(sum(chi2.isf(max(c, 1e-300), 6) for c in chances))
+    degrees = 6 * len(chances)
+    size = 0.5 * (degrees - 1) * np.log(0.5 * square) - 0.5 * square - gammaln(0.5 * degrees)
+    crossings = trials / np.sqrt(np.pi) * np.exp(size)
+    return float(min(1.0, chi2.sf(square, degrees) + crossings))

@@ -1,0 +1,39 @@
+"""What is said of whole rests that were integrated."""
+
+import numpy as np
+
+from magfusion.estimation.at_rest import AtRest
+from magfusion.results.figures import Figure, Figures
+
+
+def rest_figures(rested: AtRest) -> Figures:
+    """Return how many rests there are, and how loud each tone is in them.
+
+    Amplitudes are the peak of the field's size, freed of what noise adds, of the median rest.
+    """
+    amplitude, heard = rested.amplitude(), rested.heard
+    channels = rested.fields.channels
+    return Figures(
+        Figure("rests", len(rested.fields)),
+        Figure("rest_s", float(np.sum(rested.fields.window)), "s", label="time at rest"),
+        *(
+            Figure(
+                f"amplitude_{{beacon}}_{tone}_t",
+                float(np.median(np.nan_to_num(amplitude[:, c]))),
+                "T",
+                beacon,
+                label=f"amplitude of tone {tone}",
+            )
+            for c, (beacon, tone) in enumerate(channels)
+        ),
+        *(
+            Figure(
+                f"heard_{{beacon}}_{tone}",
+                int(np.sum(heard[:, c])),
+                "",
+                beacon,
+                label=f"rests that hear tone {tone}",
+            )
+            for c, (beacon, tone) in enumerate(channels)
+        ),
+    )
