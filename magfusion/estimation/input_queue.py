@@ -362,9 +362,10 @@ class Arrivals:
         """Return whether the platform is at rest, as far as is known."""
         stamp = state.time - self.applied_offset
         motion = state.calibration.site.platform.motion
+        if not may_stand(state.velocity_world, state.cov[VELOCITY, VELOCITY], motion):
+            return False
         imu = self.inertial_samples(stamp - motion.rest_span - REACH, stamp + REACH)
-        quiet, cov = quiet_before(imu, np.array([stamp]), motion)[0], state.cov[VELOCITY, VELOCITY]
-        return bool(quiet and may_stand(state.velocity_world, cov, motion))
+        return bool(quiet_before(imu, np.array([stamp]), motion)[0])
 
     def measured(
         self,

@@ -1,6 +1,7 @@
 """Inertial data between field epochs: cut, averaged and preintegrated."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import gtsam
 import numpy as np
@@ -92,6 +93,7 @@ def in_gap(time: Array, grid: Array, usual: float) -> BoolArray:
     return np.asarray(spacing[holding] > GAP_SAMPLES * usual)
 
 
+@lru_cache(maxsize=8)
 def preintegration_parameters(
     imu: ImuModel, gravity: float, *, bridge: bool
 ) -> gtsam.PreintegrationCombinedParams:

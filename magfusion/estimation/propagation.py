@@ -99,7 +99,9 @@ def propagate(
 
     own = steps(state.calibration)
     (link,) = links_between(
-        lambda calibration: [steps(calibration).preintegrated(site)],
+        lambda calibration: [
+            (own if calibration is state.calibration else steps(calibration)).preintegrated(site)
+        ],
         state.calibration,
         blocks,
         lambda found: values_of([state, later_state(found)]),

@@ -13,14 +13,12 @@ from magfusion.units import Array
 def product(a: Array, b: Array) -> Array:
     """Return the products ``a b`` of quaternions, shape (4, ...), scalar first."""
     (p, q, r, s), (w, x, y, z) = a, b
-    return np.stack(
-        [
-            p * w - q * x - r * y - s * z,
-            p * x + q * w + r * z - s * y,
-            p * y - q * z + r * w + s * x,
-            p * z + q * y - r * x + s * w,
-        ]
-    )
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[0] = p * w - q * x - r * y - s * z
+    out[1] = p * x + q * w + r * z - s * y
+    out[2] = p * y - q * z + r * w + s * x
+    out[3] = p * z + q * y - r * x + s * w
+    return out
 
 
 def turned(quaternion: Array, vector: Array) -> Array:

@@ -257,11 +257,7 @@ def resting(
 
 def _variance(centred: Array, lo: IntArray, hi: IntArray) -> Array:
     """Return the sum of the axes' variances over rows from ``lo`` to before ``hi``."""
-    out = np.zeros(len(lo))
-    for axis in centred.T:
-        mean, square = (
-            (total[hi] - total[lo]) / (hi - lo)
-            for total in (np.concatenate([[0.0], np.cumsum(a)]) for a in (axis, axis**2))
-        )
-        out += square - mean**2
-    return out
+    total = np.zeros((len(centred) + 1, 6))
+    np.cumsum(np.concatenate([centred, centred**2], axis=1), axis=0, out=total[1:])
+    mean = (total[hi] - total[lo]) / (hi - lo)[:, None]
+    return np.asarray(np.sum(mean[:, 3:] - mean[:, :3] ** 2, axis=1))

@@ -61,15 +61,15 @@ def cycles(samples: FieldSamples, measured_from_still: Turn, site: Site) -> Fiel
     ----------
     samples : FieldSamples
         As of `whole_cycles`; at least one.
-    measured_from_still : callable
+    measured_from_still : Turn
         As from `magfusion.receiver.turn.turn_of`.
     """
     slots, cycle = schedule(site), _cycle_of(samples, site)
     row, channel = np.nonzero(samples.valid)
     number = int(cycle[-1]) + 1
     time: Array = np.bincount(cycle, samples.time) / np.bincount(cycle)
-    still_from_measured = np.linalg.inv(measured_from_still(samples.time[row]))
-    turn = measured_from_still(time[cycle[row]]) @ still_from_measured
+    still_from_measured = measured_from_still.back(samples.time[row])
+    turn = measured_from_still(time)[cycle[row]] @ still_from_measured
     phasor = np.full((number, *samples.phasor_sensor.shape[1:]), np.nan, dtype=np.complex128)
     phasor[cycle[row], channel] = (turn @ samples.phasor_sensor[row, channel][..., None])[..., 0]
     cov = np.full((number, *samples.phasor_cov.shape[1:]), np.nan)

@@ -283,8 +283,9 @@ class Receiver(ABC):
         # By the clock as declared: what is learnt of it later changes no verdict.
         stamps = imu.time + self.site.platform.imu.time_offset
         verdict = self.admission.verdicts(self.grid, windows, waveform, stamps, self._growth)
-        for k, reason in enumerate(REASONS):
-            self._count(reason, int(np.sum(verdict == k)))
+        counts = np.bincount(verdict + 1, minlength=len(REASONS) + 1)[1:]
+        for reason, count in zip(REASONS, counts.tolist(), strict=True):
+            self._count(reason, count)
         self.without_turn = windows.rows(verdict == REASONS.index(INERTIAL_GAP))
         return windows.rows(verdict < 0)
 
@@ -514,8 +515,9 @@ class SlotReceiver(Receiver):
     ) -> tuple[FieldSamples, int]:
         """Return the phasors of slots from a number on, as `Receiver.pushed`."""
         turn = turn_of(imu, self.site)
-        known = self._values.rows(np.isin(self._values.number, windows.number))
-        fresh = windows.rows(~np.isin(windows.number, known.number))
+        same = self._values.number[:, None] == windows.number
+        known = self._values.rows(np.any(same, axis=1))
+        fresh = windows.rows(~np.any(same, axis=0))
         self._values = known.joined(self._held(waveform, turn, fresh, self.site))
         found, number = demodulate_slots(self._values, turn, self.site, self.settings)
         found = found.rows(number >= since)

@@ -91,7 +91,7 @@ def slot_values(
 
     Parameters
     ----------
-    measured_from_still : callable
+    measured_from_still : Turn
         As from `magfusion.receiver.turn.turn_of`.
     site : Site
         Whose beacons share one schedule.
@@ -108,10 +108,11 @@ def slot_values(
     time = waveform.time[first:last]
     own = Windows(windows.number, windows.centre, windows.first - first, windows.count)
     clean = waveform.measured_sensor[first:last] - site.platform.magnetometer.offset
-    still = _applied(np.asarray(np.linalg.inv(measured_from_still(time))), clean)
+    still = _applied(measured_from_still.back(time), clean)
     place = windows.number % slots.count
-    sums = _slot_sums(time, still, own, slots, carrier[place], settings, rate_hz)
-    noise = _noise(time, still, own, slots, carrier[place], rate_hz)
+    inside = _inside(time, still, own, slots, rate_hz)
+    sums = _slot_sums(inside, carrier[place], settings)
+    noise = _noise(inside, carrier[place], slots, rate_hz)
     turn = measured_from_still(sums.time)
     return SlotValues(
         windows.number,
@@ -142,7 +143,7 @@ def demodulate_slots(
 
     Parameters
     ----------
-    measured_from_still : callable
+    measured_from_still : Turn
         As from `magfusion.receiver.turn.turn_of`.
 
     Returns
@@ -155,8 +156,7 @@ def demodulate_slots(
         The slot of each row.
     """
     slots, pulsed = schedule(site), is_pulsed(site)
-    turn = measured_from_still(values.time)
-    still_from_measured: Array = np.asarray(np.linalg.inv(turn))
+    turn, still_from_measured = measured_from_still.both(values.time)
     still = _applied(still_from_measured, values.value)
     noise = _smoothed_noise(values, still_from_measured, still, slots)
     place = values.number % slots.count
@@ -183,79 +183,91 @@ def demodulate_slots(
     return found, values.number[kept]
 
 
-def _samples_of(windows: Windows) -> tuple[IntArray, IntArray, IntArray]:
-    """Return all samples in slots, the slot of each, and where each slot begins among them."""
+@dataclass(frozen=True, eq=False)
+class _Inside:
+    """The samples of some slots, one slot after the other.
+
+    Parameters
+    ----------
+    owner : int ndarray, shape (samples,)
+        The slot of each.
+    begins : int ndarray, shape (slots,)
+        Where each slot begins among them.
+    time : ndarray, shape (samples,)
+        (s)
+    elapsed : ndarray, shape (samples,)
+        Since the slot began (s).
+    still : ndarray, shape (samples, 3)
+        (T), still axes.
+    hann : ndarray, shape (samples,)
+        Taper over the slot.
+    slot_begin : ndarray, shape (slots,)
+        (s)
+    """
+
+    owner: IntArray
+    begins: IntArray
+    time: Array
+    elapsed: Array
+    still: Array
+    hann: Array
+    slot_begin: Array
+
+
+def _inside(time: Array, still: Array, windows: Windows, slots: Slots, rate_hz: float) -> _Inside:
     owner = np.repeat(np.arange(len(windows.count)), windows.count)
     begins = np.concatenate([[0], np.cumsum(windows.count)[:-1]])
-    sample = np.arange(len(owner)) - begins[owner] + windows.first[owner]
-    return sample, owner, begins
+    sample = np.arange(len(owner)) + (windows.first - begins)[owner]
+    slot_begin, at = windows.centre - 0.5 * slots.duration, time[sample]
+    elapsed = at - slot_begin[owner]
+    hann = 1.0 - np.cos(2.0 * np.pi * (elapsed + 0.5 / rate_hz) / slots.duration)
+    return _Inside(owner, begins, at, elapsed, still[sample], hann, slot_begin)
 
 
-def _hann(time: Array, begin: Array, slots: Slots, rate_hz: float) -> Array:
-    return 1.0 - np.cos(2.0 * np.pi * (time - begin + 0.5 / rate_hz) / slots.duration)
-
-
-def _slot_sums(
-    time: Array,
-    still: Array,
-    windows: Windows,
-    slots: Slots,
-    carrier_hz: Array,
-    settings: SlotSettings,
-    rate_hz: float,
-) -> _Sums:
+def _slot_sums(inside: _Inside, carrier_hz: Array, settings: SlotSettings) -> _Sums:
     """Fit a constant, and beside a carrier its two quadratures, to each slot."""
-    sample, owner, begins = _samples_of(windows)
-    slot_begin = windows.centre - 0.5 * slots.duration
-    begin, at = slot_begin[owner], time[sample]
-    weight = np.ones(len(at))
-    if settings.taper == "hann":
-        weight = _hann(at, begin, slots, rate_hz)
+    at, elapsed, begins = inside.time, inside.elapsed, inside.begins
+    weight = inside.hann if settings.taper == "hann" else np.ones(len(at))
     columns = [np.ones(len(at))]
     if np.any(carrier_hz):
-        angle = 2.0 * np.pi * carrier_hz[owner] * (at - begin)
+        angle = 2.0 * np.pi * carrier_hz[inside.owner] * elapsed
         columns += [np.cos(angle), np.sin(angle)]
-
-    def total(values: Array) -> Array:
-        return np.add.reduceat(values, begins, axis=0)
-
     size = len(columns)
-    normal, spread = np.empty((2, len(begins), size, size))
-    right = np.empty((len(begins), size, 3))
-    for i, a in enumerate(columns):
-        right[:, i] = total((weight * a)[:, None] * still[sample])
-        for j, b in enumerate(columns):
-            normal[:, i, j] = total(weight * a * b)
-            spread[:, i, j] = total(weight**2 * a * b)
+    design = np.stack(columns, axis=1)
+    weighed = weight[:, None] * design
+    normal, spread, right, centre = (
+        np.add.reduceat(values, begins, axis=0)
+        for values in (
+            weighed[:, :, None] * design[:, None],
+            weighed[:, :, None] * weighed[:, None],
+            weighed[:, :, None] * inside.still[:, None],
+            weight * at,
+        )
+    )
     inverse = np.linalg.inv(normal)
     fitted = inverse @ right
     cov = inverse @ spread @ inverse
-    centre = total(weight * at) / total(weight)
+    centre = centre / normal[:, 0, 0]
     if size == 1:
         return _Sums(centre, fitted[:, 0].astype(np.complex128), cov[:, 0, 0])
-    reference = np.exp(-2j * np.pi * carrier_hz * slot_begin)
+    reference = np.exp(-2j * np.pi * carrier_hz * inside.slot_begin)
     value = (fitted[:, 1] - 1j * fitted[:, 2]) * reference[:, None]
     return _Sums(centre, value, 0.5 * (cov[:, 1, 1] + cov[:, 2, 2]))
 
 
-def _noise(
-    time: Array, still: Array, windows: Windows, slots: Slots, carrier_hz: Array, rate_hz: float
-) -> Array:
+def _noise(inside: _Inside, carrier_hz: Array, slots: Slots, rate_hz: float) -> Array:
     """Return the covariance per sample of what is beside the carrier, (n, 3, 3), still axes.
 
     It is the power three cycles a slot away, tapered so that neither carrier nor hum leaks there.
     """
-    sample, owner, begins = _samples_of(windows)
-    slot_begin = windows.centre - 0.5 * slots.duration
-    at = time[sample] - slot_begin[owner]
-    weight = _hann(time[sample], slot_begin[owner], slots, rate_hz)
     away = 3.0 / slots.duration
     above = carrier_hz + away < 0.5 * rate_hz
     probe = np.where(above, carrier_hz + away, carrier_hz - away)
-    turned = weight * np.exp(-2j * np.pi * probe[owner] * at)
-    seen = np.add.reduceat(turned[:, None] * still[sample], begins, axis=0)
-    power = np.add.reduceat(weight**2, begins)
-    return np.asarray(np.einsum("nx,ny->nxy", seen, np.conj(seen)).real / power[:, None, None])
+    turned = inside.hann * np.exp(-2j * np.pi * probe[inside.owner] * inside.elapsed)
+    seen = np.add.reduceat(turned[:, None] * inside.still, inside.begins, axis=0)
+    power = np.add.reduceat(inside.hann**2, inside.begins)
+    cov = seen[:, :, None] * np.conj(seen[:, None])
+    return np.asarray(cov.real / power[:, None, None])
 
 
 def _smoothed_noise(

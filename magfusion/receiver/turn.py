@@ -1,7 +1,7 @@
 """What the gyro tells of a measured field: how it turns against axes that stand still."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,37 @@ from magfusion.model.site import Site
 from magfusion.model.strapdown import turn_at, turn_from_gyro
 from magfusion.units import Array
 
-Turn = Callable[[Array], Array]
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """How the axes of a magnetometer turn against axes that stand still.
+
+    Parameters
+    ----------
+    still_from_body : callable
+        At times (m,), unit quaternions of shape (4, m), scalar first.
+    from_body : ndarray, shape (3, 3)
+        As of `measured_from_body`; no rotation.
+    """
+
+    still_from_body: Callable[[Array], Array]
+    from_body: Array
+
+    def __call__(self, time: Array) -> Array:
+        """Return ``measured_from_still`` at times (m,), shape (m, 3, 3)."""
+        return self.from_body @ matrices(inverse(self.still_from_body(time)))
+
+    def back(self, time: Array) -> Array:
+        """Return ``still_from_measured`` at times (m,), shape (m, 3, 3)."""
+        return matrices(self.still_from_body(time)) @ np.linalg.inv(self.from_body)
+
+    def both(self, time: Array) -> tuple[Array, Array]:
+        """Return ``measured_from_still`` and its inverse, at times (m,)."""
+        still_from_body = matrices(self.still_from_body(time))
+        return (
+            self.from_body @ np.swapaxes(still_from_body, 1, 2),
+            still_from_body @ np.linalg.inv(self.from_body),
+        )
 
 
 def on_clock(
@@ -54,7 +84,7 @@ def standing_in(imu: ImuSamples, silence: tuple[Array, Array]) -> ImuSamples:
 
 
 def turn_of(imu: ImuSamples, site: Site) -> Turn:
-    """Return what gives, at times (m,), the ``measured_from_still`` (m, 3, 3) of a field.
+    """Return how a field turns.
 
     The axes stand still as the body's do at the first inertial sample.
 
@@ -63,8 +93,7 @@ def turn_of(imu: ImuSamples, site: Site) -> Turn:
     imu : ImuSamples
         As from `on_clock`.
     """
-    still_from_body, from_body = body_turn_of(imu), measured_from_body(site)
-    return lambda time: from_body @ matrices(inverse(still_from_body(time)))
+    return Turn(body_turn_of(imu), measured_from_body(site))
 
 
 def body_turn_of(imu: ImuSamples) -> Callable[[Array], Array]:
