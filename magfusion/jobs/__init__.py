@@ -65,6 +65,10 @@ JOBS = {
         "coverage",
         "Show where an installation can navigate: bounds of position and attitude over a volume.",
     ),
+    "design": (
+        "design",
+        "Design an installation: places, axes and frequencies of beacons for a hall.",
+    ),
     "drift": (
         "drift",
         "Test that the online estimators do not drift, on days of simulated data.",

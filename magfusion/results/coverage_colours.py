@@ -18,8 +18,12 @@ COLOURS = {
 
 def bounds(found: Coverage) -> Array:
     """Return the bounds between the colours in equal ratios (m), shape (colours - 1,)."""
-    sigma = found.position_sigma[found.determined]
-    low, high = np.quantile(sigma, [0.05, 0.95]) if len(sigma) else (0.01, 1.0)
+    return bounds_of(found.position_sigma[found.determined])
+
+
+def bounds_of(known: Array) -> Array:
+    """Return the bounds between the colours of lengths that are finite (m)."""
+    low, high = np.quantile(known, [0.05, 0.95]) if len(known) else (0.01, 1.0)
     return np.geomspace(low, max(high, 1.1 * low), len(COLOURS) - 1)
 
 

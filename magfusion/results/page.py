@@ -48,6 +48,7 @@ _CAPTIONS = {
     "calibration": "What the log determined: sigma after over sigma before",
     "check": "Spectrum, signal to noise, and the two free compasses: gravity and steady field",
     "coverage": "Where the installation can navigate",
+    "design": "Protection levels before and after",
     "drift": "Errors and claims over the days",
     "field_map": "Where the beacons' fields differ from their model",
     "magnetometer": "Magnetometer: field before and after",

@@ -141,10 +141,14 @@ def root_information(seen: PoseRows, spread: Array, prior: Array, shared: int = 
     -------
     ndarray, shape (n, k, shared + 6)
     """
-    count, _, width = seen.by_nuisance.shape
+    told = np.any(seen.by_nuisance, axis=(0, 1)) | np.any(prior, axis=0)
+    told[len(told) - shared :] = True
+    # A column of zeros would take a row of the triangle with it that others need.
+    by_nuisance, prior = (seen.by_nuisance @ spread)[..., told], prior[:, told]
+    count, _, width = by_nuisance.shape
     known = np.zeros((count, len(prior), width + seen.by_pose.shape[-1]))
     known[:, :, :width] = prior
-    stacked = np.concatenate([seen.by_nuisance @ spread, seen.by_pose], axis=2)
+    stacked = np.concatenate([by_nuisance, seen.by_pose], axis=2)
     rows = np.concatenate([stacked, known], axis=1)
     missing = max(rows.shape[2] - rows.shape[1], 0)  # fewer channels than unknowns
     rows = np.pad(rows, ((0, 0), (0, missing), (0, 0)))

@@ -1,0 +1,330 @@
+"""Which candidates to take: exchange of one beacon at a time, from several random layouts.
+
+V. V. Fedorov, Theory of Optimal Experiments (1972); H. P. Wynn, J. R. Statist. Soc. B 34 (1972):
+each beacon in turn is exchanged for the candidate that lowers the objective most, until no
+exchange does.  That is a local optimum, so it is sought from several starts.
+
+For the worst protection level a candidate is out as soon as one point is worse than what is
+reached: candidates are compared at the worst points first.  The points themselves are few at
+first; where a layout is worse elsewhere, the points there are added, until there are none.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+
+from magfusion.model.progress import Report, quiet
+from magfusion.model.site import Beacon
+from magfusion.results.design.layout_information import (
+    LayoutInformation,
+    added,
+    pose_covariance,
+)
+from magfusion.units import Array, BoolArray, IntArray
+
+Objective = Literal["worst", "D", "A"]
+LESS = 1e-4  # of the objective; an exchange that gains less is none
+FIRST_POINTS = 24  # compared from the start
+MORE_POINTS = 6  # added in a round, apart from each other
+ROUNDS = 8
+SWEEPS = 20
+DRAWN = 30  # random layouts, of which the best is a start
+STAGES = (3, 8)  # points at which candidates are compared, before all
+AT_ONCE = 3000  # informations in memory at once
+TRIES = 2000  # random layouts in a row that do not keep their distance
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Beacons that may be taken.
+
+    Parameters
+    ----------
+    beacons : tuple of Beacon
+    apart : float
+        Least distance of two beacons (m).
+    """
+
+    beacons: tuple[Beacon, ...]
+    apart: float
+
+    @property
+    def places(self) -> Array:
+        """Where they are, shape (candidates, 3) (m)."""
+        return np.array([beacon.position_world for beacon in self.beacons])
+
+    def beside(self, taken: Sequence[int]) -> BoolArray:
+        """Tell which keep their distance from those that are taken."""
+        places = self.places
+        free = np.ones(len(places), dtype=bool)
+        for other in taken:
+            free &= np.linalg.norm(places - places[other], axis=1) >= self.apart
+        return free
+
+
+@dataclass(frozen=True)
+class Found:
+    """A layout that no exchange betters.
+
+    Parameters
+    ----------
+    chosen : tuple of int
+        Of the candidates.
+    value : float
+        Of the objective, at all points.
+    complete : bool
+        Whether the search came to its end before its time was over.
+    """
+
+    chosen: tuple[int, ...]
+    value: float
+    complete: bool
+
+
+@dataclass(eq=False)
+class Search:
+    """Candidates at the points at which they are compared; points are added to it.
+
+    Parameters
+    ----------
+    information : LayoutInformation
+        At all points.
+    objective : {'worst', 'D', 'A'}
+        Worst protection level (m); mean of the logarithm of the determinant of the position's
+        covariance; mean of its trace (m^2).
+    in_time : callable
+        Whether there is time left.
+    """
+
+    information: LayoutInformation
+    candidates: Candidates
+    objective: Objective
+    in_time: Callable[[], bool] = lambda: True
+    active: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    roots: Array = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
+    standing: Array = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
+
+    def __post_init__(self) -> None:
+        """Take the first points: spread evenly over all, or enough for a mean."""
+        most = FIRST_POINTS if self.objective == "worst" else 2 * FIRST_POINTS
+        count = len(self.information.points)
+        self.add(np.unique(np.linspace(0, count - 1, min(most, count)).astype(int)))
+
+    def add(self, points: IntArray) -> None:
+        """Compare candidates at more points, too."""
+        part = self.information.at(self.information.points[points])
+        roots = np.stack([part.root(beacon) for beacon in self.candidates.beacons])
+        first = not len(self.active)
+        self.roots = roots if first else np.concatenate([self.roots, roots], axis=1)
+        standing = part.standing
+        self.standing = standing if first else np.concatenate([self.standing, standing], axis=1)
+        self.active = np.concatenate([self.active, points])
+
+    def value(self, chosen: Sequence[int]) -> float:
+        """Return the objective of a layout at the points that are compared."""
+        return of_points(self._each(chosen), self.objective)
+
+    def _each(self, chosen: Sequence[int]) -> Array:
+        new = added(self.roots[list(chosen)])
+        return at_each_point(self.information, new, self.standing, self.objective)
+
+    def value_everywhere(self, chosen: Sequence[int]) -> tuple[float, Array]:
+        """Return the objective of a layout at all points, and what each point has of it."""
+        beacons = [self.candidates.beacons[c] for c in chosen]
+        return value_of(self.information, beacons, self.objective)
+
+    def best_in_place_of(self, chosen: Sequence[int], slot: int, value: float) -> tuple[int, float]:
+        """Return the candidate that is best in the place of one, and the objective with it."""
+        others = [c for k, c in enumerate(chosen) if k != slot]
+        rows = np.flatnonzero(self.candidates.beside(others))
+        new = added(self.roots[others])
+        rest = self.standing[0] + np.sum(new, axis=0)
+        parts = [rest - self.standing[0] + kept for kept in self.standing[1:]]
+        parts += [
+            self.standing[0] + np.sum(np.delete(new, k, axis=0), axis=0) for k in range(len(new))
+        ]
+        base = np.stack([rest, *parts], axis=1)  # (points, 1 + beacons, size, size)
+        alone = pose_covariance(rest)  # without the one that is exchanged
+        if self.objective != "worst":
+            found = self._compared(rows, base[:, :1], alone, np.arange(len(self.active)))
+            means = np.mean(found, axis=1)
+            best = int(np.argmin(means))
+            return int(rows[best]), float(means[best])
+        now = self._each(chosen)
+        order = np.argsort(-now, kind="stable")
+        worst = np.zeros(len(rows))
+        starts = [0, *(s for s in STAGES if s < len(order)), len(order)]
+        for start, end in pairwise(starts):
+            found = self._compared(rows, base, alone, order[start:end])
+            worst = np.maximum(worst, np.max(found, axis=1))
+            kept = worst < value * (1.0 - LESS)
+            rows, worst = rows[kept], worst[kept]
+            if not len(rows):
+                return chosen[slot], value
+        best = int(np.argmin(worst))
+        return int(rows[best]), float(worst[best])
+
+    def _compared(self, rows: IntArray, base: Array, alone: Array, points: IntArray) -> Array:
+        """Return what points have of the objective with each candidate, (rows, points)."""
+        size, parts = base.shape[-1], base.shape[1]
+        step = max(AT_ONCE // (len(points) * parts), 1)
+        found = np.empty((len(rows), len(points)))
+        for start in range(0, len(rows), step):
+            some = rows[start : start + step]
+            new = added(self.roots[some][:, points])
+            whole = base[points][None] + new[:, :, None]
+            cov = pose_covariance(whole.reshape(-1, parts, size, size))
+            if self.objective != "worst":
+                each = _of_covariance(cov[:, 0], self.objective)
+            else:
+                own = np.tile(alone[points], (len(some), 1, 1))
+                subset = np.concatenate([cov[:, 1:], own[:, None]], axis=1)
+                each = self.information.levels_of(cov[:, 0], subset)
+            found[start : start + len(some)] = each.reshape(len(some), len(points))
+        return found
+
+
+def value_of(
+    information: LayoutInformation, beacons: Sequence[Beacon], objective: Objective
+) -> tuple[float, Array]:
+    """Return the objective of beacons beside those that stay, and what each point has of it."""
+    new = np.stack([added(information.root(beacon)) for beacon in beacons])
+    each = at_each_point(information, new, information.standing, objective)
+    return of_points(each, objective), each
+
+
+def at_each_point(
+    information: LayoutInformation, new: Array, standing: Array, objective: Objective
+) -> Array:
+    """Return what each point has of the objective, shape (n,).
+
+    Parameters
+    ----------
+    new : ndarray, shape (beacons, n, size, size)
+        Information of each new beacon.
+    standing : ndarray, shape (1 + stay, n, size, size)
+    """
+    whole = standing[0] + np.sum(new, axis=0)
+    cov = pose_covariance(whole)
+    if objective != "worst":
+        return _of_covariance(cov, objective)
+    parts = [whole - standing[0] + kept for kept in standing[1:]]
+    parts += [standing[0] + np.sum(np.delete(new, k, axis=0), axis=0) for k in range(len(new))]
+    return information.levels_of(cov, pose_covariance(np.stack(parts, axis=1)))
+
+
+def _of_covariance(cov: Array, objective: Objective) -> Array:
+    position = cov[..., 3:, 3:]
+    if objective == "A":
+        return np.asarray(np.trace(position, axis1=-2, axis2=-1))
+    return np.asarray(np.linalg.slogdet(position)[1])
+
+
+def of_points(each: Array, objective: Objective) -> float:
+    """Return the objective of what each point has of it."""
+    return float(np.max(each) if objective == "worst" else np.mean(each))
+
+
+def random_layout(
+    candidates: Candidates, count: int, rng: np.random.Generator
+) -> tuple[int, ...] | None:
+    """Return candidates drawn evenly that keep their distance; None where none are found."""
+    for _ in range(TRIES):
+        drawn: list[int] = rng.choice(len(candidates.beacons), count, replace=False).tolist()
+        if all(candidates.beside(drawn[:k])[c] for k, c in enumerate(drawn)):
+            return tuple(drawn)
+    return None
+
+
+def exchanged(search: Search, chosen: tuple[int, ...]) -> tuple[int, ...]:
+    """Exchange one beacon after another, until nothing is gained at the points compared."""
+    value, unchanged, layout = search.value(chosen), 0, list(chosen)
+    for turn in range(SWEEPS * len(layout)):
+        if unchanged == len(layout) or not search.in_time():
+            break
+        slot = turn % len(layout)
+        taken, reached = search.best_in_place_of(layout, slot, value)
+        better = reached < value - LESS * abs(value) and taken != layout[slot]
+        if better:
+            layout[slot], value = taken, reached
+        unchanged = 0 if better else unchanged + 1
+    return tuple(layout)
+
+
+def best_layout(
+    search: Search,
+    count: int,
+    starts: int,
+    rng: np.random.Generator,
+    *,
+    first: tuple[int, ...] | None = None,
+    report: Report = quiet,
+) -> Found | None:
+    """Return the best layout of several starts; None where beacons cannot keep their distance.
+
+    Parameters
+    ----------
+    first : tuple of int, optional
+        A layout to start from, before random ones.
+    """
+    best: Found | None = None
+    for start in range(starts):
+        report("starts of the search", start, starts)
+        if best is not None and not search.in_time():
+            break
+        layout = first if start == 0 and first is not None else _start(search, count, rng)
+        if layout is None:
+            return best
+        found = _settled(search, layout)
+        if best is None or found.value < best.value:
+            best = found
+    report("starts of the search", starts, starts)
+    if best is None:
+        return None
+    return Found(best.chosen, best.value, search.in_time())
+
+
+def _start(search: Search, count: int, rng: np.random.Generator) -> tuple[int, ...] | None:
+    best: tuple[float, tuple[int, ...]] | None = None
+    for _ in range(DRAWN):
+        drawn = random_layout(search.candidates, count, rng)
+        if drawn is None:
+            return None
+        value = search.value(drawn)
+        if best is None or value < best[0]:
+            best = value, drawn
+    return None if best is None else best[1]
+
+
+def _settled(search: Search, layout: tuple[int, ...]) -> Found:
+    """Exchange, and add the points where the layout is worse than where it was compared."""
+    best: Found | None = None
+    for _ in range(ROUNDS):
+        layout = exchanged(search, layout)
+        value, each = search.value_everywhere(layout)
+        if best is None or value < best.value:
+            best = Found(layout, value, complete=True)
+        enough = search.objective != "worst" or value <= search.value(layout) * (1.0 + LESS)
+        if enough or not search.in_time():
+            break
+        search.add(_worst_apart(search, each))
+    assert best is not None
+    return best
+
+
+def _worst_apart(search: Search, each: Array) -> IntArray:
+    """Return the worst points that are not compared yet, none beside another."""
+    points = search.information.points
+    near = 0.1 * float(np.linalg.norm(np.ptp(points, axis=0)))
+    taken: list[int] = []
+    for point in np.argsort(-each, kind="stable").tolist():
+        if point in search.active or each[point] < 0.9 * np.max(each):
+            continue
+        if all(np.linalg.norm(points[point] - points[other]) > near for other in taken):
+            taken.append(point)
+        if len(taken) == MORE_POINTS:
+            break
+    return np.array(taken, dtype=np.int64)

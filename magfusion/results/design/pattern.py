@@ -1,0 +1,174 @@
+"""Beacons made after one that the site has: turned, placed, tuned and of another strength."""
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.model.site import Beacon, Site
+from magfusion.receiver.windows import CLOSEST_TONES_HZ
+from magfusion.units import Array
+
+NO_MOMENT = 0.1  # of the largest; a direction with less has none
+AXES_OFFERED = (3, 7, 13)
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """Where tones may be, and how far apart.
+
+    Parameters
+    ----------
+    low, high : float
+        (Hz)
+    window : float
+        Over which tones must be told apart (s): two of its periods lie between any two.
+    mains_hz : float
+        Its harmonics are kept away from; 0 for none.
+    """
+
+    low: float
+    high: float
+    window: float
+    mains_hz: float
+
+    @property
+    def spacing(self) -> float:
+        """Least distance of tones from each other, from zero and from the mains (Hz)."""
+        return max(2.0 / self.window, CLOSEST_TONES_HZ)
+
+    def free(self, taken: Array) -> Array:
+        """Return tones that may stand beside those that are taken, and beside each other (Hz)."""
+        step = self.spacing / 5.0
+        wanted = np.arange(self.low, self.high * (1.0 + 1e-9), step)
+        found: list[float] = []
+        for frequency in np.round(wanted, 6).tolist():
+            others = [0.0, *taken.tolist(), *found]
+            if self.mains_hz:
+                others.append(self.mains_hz * max(round(frequency / self.mains_hz), 1))
+            nearest = min(abs(frequency - other) for other in others)
+            if nearest >= self.spacing * (1.0 - 1e-9):
+                found.append(frequency)
+        return np.array(found)
+
+
+def pattern_axis(beacon: Beacon) -> Array | None:
+    """Return the axis that says how a beacon is turned, beacon axes; None where no turn matters.
+
+    Of coils in one plane its normal, about which their field turns; of one coil its own axis; of
+    coils in all three directions none.
+    """
+    _, size, axes = np.linalg.svd(np.vstack([beacon.moments_beacon, np.zeros((3, 3))]))
+    strong = int(np.sum(size > NO_MOMENT * size[0]))
+    return None if strong == 3 else np.asarray(axes[0] if strong == 1 else axes[2])
+
+
+def turned(beacon: Beacon, axis_world: Array) -> Beacon:
+    """Return a beacon whose axis points along a unit vector, turned no farther than it must be."""
+    axis = pattern_axis(beacon)
+    if axis is None:
+        return beacon
+    now = beacon.world_from_beacon @ axis
+    if now @ axis_world < 0.0:
+        now = -now  # the other end of the same axis
+    across = np.cross(now, axis_world)
+    sine = float(np.linalg.norm(across))
+    if sine < 1e-12:
+        return beacon
+    turn = Rotation.from_rotvec(across / sine * np.arctan2(sine, now @ axis_world))
+    return replace(beacon, world_from_beacon=turn.as_matrix() @ beacon.world_from_beacon)
+
+
+def axes_offered(beacon: Beacon, count: int) -> Array:
+    """Return the directions among which that of a beacon is chosen, shape (axes, 3), world.
+
+    Parameters
+    ----------
+    count : {3, 7, 13}
+        The world's axes; and the diagonals of a cube; and those of its faces.
+    """
+    axis = pattern_axis(beacon)
+    if axis is None:
+        return np.array([[0.0, 0.0, 1.0]])
+    every = np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
+    first = np.array([v[np.flatnonzero(v)[0]] > 0.0 if v.any() else False for v in every])
+    half = every[first]  # of two opposite directions one
+    kind = np.sum(np.abs(half), axis=1)
+    wanted = {3: (1,), 7: (1, 3), 13: (1, 3, 2)}[count]
+    rows = np.concatenate([half[kind == k] for k in wanted])
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def stronger(beacon: Beacon, factor: float) -> Beacon:
+    """Return a beacon whose moments are so many times as large, its currents with them."""
+    coils = tuple(
+        replace(
+            coil,
+            moment_beacon=factor * coil.moment_beacon,
+            current=None if coil.current is None else factor * coil.current,
+        )
+        for coil in beacon.coils
+    )
+    return replace(beacon, coils=coils)
+
+
+def tuned(beacon: Beacon, frequencies_hz: Array) -> Beacon:
+    """Return a beacon with other frequencies, one for each of its tones in their order."""
+    tones = beacon.tone_frequencies_hz.tolist()
+    new = dict(zip(tones, frequencies_hz.tolist(), strict=True))
+    coils = tuple(
+        coil if coil.frequency_hz is None else replace(coil, frequency_hz=new[coil.frequency_hz])
+        for coil in beacon.coils
+    )
+    own = new.get(beacon.frequency_hz, frequencies_hz[0])
+    return replace(beacon, frequency_hz=float(own), coils=coils)
+
+
+def peak_moment(beacon: Beacon) -> float:
+    """Return the largest moment of a beacon's coils (A m^2)."""
+    return float(np.max(np.linalg.norm(beacon.moments_beacon, axis=1)))
+
+
+def template_of(site: Site, name: str | None) -> Beacon:
+    """Return the beacon of which copies are made, without what belongs to its own place.
+
+    Raises
+    ------
+    InputError
+        Where there is none of that name, or it is driven in time slots.
+    """
+    names = [beacon.name for beacon in site.beacons]
+    if name is not None and name not in names:
+        raise InputError(
+            f"--template {name}: the site has no such beacon; it has {', '.join(names)}"
+        )
+    found = site.beacons[0 if name is None else names.index(name)]
+    for beacon in site.beacons:
+        if any(slot is not None for _, slot in beacon.tones):
+            raise InputError(
+                f"beacon {beacon.name} is driven in time slots, and design chooses frequencies;"
+                " remove the slots from its coils, or plan by coverage --extra-beacon"
+            )
+    return replace(found, field_map=None, hemisphere_beacon=None, unknown=None)
+
+
+def frequencies_for(
+    template: Beacon, count: int, band: Band, kept: tuple[Beacon, ...]
+) -> tuple[Array, Array]:
+    """Return the frequencies of each new beacon, shape (count, tones), and what is still free.
+
+    Raises
+    ------
+    InputError
+        Where there is no room for so many.
+    """
+    taken = np.concatenate([np.zeros(0), *(b.tone_frequencies_hz for b in kept)])
+    free, tones = band.free(taken), len(template.tones)
+    if len(free) < count * tones:
+        raise InputError(
+            f"--band {band.low:g},{band.high:g} has room for {len(free)} tones {band.spacing:g} Hz"
+            f" apart, and {count * tones} are needed; widen it, or give a longer --window"
+        )
+    return free[: count * tones].reshape(count, tones), free[count * tones :]

@@ -1,0 +1,267 @@
+"""A whole design: the candidates of a hall, the search, moments and frequencies."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.model.ground import conductivity_of
+from magfusion.model.progress import Report, quiet
+from magfusion.model.site import Beacon, Site
+from magfusion.model.trust import Risk
+from magfusion.results.design.exchange import (
+    Candidates,
+    Objective,
+    Search,
+    best_layout,
+    random_layout,
+    value_of,
+)
+from magfusion.results.design.layout_information import LayoutInformation
+from magfusion.results.design.pattern import (
+    Band,
+    axes_offered,
+    frequencies_for,
+    pattern_axis,
+    peak_moment,
+    stronger,
+    tuned,
+    turned,
+)
+from magfusion.results.design.tuning import assigned, divided
+from magfusion.results.pose_information import NEAREST
+from magfusion.units import Array
+
+MOST_CANDIDATES = 10_000
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What is to be designed.
+
+    Parameters
+    ----------
+    site : Site
+        With the beacons that stay.
+    template : Beacon
+        Of which copies are placed, with the moment that each may have.
+    count : int
+        Of the copies.
+    places : ndarray, shape (m, 3)
+        Where they may be mounted (m).
+    points : ndarray, shape (n, 3)
+        Where it is to be navigated (m).
+    axes : int
+        Directions in which each may point.
+    apart, clearance : float
+        Least distance of two beacons, and of a beacon from points of use (m).
+    budgeted : bool
+        Whether the moments may be divided otherwise than evenly.
+    """
+
+    site: Site
+    template: Beacon
+    count: int
+    places: Array
+    points: Array
+    band: Band
+    risk: Risk
+    objective: Objective = "worst"
+    axes: int = 7
+    apart: float = 1.0
+    clearance: float = 0.5
+    budgeted: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """What was chosen.
+
+    Parameters
+    ----------
+    site : Site
+        With the beacons that stayed and the new ones.
+    new : tuple of Beacon
+    candidates : int
+        Among which they were chosen.
+    complete : bool
+        Whether the search came to its end in time.
+    random_worst_m : ndarray, shape (layouts,)
+        Worst protection level of random layouts of the same candidates (m).
+    median_random : Site, optional
+        The random layout whose worst level is the median.
+    """
+
+    site: Site
+    new: tuple[Beacon, ...]
+    candidates: int
+    complete: bool
+    random_worst_m: Array
+    median_random: Site | None
+
+
+def designed(
+    task: Task,
+    *,
+    starts: int,
+    layouts: int,
+    rng: np.random.Generator,
+    first: Site | None = None,
+    in_time: Callable[[], bool] = lambda: True,
+    report: Report = quiet,
+) -> Design:
+    """Choose places, axes, moments and frequencies.
+
+    Parameters
+    ----------
+    starts : int
+        Of the search.
+    layouts : int
+        Random ones to compare with.
+    first : Site, optional
+        Whose beacons, as many as are to be placed, are the first start.
+
+    Raises
+    ------
+    InputError
+        Where nothing may be mounted, or not so many so far apart.
+    """
+    tones, free = frequencies_for(task.template, task.count, task.band, task.site.beacons)
+    plain = tuned(task.template, tones[len(tones) // 2])
+    candidates = candidates_of(task, plain)
+    information = LayoutInformation(
+        task.site,
+        plain,
+        task.points,
+        task.band.window,
+        task.risk,
+    )
+    draw, search_rng = rng.spawn(2)
+    drawn = [random_layout(candidates, task.count, draw) for _ in range(layouts)]
+    search = Search(information, candidates, task.objective, in_time)
+    given = None if first is None else _nearest(candidates, first, task)
+    found = best_layout(search, task.count, starts, search_rng, first=given, report=report)
+    if found is None or any(layout is None for layout in drawn):
+        raise InputError(
+            f"{task.count} beacons at least --apart {task.apart:g} m from each other do not find"
+            f" room on {len(np.unique(candidates.places, axis=0))} mounting places; lower --apart"
+            " or --grid"
+        )
+    new = _finished(
+        task, information, [candidates.beacons[c] for c in found.chosen], tones, free, in_time
+    )
+    worst = []
+    for k, layout in enumerate(drawn):
+        report("random layouts", k, len(drawn))
+        beacons = [candidates.beacons[c] for c in layout or ()]
+        worst.append(value_of(information, beacons, "worst")[0])
+    median = None
+    if worst:
+        middle = drawn[int(np.argsort(worst, kind="stable")[(len(worst) - 1) // 2])]
+        own = [tuned(candidates.beacons[c], t) for c, t in zip(middle or (), tones, strict=True)]
+        median = with_beacons(task.site, _named(own, task.site))
+    return Design(
+        with_beacons(task.site, new),
+        new,
+        len(candidates.beacons),
+        found.complete,
+        np.array(worst),
+        median,
+    )
+
+
+def candidates_of(task: Task, beacon: Beacon) -> Candidates:
+    """Return copies of a beacon at every place where one may be, in every direction.
+
+    Raises
+    ------
+    InputError
+        Where there are none, or too many.
+    """
+    places = task.places
+    if len(places):
+        gap = np.array([np.min(np.linalg.norm(task.points - p, axis=1)) for p in places])
+        places = places[gap >= max(task.clearance, NEAREST)]
+    for kept in task.site.beacons:
+        places = places[np.linalg.norm(places - kept.position_world, axis=1) >= task.apart]
+    axes = axes_offered(beacon, task.axes)
+    if len(places) < task.count:
+        raise InputError(
+            f"{len(places)} mounting places are left, and {task.count} are needed: all others are"
+            f" forbidden, nearer than --clearance {task.clearance:g} m to where it is to be"
+            f" navigated, or nearer than --apart {task.apart:g} m to a beacon that stays"
+        )
+    if len(places) * len(axes) > MOST_CANDIDATES:
+        raise InputError(
+            f"{len(places)} mounting places in {len(axes)} directions are more than"
+            f" {MOST_CANDIDATES} candidates; choose a larger --grid, or fewer --axes"
+        )
+    return Candidates(
+        tuple(replace(turned(beacon, axis), position_world=p) for p in places for axis in axes),
+        task.apart,
+    )
+
+
+def with_beacons(site: Site, new: tuple[Beacon, ...]) -> Site:
+    """Return the site with new beacons behind those that it has."""
+    return replace(site, beacons=(*site.beacons, *new))
+
+
+def with_moment(beacon: Beacon, moment: float) -> Beacon:
+    """Return a beacon whose strongest coil has a moment (A m^2)."""
+    return stronger(beacon, moment / peak_moment(beacon))
+
+
+def _finished(
+    task: Task,
+    information: LayoutInformation,
+    chosen: list[Beacon],
+    tones: Array,
+    free: Array,
+    in_time: Callable[[], bool],
+) -> tuple[Beacon, ...]:
+    """Return the beacons chosen with their own frequencies, moments and names."""
+    beacons = tuple(tuned(b, t) for b, t in zip(chosen, tones, strict=True))
+    response = task.site.platform.magnetometer.response
+    if response is not None or task.template.conductivity or conductivity_of(task.site):
+        beacons = assigned(information, beacons, free, task.objective, in_time)
+    if task.budgeted and len(beacons) > 1:
+        beacons, _ = divided(information, beacons, task.objective, in_time)
+    return _named(list(beacons), task.site)
+
+
+def _named(beacons: list[Beacon], site: Site) -> tuple[Beacon, ...]:
+    taken = {beacon.name for beacon in site.beacons}
+    free = (name for name in (f"B{i}" for i in range(1, 1000)) if name not in taken)
+    return tuple(replace(beacon, name=next(free)) for beacon in beacons)
+
+
+def _nearest(candidates: Candidates, first: Site, task: Task) -> tuple[int, ...]:
+    """Return the candidates that are most like the beacons of an earlier design."""
+    kept = {beacon.name for beacon in task.site.beacons}
+    new = [beacon for beacon in first.beacons if beacon.name not in kept]
+    if len(new) != task.count:
+        raise InputError(
+            f"--continue: the earlier design places {len(new)} beacons beside those that stay, and"
+            f" --beacons asks for {task.count}"
+        )
+    chosen: list[int] = []
+    for beacon in new:
+        gap = np.linalg.norm(candidates.places - beacon.position_world, axis=1)
+        gap = np.where(candidates.beside(chosen), gap, np.inf)
+        near = np.flatnonzero(gap <= np.min(gap) + 1e-6)
+        axis = pattern_axis(beacon)
+        alike = [
+            0.0
+            if axis is None
+            else abs(
+                float(
+                    (beacon.world_from_beacon @ axis)
+                    @ (candidates.beacons[k].world_from_beacon @ axis)
+                )
+            )
+            for k in near
+        ]
+        chosen.append(int(near[int(np.argmax(alike))]))
+    return tuple(chosen)

@@ -1,0 +1,98 @@
+"""How a budget of moment is divided among beacons that are placed, and who has which frequency."""
+
+from collections.abc import Callable
+from itertools import permutations
+
+import numpy as np
+
+from magfusion.model.site import Beacon
+from magfusion.results.design.exchange import LESS, Objective, value_of
+from magfusion.results.design.layout_information import LayoutInformation
+from magfusion.results.design.pattern import stronger, tuned
+from magfusion.units import Array
+
+STEPS = (0.2, 0.1, 0.05)  # of a beacon's even share, given from one to another
+LEAST_SHARE = 0.2  # of it, that a beacon keeps
+
+
+def divided(
+    information: LayoutInformation,
+    beacons: tuple[Beacon, ...],
+    objective: Objective,
+    in_time: Callable[[], bool],
+) -> tuple[tuple[Beacon, ...], Array]:
+    """Give moment from one beacon to another as long as that betters the objective.
+
+    Parameters
+    ----------
+    beacons : tuple of Beacon
+        Each with an even share.
+
+    Returns
+    -------
+    beacons : tuple of Beacon
+        Whose moments have the same sum.
+    share : ndarray, shape (beacons,)
+        Of what each had.
+    """
+    share = np.ones(len(beacons))
+
+    def value(shares: Array) -> float:
+        some = [stronger(b, s) for b, s in zip(beacons, shares.tolist(), strict=True)]
+        return value_of(information, some, objective)[0]
+
+    best = value(share)
+    for step in STEPS:
+        gained = True
+        while gained and in_time():
+            gained = False
+            for giver, taker in permutations(range(len(beacons)), 2):
+                other = share.copy()
+                other[giver] -= step
+                other[taker] += step
+                if other[giver] < LEAST_SHARE - 1e-9:
+                    continue
+                reached = value(other)
+                if reached < best - LESS * abs(best):
+                    share, best, gained = other, reached, True
+    found = tuple(stronger(b, s) for b, s in zip(beacons, share.tolist(), strict=True))
+    return found, share
+
+
+def assigned(
+    information: LayoutInformation,
+    beacons: tuple[Beacon, ...],
+    free_hz: Array,
+    objective: Objective,
+    in_time: Callable[[], bool],
+) -> tuple[Beacon, ...]:
+    """Exchange frequencies between beacons, and for free ones, as long as that is better.
+
+    It is only where the ground conducts or the magnetometer does not answer alike to all.
+
+    Parameters
+    ----------
+    free_hz : ndarray, shape (k,)
+        That nobody has.
+    """
+    tones = [b.tone_frequencies_hz for b in beacons]
+    free = free_hz[: len(free_hz) // len(tones[0]) * len(tones[0])].reshape(-1, len(tones[0]))
+    sets = [*tones, *free]
+    order = list(range(len(beacons)))
+
+    def made(numbers: list[int]) -> tuple[Beacon, ...]:
+        return tuple(tuned(b, sets[k]) for b, k in zip(beacons, numbers, strict=True))
+
+    best, gained = value_of(information, made(order), objective)[0], True
+    while gained and in_time():
+        gained = False
+        for slot in range(len(order)):
+            for number in range(len(sets)):
+                other = [order[slot] if k == number else k for k in order]
+                other[slot] = number
+                if other == order:
+                    continue
+                reached = value_of(information, made(other), objective)[0]
+                if reached < best - LESS * abs(best):
+                    order, best, gained = other, reached, True
+    return made(order)

@@ -1,0 +1,64 @@
+"""The command that designs an installation: its files, and what it refuses."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet
+import pytest
+from conftest import Refuse, Worked, run_command
+
+from magfusion.files.site import load_site
+from magfusion.model.trust import Risk
+from magfusion.results.coverage import coverage
+
+FILES = {"coverage.parquet", "design.png", "report.html", "report.json", "run.rrd", "site.yaml"}
+QUICK = ("--box", "0,6,0,5,0,3", "--spacing", 1.5, "--grid", 3, "--axes", 3, "--starts", 1)
+
+
+def test_the_command_writes_a_site_that_has_what_the_report_says(
+    worked: Worked, tmp_path: Path
+) -> None:
+    site, place = worked.log / "site.yaml", tmp_path / "design"
+    keep = ("--beacons", 2, "--keep", "A", "--random", 5)
+    run_command("design", site, "-o", place, *QUICK, *keep)
+    # Goes on from an earlier result, and replaces it.
+    run_command("design", site, "-o", place, *QUICK, *keep, "--continue", place / "site.yaml")
+    assert {path.name for path in place.iterdir()} == FILES
+    report = json.loads((place / "report.json").read_text())
+    made = load_site(place / "site.yaml")
+    assert [b.name for b in made.beacons] == ["A", "B1", "B2"]
+    for beacon in made.beacons[1:]:
+        where = [report[f"{beacon.name}.position_{axis}_m"] for axis in "xyz"]
+        assert np.allclose(where, beacon.position_world, rtol=0, atol=1e-12)
+    table = pyarrow.parquet.read_table(place / "coverage.parquet").to_pydict()
+    points = np.stack([table[f"position_{axis}"] for axis in "xyz"], axis=1)
+    found = coverage(made, points, report["window_s"], risk=Risk())
+    assert found.protection_level_m is not None
+    assert report["protection_level_m_worst"] == pytest.approx(np.max(found.protection_level_m))
+    assert report["random_layouts"] == 5
+    assert report["protection_level_m_worst"] < report["random_worst_level_m_median"]
+    assert report["search_complete"]
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--keep", "A,Z"), "no beacon 'Z'"),
+        (("--template", "Z"), "--template Z"),
+        (("--band", "20"), "--band '20'"),
+        (("--band", "20,21"), "has room for 1 tones"),
+        (("--moment", 1, "--moment-budget", 4), "not both"),
+        (("--spacing", "1e-3"), "--spacing"),
+        (("--beacons", 0), "--beacons"),
+        (("--apart", 100), "--apart 100 m"),
+        (("--hall", "nowhere.yaml", "--box", "0,1,0,1,0,1"), "not both"),
+    ],
+)
+def test_an_option_that_cannot_be_is_refused(
+    options: tuple[object, ...], told: str, worked: Worked, tmp_path: Path, refuse: Refuse
+) -> None:
+    quick = () if "--hall" in options else QUICK
+    assert told in refuse(
+        "design", worked.log / "site.yaml", "-o", tmp_path / "d", *quick, *options
+    )
