@@ -161,7 +161,14 @@ def test_only_solve_optimises() -> None:
     assert fallbacks == 2  # of a whole graph, and of a part of one
 
 
-SIMULATOR_SEES = {"correlation", "physics", "samples", "site", "trajectory"}  # of the model
+SIMULATOR_SEES = {
+    "correlation",
+    "marks",
+    "physics",
+    "samples",
+    "site",
+    "trajectory",
+}  # of the model
 
 
 def test_the_simulator_knows_nothing_of_the_estimators_model() -> None:

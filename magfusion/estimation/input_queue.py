@@ -25,10 +25,11 @@ from magfusion.estimation.preintegration import RATE_SPAN
 from magfusion.estimation.stand_in import StandIn
 from magfusion.estimation.state import MOTION, VELOCITY, State, as_trajectory
 from magfusion.estimation.stream_buffer import Buffer, check_clock
+from magfusion.model.marks import Marks
 from magfusion.model.parameters import CLOCK_RATE, TIME_OFFSET, Block
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
 from magfusion.receiver.receiver import LockinReceiver, Receiver
-from magfusion.units import Array
+from magfusion.units import Array, IntArray
 
 LONGEST_WAIT = 5.0  # s; the fields go on without an IMU that is silent for longer
 OFFSET_STALE = 1e-4  # s; at a radian a second, six thousandths of a degree
@@ -155,6 +156,16 @@ class Arrivals:
         check_clock("magnetometer", stamps, self._newest)
         self.waveform.add(stamps, np.atleast_2d(measured_sensor))
 
+    def add_marks(self, marks: Marks) -> None:
+        """Take bursts of coils, as `Navigator.add_marks`."""
+        check_clock("marks", marks.end, self._newest)
+        self.receiver.hear_marks(marks)
+
+    def add_slots(self, time: Array, slot: IntArray) -> None:
+        """Take slots beside samples, as `Navigator.add_slots`."""
+        check_clock("magnetometer", time, self._newest)
+        self.receiver.hear_slots(time, slot)
+
     def add_fields(self, samples: FieldSamples, steady: SteadyFields | None, after: float) -> int:
         """Take phasors, as `Navigator.add_fields`; return how many are not after a time (s)."""
         check_clock("fields", samples.time, self._newest)
@@ -256,6 +267,7 @@ class Arrivals:
         for buffer in (self.imu, self.waveform):
             buffer.forget(oldest, oldest)
         self.fields = [s for s in self.fields if s.time[0] >= oldest]
+        self.receiver.forget_marks(oldest)
 
     def start(self, start: OnlineStart, delay: float) -> None:
         """Go on from a first state, and drop what it has used; the delay as of `receive`."""

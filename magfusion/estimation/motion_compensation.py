@@ -11,7 +11,6 @@ from magfusion.model.parameters import Calibration, linearize_channels, predict_
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.waveform import Motion, carriers, predicted_waveform
-from magfusion.receiver.admission import Windows
 from magfusion.receiver.lockin import WindowOperator, window_operator
 from magfusion.receiver.receiver import LockinReceiver
 from magfusion.receiver.turn import on_clock
@@ -139,7 +138,7 @@ def demodulate_predicted(
     window = receiver.grid.windows(np.array([number]), waveform.time)
     inside = slice(int(window.first[0]), int(window.first[0] + window.count[0]))
     samples = Waveform(waveform.time[inside], waveform.measured_sensor[inside])
-    alone = Windows(window.number, window.centre, np.zeros(1, dtype=np.int64), window.count)
+    alone = replace(window, first=np.zeros(1, dtype=np.int64))
     calibration = replace(predicted.calibration, time_offset=offset)
     known = on_clock(imu, offset, predicted.gyro_bias_body)
     site, step = calibration.site, receiver.admission.imu_step

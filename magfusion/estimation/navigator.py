@@ -36,6 +36,7 @@ from magfusion.estimation.still_samples import StillSamples
 from magfusion.estimation.warming import heard_at_reference, heard_fields_at_reference
 from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
 from magfusion.model.drive import DriveSamples, DriveShares
+from magfusion.model.marks import Marks
 from magfusion.model.parameters import dimension, placed
 from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.samples import FieldSamples, SteadyFields
@@ -45,7 +46,7 @@ from magfusion.model.trust import Finding
 from magfusion.model.without_imu import on_motion_prior, require_motion_prior
 from magfusion.receiver.drive import DriveReceiver
 from magfusion.receiver.receiver import Receiver
-from magfusion.units import Array
+from magfusion.units import Array, IntArray
 
 
 class Navigator:
@@ -163,6 +164,29 @@ class Navigator:
         self._currents.push(samples)
         self._drives.forget()
         self._update.of_currents = tuple(drive_findings(self._currents, self.site))
+
+    def add_marks(self, marks: Marks) -> None:
+        """Take bursts of coils whose slots are marked, with their samples or up to 0.5 s later.
+
+        Raises
+        ------
+        InputError
+            Where they do not follow those that came, a slot is of no coil, or the clock jumped.
+        """
+        self._arrived.add_marks(marks)
+        self.advance()
+
+    def add_slots(self, time: Array, slot: IntArray) -> None:
+        """Take the slot that is driven at each sample (k,), before the samples themselves.
+
+        ``magfusion.model.marks.SILENT`` where none is, ``UNTOLD`` where nothing is said.
+
+        Raises
+        ------
+        InputError
+            As `add_marks`.
+        """
+        self._arrived.add_slots(time, slot)
 
     def add_temperature(self, part: str, time: float, degc: float) -> None:
         """Take the temperature of a beacon, or of the ``magnetometer``: of what comes after it."""
@@ -359,6 +383,7 @@ class Navigator:
             list(arrived.steady.values()),
             reached,
             self.settings,
+            arrived.receiver.marks,
         )
         longest = 4.0 * self.settings.start_duration
         if isinstance(start, NoStart):

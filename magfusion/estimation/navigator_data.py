@@ -29,6 +29,7 @@ from magfusion.model.parameters import Block, Calibration, dimension, initial_ca
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trust import Verdict
+from magfusion.receiver.marked_bursts import OVERLAP, Bursts
 from magfusion.units import Array
 
 MEASUREMENTS: tuple[type[Measurement], ...] = (FieldPhasors, EarthField, ZeroVelocity, PoseFix)
@@ -88,6 +89,7 @@ def navigator_rules(
             Node: lambda node: _check_node(node, blocks),
             Prior: lambda prior: _check_prior(prior, size),
             Buffer: _check_buffer,
+            Bursts: _check_bursts,
             FieldSamples: lambda f: _check(f.channels == site.channels, "has other channels"),
             SlidingWindow: lambda window: _check_window(window),
         },
@@ -97,6 +99,19 @@ def navigator_rules(
 def _check(right: bool | np.bool_, wrong: str) -> None:
     if not right:
         raise ValueError(wrong)
+
+
+def _check_bursts(bursts: Bursts) -> None:
+    marks = bursts.marks
+    lengths = {
+        len(marks.begin),
+        len(marks.end),
+        len(marks.slot),
+        len(bursts.epochs(bursts.numbers)),
+    }
+    _check(len(lengths) == 1, "has columns of different length")
+    edges = np.stack([marks.begin, marks.end], axis=1).ravel()
+    _check(np.all(np.diff(edges) > -OVERLAP), "has bursts that overlap")
 
 
 def _check_state(state: State, size: int) -> None:

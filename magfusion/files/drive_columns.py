@@ -28,15 +28,19 @@ def column_of(beacon: str) -> str:
 
 def drive_columns(path: Path) -> tuple[str, ...]:
     """Return the columns of currents that a table has; none of what is no table."""
+    names = column_names(path)
+    return tuple(n for n in names if n == COLUMN or (n.startswith(_OF) and n != _OF))
+
+
+def column_names(path: Path) -> list[str]:
+    """Return the columns that a table has; none of what is no table."""
     try:
         if path.suffix == ".csv":
             with path.open(newline="", encoding="utf-8-sig") as stream:
-                names = [name.strip() for name in next(csv.reader(stream), [])]
-        else:
-            names = list(pyarrow.parquet.read_schema(path).names)
+                return [name.strip() for name in next(csv.reader(stream), [])]
+        return list(pyarrow.parquet.read_schema(path).names)
     except (pa.ArrowException, OSError, ValueError, csv.Error):  # refused where it is read
-        return ()
-    return tuple(n for n in names if n == COLUMN or (n.startswith(_OF) and n != _OF))
+        return []
 
 
 def read_drive(path: Path | None, span: Span) -> DriveSamples | None:

@@ -1,6 +1,7 @@
 """A log: a directory of tables and a header."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -18,6 +19,7 @@ from magfusion.files.inertial_tables import (
     write_imu,
     write_waveform,
 )
+from magfusion.files.marks_table import read_marks, write_marks
 from magfusion.files.table import LARGEST_TIME_NS, Span, find_table
 from magfusion.files.temperature_table import read_temperatures, write_temperatures
 from magfusion.files.trajectory_table import read_trajectory, write_trajectory
@@ -28,7 +30,7 @@ from magfusion.model.trust import Finding
 
 HEADER = "log.yaml"
 _NOTHING: tuple[Finding, ...] = ()
-STREAMS = ("imu", "magnetometer", "fields", "truth", "temperature")
+STREAMS = ("imu", "magnetometer", "fields", "truth", "temperature", "marks")
 
 
 class LogHeader(StrictModel):
@@ -83,6 +85,9 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
     if tables["imu"] is not None:
         imu, of_imu = read_imu(tables["imu"], span)
     waveform, of_waveform = read_waveform(tables["magnetometer"], span)
+    marks = read_marks(tables["magnetometer"], tables["marks"], span)
+    if waveform is not None and marks is not None:
+        waveform = replace(waveform, marks=marks)
     log = Log(
         name=header.name,
         epoch_ns=header.epoch_ns,
@@ -122,6 +127,8 @@ def write_log(log: Log, path: Path) -> None:
         if log.waveform is not None:
             table = unfinished / "magnetometer.parquet"
             write_waveform(log.waveform, table, log.epoch_ns, log.drive)
+            if log.waveform.marks is not None:
+                write_marks(log.waveform.marks, unfinished / "marks.parquet", log.epoch_ns)
         if log.fields is not None:
             write_fields(log.fields, unfinished / "fields.parquet", log.epoch_ns)
         if log.truth is not None:

@@ -8,10 +8,11 @@ import numpy as np
 import pyarrow.parquet
 
 from magfusion.errors import InputError
-from magfusion.files.drive_columns import drive_columns
+from magfusion.files.drive_columns import column_names, drive_columns
 from magfusion.files.fields import read_fields
 from magfusion.files.inertial_tables import read_if_there
 from magfusion.files.log import HEADER, LogHeader, is_log
+from magfusion.files.marks_table import SLOT
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.table import LONGEST_GAP, Span, find_table
 from magfusion.files.table_stream import Piece, pieces
@@ -148,7 +149,10 @@ def long_log(path: Path, start: float | None = None, end: float | None = None) -
     tables = {name: find_table(path, name) for name in (*_COLUMNS, "fields")}
     if tables["imu"] is None or tables["magnetometer"] is tables["fields"] is None:
         return None  # which is refused where it is read whole
-    if tables["magnetometer"] is not None and drive_columns(tables["magnetometer"]):
+    raw = tables["magnetometer"]
+    if find_table(path, "marks") is not None or (
+        raw is not None and (drive_columns(raw) or SLOT in column_names(raw))
+    ):
         return None
     span = Span(read_yaml(path / HEADER, LogHeader).epoch_ns, start, end)
     fields = read_if_there(tables["fields"], read_fields, span)

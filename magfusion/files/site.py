@@ -17,11 +17,13 @@ from magfusion.files.site_motion import MILLION, MotionEntry, imu_entry, prior_e
 from magfusion.files.site_region import region_entry
 from magfusion.files.site_response import response_entry, response_of
 from magfusion.files.site_schema import (
+    MARKED,
     BeaconEntry,
     ClockEntry,
     EarthEntry,
     MagnetometerEntry,
     SiteEntry,
+    SlotsEntry,
 )
 from magfusion.files.site_warming import warming_entry
 from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
@@ -38,6 +40,7 @@ from magfusion.model.site import (
     Location,
     Magnetometer,
     MagnetometerSigma,
+    MarkedSlots,
     MotionModel,
     Platform,
     Site,
@@ -203,7 +206,7 @@ def _beacon(entry: BeaconEntry) -> Beacon:
         frequency_hz=entry.frequency_hz,
         coils=tuple(coil.coil() for coil in entry.coils),
         synchronised=entry.synchronised,
-        slots=None if entry.slots is None else _model(Slots, entry.slots),
+        slots=_slots(entry.slots),
         model_error=entry.model_error,
         noise_factor=entry.noise_factor,
         hemisphere_beacon=entry.hemisphere,
@@ -345,10 +348,18 @@ def _noise_entry(beacon: Beacon) -> dict[str, Any]:
     return entry | warming_entry(beacon.warming)
 
 
+def _slots(entry: SlotsEntry | str | None) -> Slots | MarkedSlots | None:
+    if isinstance(entry, str):
+        return MarkedSlots()
+    return None if entry is None else _model(Slots, entry)
+
+
 def _slots_entry(beacon: Beacon) -> dict[str, Any]:
     slots = beacon.slots
     if slots is None:
         return {}
+    if isinstance(slots, MarkedSlots):
+        return {"slots": MARKED}
     times = {"duration_s": float(slots.duration), "count": int(slots.count)}
     return {"slots": times | {"start_s": float(slots.start)}}
 

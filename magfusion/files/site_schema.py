@@ -220,11 +220,15 @@ class CoilEntry(StrictModel):
         )
 
 
+MARKED = "marked"
+MOST_SLOTS = 1000
+
+
 class SlotsEntry(StrictModel):
     """When the coils of a beacon are driven, one after the other."""
 
     duration_s: Annotated[_AboveZero, between(1e-4, 3600.0)]
-    count: Annotated[int, Field(ge=1, le=1000)]
+    count: Annotated[int, Field(ge=1, le=MOST_SLOTS)]
     start_s: Annotated[float, between(-1e10, 1e10)] = 0.0
 
 
@@ -236,6 +240,15 @@ class BeaconSigmaEntry(StrictModel):
     log_moment: Annotated[Array, PlainValidator(coil_sigma)] = Field(
         default_factory=lambda: np.zeros(())
     )
+
+
+def _slots(value: object) -> object:
+    """Take a schedule, or the word for bursts that the log marks."""
+    if value == MARKED:
+        return MARKED
+    if not isinstance(value, dict):
+        raise refusal(f"write {{duration_s, count}}, or {MARKED} where the log says when")
+    return SlotsEntry.model_validate(value)
 
 
 def _direct_current_only_in_slots(value: float, info: ValidationInfo) -> float:
@@ -253,7 +266,7 @@ class BeaconEntry(StrictModel):
     position_m: Annotated[Array | None, array(3, largest=LARGEST_DISTANCE, unit="m")] = None
     rpy_deg: Annotated[Array | None, array(3, largest=LARGEST_ANGLE, unit="degrees")] = None
     unknown: Literal["pose", "position", "attitude"] | None = None
-    slots: SlotsEntry | None = None
+    slots: Annotated[SlotsEntry | Literal["marked"], PlainValidator(_slots)] | None = None
     frequency_hz: Annotated[float, AfterValidator(_direct_current_only_in_slots)]
     coils: Annotated[list[CoilEntry], at_least_one("coil")]
     synchronised: bool = True
@@ -279,6 +292,8 @@ class BeaconEntry(StrictModel):
     def _coils_fit_the_slots(self) -> Self:
         if self.slots is None:
             return self
+        if not isinstance(self.slots, SlotsEntry):
+            return self._coils_are_marked()
         for i, coil in enumerate(self.coils):
             if coil.slot is None or coil.slot >= self.slots.count:
                 remedy = f"give one of the beacon's {self.slots.count} slots, counted from 0"
@@ -291,9 +306,19 @@ class BeaconEntry(StrictModel):
             raise refusal_at(("synchronised",), False, remedy)
         return self
 
+    def _coils_are_marked(self) -> Self:
+        """See that marks name every coil, and that they leave the sign of pulses no doubt."""
+        for i, coil in enumerate(self.coils):
+            if coil.slot is None or coil.slot >= MOST_SLOTS:
+                raise refusal_at(("coils", i, "slot"), coil.slot, "give the number in the marks")
+            if not self.synchronised and not (coil.frequency_hz or self.frequency_hz):
+                remedy = "write true: marks say when a pulse is driven, and its sign is its coil's"
+                raise refusal_at(("synchronised",), False, remedy)
+        return self
+
     def _slots_tell(self) -> bool:
         """Return whether a stream can tell when a cycle begins."""
-        assert self.slots is not None
+        assert isinstance(self.slots, SlotsEntry)
         driven = {coil.slot for coil in self.coils}
         count = self.slots.count
         turned = (

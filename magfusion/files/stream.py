@@ -14,12 +14,14 @@ from pydantic_core import PydanticCustomError
 
 from magfusion.errors import InputError
 from magfusion.files.drive_columns import beacon_of, column_of
+from magfusion.files.marks_table import is_slot, slots_of
 from magfusion.files.site_warming import COLDEST, HOTTEST
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS
 from magfusion.files.yaml_files import StrictModel, sentence
 from magfusion.model.drive import DriveSamples
+from magfusion.model.marks import UNTOLD, Marks
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
-from magfusion.units import Array, ComplexArray
+from magfusion.units import AnyArray, Array, ComplexArray, IntArray
 
 Format = Literal["json", "msgpack"]
 _CHUNK = 1 << 16  # bytes
@@ -79,6 +81,15 @@ def _series(value: object) -> Array:
     return found
 
 
+def _slots(value: object) -> IntArray:
+    """Return slots beside samples; null and NaN say nothing."""
+    found = _series(value)
+    if not np.all(is_slot(found)):
+        what = "for each sample null, -1 where no coil is driven, or the number of a slot"
+        raise PydanticCustomError("slots", "it should be {what}", {"what": what})
+    return slots_of(found)
+
+
 def _phasor(value: object) -> ComplexArray:
     """Return the phasors of a beacon's tones, (tones, 3); a tone that is null is missing."""
     what = "for each tone null or [[re_x, re_y, re_z], [im_x, im_y, im_z]]"
@@ -121,14 +132,20 @@ class ImuRecord(_Arrays):
 
 
 class MagnetometerRecord(_Arrays):
-    """Raw samples of the magnetometer: stamps (k,), fields (k, 3) (T); NaN where missing."""
+    """Raw samples of the magnetometer: stamps (k,), fields (k, 3) (T); NaN where missing.
+
+    ``slot`` is that of the coil that is driven: -1 where none is, null where nothing is said.
+    """
 
     time: Annotated[Array, PlainValidator(_times)]
     field: Annotated[Array, PlainValidator(_vectors)]
+    slot: Annotated[IntArray, PlainValidator(_slots)] | None = None
 
     @model_validator(mode="after")
     def _alike(self) -> "MagnetometerRecord":
         _check_lengths(self.time, field=self.field)
+        if self.slot is not None:
+            _check_lengths(self.time, slot=self.slot)
         return self
 
 
@@ -178,6 +195,21 @@ class DriveRecord(_Arrays):
         return self
 
 
+class MarksRecord(_Arrays):
+    """Bursts of coils: when each starts and ends (k,), and its slot; -1 where none is driven."""
+
+    start: Annotated[Array, PlainValidator(_times)]
+    end: Annotated[Array, PlainValidator(_times)]
+    slot: Annotated[IntArray, PlainValidator(_slots)]
+
+    @model_validator(mode="after")
+    def _alike(self) -> "MarksRecord":
+        _check_lengths(self.start, end=self.end, slot=self.slot)
+        if np.any(self.slot == UNTOLD):
+            raise PydanticCustomError("slots", "each mark should have a slot")
+        return self
+
+
 class Record(StrictModel):
     """One line of the stream; it may hold several kinds of samples."""
 
@@ -186,16 +218,17 @@ class Record(StrictModel):
     fields: FieldsRecord | None = None
     temperature: TemperatureRecord | None = None
     drive: DriveRecord | None = None
+    marks: MarksRecord | None = None
 
     @model_validator(mode="after")
     def _not_empty(self) -> "Record":
         if all(getattr(self, kind) is None for kind in type(self).model_fields):
-            kinds = "imu, magnetometer, fields, temperature or drive"
+            kinds = "imu, magnetometer, fields, temperature, drive or marks"
             raise PydanticCustomError("empty", "it should hold {kinds}", {"kinds": kinds})
         return self
 
 
-def _check_lengths(time: Array, **rows: Array) -> None:
+def _check_lengths(time: Array, **rows: AnyArray) -> None:
     for name, values in rows.items():
         if len(values) != len(time):
             given = {"name": name, "rows": len(values), "times": len(time)}
@@ -340,6 +373,12 @@ def magnetometer_content(waveform: Waveform) -> dict[str, Any]:
     """Return raw samples of the magnetometer as a record."""
     field = waveform.measured_sensor.tolist()
     return {"magnetometer": {"time": waveform.time.tolist(), "field": field}}
+
+
+def marks_content(marks: Marks) -> dict[str, Any]:
+    """Return bursts as a record."""
+    start, end = marks.begin.tolist(), marks.end.tolist()
+    return {"marks": {"start": start, "end": end, "slot": marks.slot.tolist()}}
 
 
 def temperature_content(time: float, part: str, degc: float) -> dict[str, Any]:

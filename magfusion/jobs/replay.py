@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from magfusion.estimation.navigator import Navigator
     from magfusion.files.long_log import LongLog
     from magfusion.files.stream import Format
+    from magfusion.model.marks import Marks
     from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
 
 
@@ -70,7 +71,7 @@ class Replay:
 
     def piece(self, k: int) -> Piece:
         """Return one piece."""
-        from magfusion.model.samples import ImuSamples, Waveform
+        from magfusion.model.samples import ImuSamples
 
         imu, waveform = self.log.imu, self.log.waveform
         own = slice(*self._imu[k : k + 2])
@@ -81,9 +82,17 @@ class Replay:
             imu=ImuSamples(imu.time[own], imu.gyro_body[own], imu.accel_body[own]),
             waveform=None
             if waveform is None
-            else Waveform(waveform.time[part], waveform.measured_sensor[part]),
+            else replace(waveform.rows(part), marks=self._marks(k)),
             fields=() if fields is None else tuple(fields.rows(slice(i, i + 1)) for i in rows),
         )
+
+    def _marks(self, k: int) -> Marks | None:
+        """Return the bursts that have ended since the piece before."""
+        waveform = self.log.waveform
+        if waveform is None or waveform.marks is None:
+            return None
+        first, last = _places(waveform.marks.end, self._edges[k : k + 2]).tolist()
+        return waveform.marks.rows(slice(first if k else 0, last))
 
     def pieces(self, first: int = 0) -> Iterator[tuple[int, Piece]]:
         """Yield the pieces from the first on with their number."""
@@ -95,6 +104,8 @@ def feed(navigator: Navigator, piece: Piece) -> None:
     """Give a piece to a navigator."""
     if len(piece.imu) and navigator.site.platform.inertial:
         navigator.add_imu(piece.imu.time, piece.imu.gyro_body, piece.imu.accel_body)
+    if piece.waveform is not None and piece.waveform.marks:
+        navigator.add_marks(piece.waveform.marks)
     if piece.waveform is not None and len(piece.waveform):
         navigator.add_magnetometer(piece.waveform.time, piece.waveform.measured_sensor)
     for samples in piece.fields:
@@ -156,6 +167,7 @@ def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool)
         fields_content,
         imu_content,
         magnetometer_content,
+        marks_content,
         temperature_content,
         write_record,
     )
@@ -175,6 +187,8 @@ def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool)
             currents = currents.rows(slice(due, None))
         if len(piece.imu):
             write_record(imu_content(piece.imu), sink, form)
+        if piece.waveform is not None and piece.waveform.marks:
+            write_record(marks_content(piece.waveform.marks), sink, form)
         if piece.waveform is not None and len(piece.waveform):
             write_record(magnetometer_content(piece.waveform), sink, form)
         for samples in piece.fields:

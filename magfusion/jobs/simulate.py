@@ -58,6 +58,12 @@ class SimulateSettings(RandomSettings):
         most=1.0,
         note="alike within the site's model_error_correlation_m",
     )
+    burst: float = option(
+        0.002, "Length of a burst, where the site's slots are marked", unit="s", least=1e-4, most=10
+    )
+    pause: float = option(
+        0.002, "Longest pause between such bursts; each is drawn", unit="s", least=0.0, most=60.0
+    )
     ground: str | None = option(
         None,
         "Layers of ground under air, height:S/m from above, e.g. 0:0.01,-20:0.05",
@@ -99,6 +105,7 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
     from magfusion.simulation.disturbance import Ambient, FieldDrift, office_noise
     from magfusion.simulation.layers import layers_option
     from magfusion.simulation.log import EPOCH_NS, SimulationConfig
+    from magfusion.simulation.slots import Multiplexer
     from magfusion.simulation.waveform import usual_rate_hz
 
     site = demo_site() if settings.site is None else load_site(settings.site)
@@ -108,10 +115,11 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
         duration=settings.duration,
         motion=settings.motion,
         imu_rate_hz=settings.imu_rate,
-        magnetometer_rate_hz=settings.rate or usual_rate_hz(site),
+        magnetometer_rate_hz=settings.rate or usual_rate_hz(site, settings.burst),
         perturb=settings.perturb,
         iron=settings.iron,
         random_field=settings.random_field,
+        multiplexer=Multiplexer(settings.burst, settings.pause),
         ambient=Ambient(
             day_night=office_noise(EPOCH_NS) if settings.ambient == "day-night" else None,
             drift=FieldDrift(settings.drift, DRIFT_TIME) if settings.drift else None,

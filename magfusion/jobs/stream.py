@@ -19,6 +19,7 @@ from magfusion.files.site import load_site
 from magfusion.files.stream import (
     Format,
     Numbered,
+    Record,
     drive_samples,
     field_samples,
     json_line,
@@ -28,6 +29,7 @@ from magfusion.files.stream import (
 from magfusion.jobs.checkpoint import begin, save
 from magfusion.jobs.live import LiveSettings, StateSink, state_sinks
 from magfusion.jobs.region import ANYWHERE, Where
+from magfusion.model.marks import Marks
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding
 from magfusion.units import Array
@@ -178,11 +180,7 @@ def _take_in(
     if numbered.record is None:
         raise InputError(numbered.refusal)
     record, newest = numbered.record, -np.inf
-    if record.temperature is not None:
-        for part, degc in record.temperature.degc.items():
-            navigator.add_temperature(part, record.temperature.time, degc)
-    if record.drive is not None:
-        navigator.add_drive(drive_samples(record.drive))
+    _take_in_beside(navigator, record)
     if record.imu is not None:
         time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
         if len(time):
@@ -201,6 +199,19 @@ def _take_in(
         navigator.add_fields(field_samples(record.fields, site.channels))
         newest = max(newest, record.fields.time)
     return newest
+
+
+def _take_in_beside(navigator: Navigator, record: Record) -> None:
+    """Give the navigator what it is to know before the samples that it goes with."""
+    if record.temperature is not None:
+        for part, degc in record.temperature.degc.items():
+            navigator.add_temperature(part, record.temperature.time, degc)
+    if record.drive is not None:
+        navigator.add_drive(drive_samples(record.drive))
+    if record.marks is not None:
+        navigator.add_marks(Marks(record.marks.start, record.marks.end, record.marks.slot))
+    if record.magnetometer is not None and record.magnetometer.slot is not None:
+        navigator.add_slots(record.magnetometer.time, record.magnetometer.slot)
 
 
 def _last(time: Array) -> float:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from magfusion.model.drive import DriveSamples
+from magfusion.model.marks import Marks
 from magfusion.model.temperature import Temperatures
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
@@ -49,13 +50,20 @@ class Waveform:
         Seconds since the log's epoch, strictly increasing.
     measured_sensor : ndarray, shape (n, 3)
         Uncalibrated flux density (T).
+    marks : Marks, optional
+        When which coil was driven, where that was recorded; bursts outside the samples, too.
     """
 
     time: Array
     measured_sensor: Array
+    marks: Marks | None = None
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def rows(self, kept: IntArray | BoolArray | slice) -> "Waveform":
+        """Return some samples."""
+        return Waveform(self.time[kept], self.measured_sensor[kept], self.marks)
 
 
 @dataclass(frozen=True, eq=False)

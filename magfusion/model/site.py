@@ -85,6 +85,14 @@ class Slots:
         return np.floor((time - self.start) / self.duration + 1e-6).astype(np.int64)
 
 
+@dataclass(frozen=True)
+class MarkedSlots:
+    """Time division by a clock that nobody knows beforehand: the log says when each is driven.
+
+    A slot is then a number that its marks name (`magfusion.model.marks`), and has no length.
+    """
+
+
 @dataclass(frozen=True, eq=False)
 class BeaconSigma:
     """Prior standard deviations of a beacon's calibration; zero means known.
@@ -118,7 +126,7 @@ class Beacon:
         False where the drive phase relative to the log clock is unknown and drifts.
     field_map : FieldMap, optional
         How its field differs from the model where it was surveyed.
-    slots : Slots, optional
+    slots : Slots or MarkedSlots, optional
         When its coils are driven, where they are driven in turn and that is known; a frequency of
         zero then means pulses of direct current.
     unknown : {"pose", "position", "attitude"}, optional
@@ -144,7 +152,7 @@ class Beacon:
     synchronised: bool
     sigma: BeaconSigma
     field_map: FieldMap | None = None
-    slots: Slots | None = None
+    slots: Slots | MarkedSlots | None = None
     unknown: Unknown | None = None
     model_error: float | None = None
     noise_factor: float = 1.0

@@ -40,19 +40,25 @@ class Windows:
         (s)
     first, count : int ndarray, shape (n,)
         Samples of each window.
+    length : ndarray, shape (n,)
+        (s)
+    place : int ndarray, shape (n,)
+        In a cycle of slots; of windows that are alike zero.
     """
 
     number: IntArray
     centre: Array
     first: IntArray
     count: IntArray
+    length: Array
+    place: IntArray
 
     def __len__(self) -> int:
         return len(self.number)
 
     def rows(self, kept: BoolArray | IntArray | slice) -> "Windows":
         """Return some windows."""
-        return Windows(self.number[kept], self.centre[kept], self.first[kept], self.count[kept])
+        return Windows(*(part[kept] for part in vars(self).values()))
 
     def joined(self, others: "Windows") -> "Windows":
         """Return these and others of the same grid, in order."""
@@ -64,7 +70,7 @@ class Windows:
     def none() -> "Windows":
         """Return no windows."""
         whole = np.zeros(0, dtype=np.int64)
-        return Windows(whole, np.zeros(0), whole, whole)
+        return Windows(whole, np.zeros(0), whole, whole, np.zeros(0), whole)
 
 
 @dataclass(frozen=True)
@@ -113,7 +119,8 @@ class Grid:
         half = self.length / 2.0
         first = np.searchsorted(time, centre - half - self.rounding)
         last = np.searchsorted(time, centre + half - self.rounding)
-        return Windows(number, centre, first, last - first)
+        length = np.full(len(number), self.length)
+        return Windows(number, centre, first, last - first, length, number % self.together)
 
 
 def usual_step(time: Array, stream: str) -> float:
@@ -161,6 +168,8 @@ class Admission:
         Whether a window without inertial samples is of no use; otherwise it is one of more noise.
     least_share : float
         Of the samples that a window should hold.
+    slack : int
+        Samples by which windows may lie askew of the sampling.
     ends : tuple of RangeEnds
         What is known of each axis's range so far.
     """
@@ -172,6 +181,7 @@ class Admission:
     clips: bool
     needs_turn: bool
     least_share: float
+    slack: int = 0
     ends: tuple[RangeEnds, ...] = field(default_factory=lambda: tuple(RangeEnds() for _ in "xyz"))
 
     def verdicts(
@@ -191,8 +201,8 @@ class Admission:
             Takes windows that lack samples and the times of all; returns how many times as large as
             that of a whole window the variance of their phasors is.
         """
-        half = grid.length / 2.0 + grid.early
-        begin, end = windows.centre - half, windows.centre + grid.length / 2.0 - grid.early
+        half = windows.length / 2.0 + grid.early
+        begin, end = windows.centre - half, windows.centre + windows.length / 2.0 - grid.early
         found = np.full(len(windows), -1)
 
         def drop(reason: str, spoilt: BoolArray) -> None:
@@ -202,7 +212,7 @@ class Admission:
         gap = np.flatnonzero(np.diff(time) > 1.5 * step)
         # From just before the first missing sample to just after the last.
         lacking = meets(time[gap] + 0.75 * step, time[gap + 1] - 0.75 * step, begin, end)
-        few = windows.count * step < self.least_share * grid.length
+        few = (windows.count + self.slack) * step < self.least_share * windows.length
         asked = lacking & ~few
         if np.any(asked):
             lacking[asked] = growth(windows.rows(asked), time) > MOST_GROWTH

@@ -10,12 +10,15 @@ from typing import Literal
 
 import numpy as np
 
-from magfusion.units import Array, ComplexArray, IntArray
+from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 Removal = Literal["none", "subtract", "interpolate", "state"]
 LEAST_TURNS = (
     1.2  # of an alias of the mains in the span of the state, which distinguishes it from a ramp
 )
+STATE_CYCLES = 8
+LEAST_TOLD = 0.2  # of a column of ones; a design whose least direction is shorter tells no mains
+FARTHEST, FARTHEST_BURSTS = 1.0, 16.0  # s, or lengths: what is farther off says nothing
 STRETCH = 4  # at most so many times longer a state, where that separates them
 
 
@@ -136,6 +139,83 @@ def _interpolated(
     reach = np.minimum(np.abs(driven - silent[left]), np.abs(driven - silent[right]))
     weight[outside & (reach > count)] = np.nan
     return np.stack([left, right], axis=1), weight
+
+
+def uneven_weights(
+    driven: Array,
+    driven_length: Array,
+    silent: Array,
+    silent_length: Array,
+    number: int,
+    mains_hz: float,
+) -> tuple[IntArray, Array]:
+    """Return from which silent bursts, that follow no clock, the ambient field is taken.
+
+    The state of `ambient_weights` by the times and lengths of the bursts: a constant, a ramp and,
+    as soon as enough of the nearest tell them from these, the mains.
+
+    Parameters
+    ----------
+    driven, driven_length : ndarray, shape (n,)
+        Middle and length (s).
+    silent, silent_length : ndarray, shape (m,)
+        Likewise, in order of time.
+    number : int
+        Bursts in the state; up to four times as many for the mains.
+    mains_hz : float
+        Zero for none.
+
+    Returns
+    -------
+    index, weight
+        As of `ambient_weights`.
+    """
+    if len(silent) == 0 or len(driven) == 0:
+        return ambient_weights(np.arange(len(driven)), np.zeros(0, dtype=np.int64), 1, "state")
+    index, weight = _uneven(driven, driven_length, silent, silent_length, number, 0.0)[:2]
+    left = np.arange(len(driven) if mains_hz else 0)
+    while len(left) and number <= STRETCH * STATE_CYCLES:
+        wider, better, told = _uneven(
+            driven[left], driven_length[left], silent, silent_length, number, mains_hz
+        )
+        spare = wider.shape[1] - index.shape[1]
+        index = np.pad(index, ((0, 0), (0, spare)))
+        weight = np.pad(weight, ((0, 0), (0, spare)))
+        index[left[told]], weight[left[told]] = wider[told], better[told]
+        left, number = left[~told], 2 * number
+    return index, weight
+
+
+def _uneven(
+    driven: Array,
+    driven_length: Array,
+    silent: Array,
+    silent_length: Array,
+    number: int,
+    mains_hz: float,
+) -> tuple[IntArray, Array, BoolArray]:
+    """Return index and weights of one design, and where it tells its columns apart."""
+    number = min(number, len(silent))
+    first = np.searchsorted(silent, driven) - number // 2
+    index = np.clip(first, 0, len(silent) - number)[:, None] + np.arange(number)
+    elapsed = silent[index] - driven[:, None]
+    near = np.abs(elapsed) <= np.maximum(FARTHEST, FARTHEST_BURSTS * driven_length)[:, None]
+    span = np.max(np.abs(elapsed) * near, axis=1, keepdims=True)
+    ramp = np.where(np.sum(near, axis=1, keepdims=True) > 1, elapsed / np.maximum(span, 1e-9), 0.0)
+    columns = [np.ones_like(elapsed), ramp]
+    wanted = [np.ones(len(driven)), np.zeros(len(driven))]
+    if mains_hz:
+        # A burst averages the mains, each by its own length.
+        share = np.sinc(mains_hz * silent_length)[index]
+        angle = 2.0 * np.pi * mains_hz * elapsed
+        columns += [share * np.cos(angle), share * np.sin(angle)]
+        wanted += [np.sinc(mains_hz * driven_length), np.zeros(len(driven))]
+    design = np.stack(columns, axis=-1) * near[..., None]
+    inverse = np.linalg.pinv(design, rcond=1e-6)
+    weight = np.einsum("nc,nck->nk", np.stack(wanted, axis=1), inverse)
+    least = np.linalg.svd(design, compute_uv=False)[:, -1] / np.sqrt(number)
+    told = least > LEAST_TOLD if number >= len(columns) else np.zeros(len(driven), dtype=bool)
+    return index, np.where(near.any(axis=1)[:, None], weight, np.nan), told
 
 
 def removed(

@@ -3,19 +3,32 @@
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.model.marks import SILENT, Marks
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site
-from magfusion.receiver.slots import schedule
+from magfusion.receiver.marked_bursts import LONGEST_EPOCH
+from magfusion.receiver.slots import is_marked, schedule
 from magfusion.receiver.turn import Turn, on_clock, turn_of
 from magfusion.units import Array, BoolArray, IntArray
 
-# s; from the first to the last slot of an epoch. Half as long after its middle, a head that is
-# accelerated by 10 m/s^2 is 0.2 mm from where a steady velocity leads.
-LONGEST_EPOCH = 0.012
+LONGEST_PAUSE = 4.0  # usual ones; after a longer one a marked cycle does not go on
 
 
-def joins(site: Site) -> bool:
-    """Return whether a cycle is short enough to be one epoch while the platform moves."""
+def joins(site: Site, marks: Marks | None = None) -> bool:
+    """Return whether a cycle is short enough to be one epoch while the platform moves.
+
+    Parameters
+    ----------
+    marks : Marks, optional
+        Of slots that no clock tells: whether most of their cycles are.
+    """
+    if is_marked(site):
+        if marks is None:
+            return False
+        own = marks.rows(marks.slot != SILENT)
+        epoch = _marked(0.5 * (own.begin + own.end), own.slot, longest=LONGEST_EPOCH)
+        whole = np.bincount(epoch) == len(site.channels)
+        return bool(len(epoch) and np.mean(whole) > 0.5)
     slots = schedule(site)
     driven = [slot for beacon in site.beacons for _, slot in beacon.tones if slot is not None]
     return bool((max(driven) - min(driven)) * slots.duration <= LONGEST_EPOCH)
@@ -48,13 +61,15 @@ def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSam
     whole: BoolArray = np.all(found.valid, axis=1)
     if not np.any(whole):
         raise InputError(
-            f"no cycle of {schedule(site).count} slots holds all of {len(samples.channels)} coils;"
+            f"no cycle of slots holds all of {len(samples.channels)} coils;"
             " record longer, or give the site in which the log was recorded"
         )
     return found.rows(whole)
 
 
-def cycles(samples: FieldSamples, measured_from_still: Turn, site: Site) -> FieldSamples:
+def cycles(
+    samples: FieldSamples, measured_from_still: Turn, site: Site, epoch: IntArray | None = None
+) -> FieldSamples:
     """Join the slots of each cycle to one row, whichever of them there are.
 
     Parameters
@@ -63,8 +78,10 @@ def cycles(samples: FieldSamples, measured_from_still: Turn, site: Site) -> Fiel
         As of `whole_cycles`; at least one.
     measured_from_still : Turn
         As from `magfusion.receiver.turn.turn_of`.
+    epoch : int ndarray, shape (n,), optional
+        The cycle of each row, increasing, where that is known.
     """
-    slots, cycle = schedule(site), _cycle_of(samples, site)
+    cycle = _cycle_of(samples, site) if epoch is None else np.unique(epoch, return_inverse=True)[1]
     row, channel = np.nonzero(samples.valid)
     number = int(cycle[-1]) + 1
     time: Array = np.bincount(cycle, samples.time) / np.bincount(cycle)
@@ -78,7 +95,7 @@ def cycles(samples: FieldSamples, measured_from_still: Turn, site: Site) -> Fiel
     ahead[cycle[row], channel] = samples.time[row] - time[cycle[row]]
     return FieldSamples(
         time=time,
-        window=np.full(number, slots.cycle),
+        window=_lengths(samples, cycle, site),
         channels=samples.channels,
         phasor_sensor=phasor,
         phasor_cov=cov,
@@ -86,13 +103,49 @@ def cycles(samples: FieldSamples, measured_from_still: Turn, site: Site) -> Fiel
     )
 
 
+def _lengths(samples: FieldSamples, cycle: IntArray, site: Site) -> Array:
+    """Return how long each cycle is (s); of marked slots, to the end of the last."""
+    number = int(cycle[-1]) + 1
+    if not is_marked(site):
+        return np.full(number, schedule(site).cycle)
+    begin, end = np.full(number, np.inf), np.full(number, -np.inf)
+    np.minimum.at(begin, cycle, samples.time - 0.5 * samples.window)
+    np.maximum.at(end, cycle, samples.time + 0.5 * samples.window)
+    return np.asarray(end - begin)
+
+
 def _cycle_of(samples: FieldSamples, site: Site) -> IntArray:
     """Return the cycle of each row, counted from the first: by the coils that it holds.
 
     A source whose clock runs away from the log's keeps no schedule for long.
     """
+    if is_marked(site):
+        usual = float(np.median(np.diff(samples.time))) if len(samples) > 1 else 0.0
+        return _marked(samples.time, np.argmax(samples.valid, axis=1), pause=LONGEST_PAUSE * usual)
     slots = schedule(site)
     slot = np.array([slot for beacon in site.beacons for _, slot in beacon.tones], dtype=float)
     count = np.maximum(np.sum(samples.valid, axis=1), 1)
     begin = samples.time - (samples.valid @ slot / count + 0.5) * slots.duration
     return np.cumsum(np.diff(begin, prepend=begin[:1]) > 0.5 * slots.cycle)
+
+
+def _marked(
+    time: Array, slot: IntArray, *, longest: float = np.inf, pause: float = np.inf
+) -> IntArray:
+    """Return the cycle of each burst: a coil that comes again begins another.
+
+    Parameters
+    ----------
+    longest, pause : float
+        From its first to its last burst, and between two (s).
+    """
+    cycle = np.zeros(len(time), dtype=np.int64)
+    taken: set[int] = set()
+    first = before = -np.inf
+    newest = -1
+    for k, (when, one) in enumerate(zip(time.tolist(), slot.tolist(), strict=True)):
+        if newest < 0 or one in taken or when - first > longest or when - before > pause:
+            newest, taken, first = newest + 1, set(), when
+        cycle[k], before = newest, when
+        taken.add(one)
+    return cycle

@@ -13,7 +13,7 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.model.drive import LEAST_ON, DriveSamples, DriveShares
-from magfusion.model.site import Beacon, Site
+from magfusion.model.site import Beacon, MarkedSlots, Site
 from magfusion.receiver.slots import has_schedule, schedule
 from magfusion.receiver.windows import LockinSettings, default_settings
 from magfusion.units import Array, ComplexArray
@@ -68,6 +68,11 @@ def drive_channels(site: Site, columns: Mapping[str, object]) -> tuple[Channel, 
 
 
 def _of_beacon(beacon: Beacon, column: str) -> Iterator[Channel]:
+    if isinstance(beacon.slots, MarkedSlots):
+        raise InputError(
+            f"beacon {beacon.name}: its current is recorded, and its bursts are marked, which are"
+            " not referred to a current yet; leave the drive column out"
+        )
     if beacon.slots is not None and not beacon.synchronised:
         raise InputError(
             f"beacon {beacon.name}: its current is recorded, but not when its slots begin; write"

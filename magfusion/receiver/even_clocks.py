@@ -60,7 +60,9 @@ def _at(log: Log, clocks: Mapping[str, SamplingClock]) -> Log:
         log = replace(log, imu=replace(log.imu, time=clocks["imu"].time))
     if "magnetometer" in clocks:
         assert log.waveform is not None
-        log = replace(log, waveform=replace(log.waveform, time=clocks["magnetometer"].time))
+        time, wave = clocks["magnetometer"].time, log.waveform
+        marks = None if wave.marks is None else wave.marks.on_clock(wave.time, time)
+        log = replace(log, waveform=replace(wave, time=time, marks=marks))
     return log
 
 

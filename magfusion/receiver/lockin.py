@@ -246,7 +246,9 @@ def unexplained(log: Log, site: Site, settings: LockinSettings) -> Array:
     begin = np.searchsorted(waveform.time, centre - half)
     count = np.searchsorted(waveform.time, centre + half) - begin
     rows = count > LEAST_COMPARED * np.max(count)
-    windows = Windows(np.arange(len(centre)), centre, begin, count).rows(rows)
+    length = np.full(len(centre), settings.window)
+    number = np.arange(len(centre))
+    windows = Windows(number, centre, begin, count, length, np.zeros_like(number)).rows(rows)
     imu = on_clock(log.imu, site.platform.imu.time_offset)
     operator = window_operator(waveform, imu, site, settings, windows)
     return operator.unexplained(waveform.measured_sensor - site.platform.magnetometer.offset)

@@ -12,6 +12,7 @@ from functools import cached_property, reduce
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.model.marks import Marks
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
@@ -36,6 +37,7 @@ from magfusion.receiver.slots import (
     driven_slots,
     has_schedule,
     history_of,
+    is_marked,
     is_pulsed,
     schedule,
     slot_lockin,
@@ -101,6 +103,10 @@ class Receiver(ABC):
         settings : LockinSettings or SlotSettings, optional
             None chooses them by the tones or the time slots.
         """
+        if is_marked(site):
+            from magfusion.receiver.marked import MarkedReceiver
+
+            return MarkedReceiver(site, settings)
         if isinstance(settings, SlotSettings) or has_schedule(site):
             return SlotReceiver(site, settings)
         return LockinReceiver(site, settings)
@@ -179,11 +185,31 @@ class Receiver(ABC):
         found = found.rows(number >= since)
         return found, len(found)
 
+    @property
+    def marks(self) -> Marks | None:
+        """The bursts that are kept; None of drives that keep to a clock."""
+        return None
+
+    def hear_marks(self, marks: Marks) -> None:  # noqa: B027
+        """Take bursts as they were marked; drives that keep to a clock need none.
+
+        Raises
+        ------
+        InputError
+            Where they do not follow those that came, or a slot is of no coil.
+        """
+
+    def hear_slots(self, time: Array, slot: IntArray) -> None:  # noqa: B027
+        """Take the slots beside samples, as `hear_marks`."""
+
+    def forget_marks(self, before: float) -> None:  # noqa: B027
+        """Drop the bursts before a time (s), as long as none is judged."""
+
     def _follow(self, waveform: Waveform) -> None:  # noqa: B027
         """Bring the grid to where the stream shows it."""
 
     @abstractmethod
-    def _driven(self, number: IntArray) -> BoolArray:
+    def _driven(self, windows: Windows) -> BoolArray:
         """Tell which windows lead to a row of phasors."""
 
     @abstractmethod
@@ -213,18 +239,18 @@ class Receiver(ABC):
         """
         assert self.grid is not None
         self._follow(waveform)
-        new = self.admit(*self._since(waveform, imu, time_offset, self.next_number), until).number
-        oldest = min([*self.recent[:1].tolist(), *new[:1].tolist(), self.next_number])
+        new = self.admit(*self._since(waveform, imu, time_offset, self.next_number), until)
+        known = self._known(new)
+        oldest = min([*known[:1].tolist(), self.next_number])
         waveform, imu = self._since(waveform, imu, time_offset, oldest)
         expected = int(np.sum(self._driven(new)))
-        known = np.concatenate([self.recent, new])
         self.recent = known[known >= self.next_number - self.remembered]
         if expected == 0:
             return FieldSamples.empty(self.site.channels)
-        windows = self.grid.windows(known, waveform.time)
+        windows = self._windows(known, waveform.time)
         offset = self.site.platform.imu.time_offset if time_offset is None else time_offset
         known_imu = on_clock(imu, offset, gyro_bias_body)
-        found, seen = self.pushed(waveform, known_imu, windows, int(new[0]))
+        found, seen = self.pushed(waveform, known_imu, windows, int(new.number[0]))
         self._count(NO_SILENT_SLOT, expected - seen)
         return found
 
@@ -239,7 +265,7 @@ class Receiver(ABC):
         if len(imu):
             imu = initial_calibration(self.site, 0.0, float(imu.time[0])).on_log_rate(imu)
         windows = self._admitted(waveform, imu)
-        expected = int(np.sum(self._driven(windows.number)))
+        expected = int(np.sum(self._driven(windows)))
         if expected == 0:
             raise self._none_usable()
         known = on_clock(imu, self.site.platform.imu.time_offset)
@@ -261,7 +287,27 @@ class Receiver(ABC):
 
     def complete(self, until: float) -> bool:
         """Return whether there is a window to judge at a time (s)."""
-        return self.grid is not None and self.grid.last(until) >= self.next_number
+        return self.grid is not None and self._last(until) >= self.next_number
+
+    def _last(self, until: float) -> int:
+        """Return the number of the last window that can be judged at a time (s)."""
+        assert self.grid is not None
+        return self.grid.last(until)
+
+    def _last_of_log(self, waveform: Waveform) -> int:
+        """Return the number of the last window that the samples of a whole log fill."""
+        assert self.grid is not None
+        assert self.admission is not None
+        return self.grid.last_of_log(waveform.time, self.admission.magnetometer_step)
+
+    def _windows(self, number: IntArray, time: Array) -> Windows:
+        """Return windows by their numbers."""
+        assert self.grid is not None
+        return self.grid.windows(number, time)
+
+    def _known(self, new: Windows) -> IntArray:
+        """Return the numbers of windows that were admitted and may be needed, to the newest."""
+        return np.concatenate([self.recent, new.number])
 
     def admit(self, waveform: Waveform, imu: ImuSamples, until: float | None = None) -> Windows:
         """Return the windows that have become complete and can be demodulated.
@@ -273,13 +319,10 @@ class Receiver(ABC):
         """
         assert self.grid is not None
         assert self.admission is not None
-        if until is None:
-            last = self.grid.last_of_log(waveform.time, self.admission.magnetometer_step)
-        else:
-            last = self.grid.last(until)
+        last = self._last_of_log(waveform) if until is None else self._last(until)
         number = np.arange(self.next_number, max(last + 1, self.next_number))
         self.next_number += len(number)
-        windows = self.grid.windows(number, waveform.time)
+        windows = self._windows(number, waveform.time)
         # By the clock as declared: what is learnt of it later changes no verdict.
         stamps = imu.time + self.site.platform.imu.time_offset
         verdict = self.admission.verdicts(self.grid, windows, waveform, stamps, self._growth)
@@ -298,7 +341,7 @@ class Receiver(ABC):
         offset = self.site.platform.imu.time_offset if time_offset is None else time_offset
         begin = max(int(np.searchsorted(imu.time, oldest - offset - INERTIAL_MARGIN)) - 1, 0)
         return (
-            Waveform(waveform.time[first:], waveform.measured_sensor[first:]),
+            waveform.rows(slice(first, None)),
             ImuSamples(imu.time[begin:], imu.gyro_body[begin:], imu.accel_body[begin:]),
         )
 
@@ -333,9 +376,10 @@ class Receiver(ABC):
         assert self.grid is not None
         slots = has_schedule(self.site)
         one, remedy = ("slot", "") if slots else ("window", ", or choose a shorter window")
+        one += f" of {self.grid.length:g} s" if self.grid.length else ""
         reasons = "; ".join(f"{k}: {v}" for k, v in self.dropped.items())
         return InputError(
-            f"magnetometer: no {one} of {self.grid.length:g} s is usable"
+            f"magnetometer: no {one} is usable"
             f" ({reasons or 'the log is too short'}); record longer{remedy}"
         )
 
@@ -409,8 +453,8 @@ class LockinReceiver(Receiver):
             known = self._designs = designs_of(waveform, site, self.settings, windows)
         return window_operator(waveform, imu, site, self.settings, windows, designs=known)
 
-    def _driven(self, number: IntArray) -> BoolArray:
-        return np.ones(len(number), dtype=bool)
+    def _driven(self, windows: Windows) -> BoolArray:
+        return np.ones(len(windows), dtype=bool)
 
     def _growth(self, windows: Windows, time: Array) -> Array:
         assert self.admission is not None
@@ -485,7 +529,7 @@ class SlotReceiver(Receiver):
         for end in np.append(ends, len(time)).tolist():
             newest = float(time[end - 1])
             rows = slice(int(np.searchsorted(time, newest - 1.01 * span)), end)
-            look = Waveform(time[rows], waveform.measured_sensor[rows])
+            look = waveform.rows(rows)
             if self.grid is None:
                 # Where nothing is heard yet, there is nothing to count on from.
                 try:
@@ -494,7 +538,7 @@ class SlotReceiver(Receiver):
                     refusal = error
                     continue
             self._follow(look)
-            come = Waveform(time[:end], waveform.measured_sensor[:end])
+            come = waveform.rows(slice(end))
             own, inertial = self._since(come, imu, None, self.next_number)
             found = self.admit(own, inertial, None if end == len(time) else newest)
             parts.append(replace(found, first=found.first + end - len(own)))
@@ -520,11 +564,15 @@ class SlotReceiver(Receiver):
         fresh = windows.rows(~np.any(same, axis=0))
         self._values = known.joined(self._held(waveform, turn, fresh, self.site))
         found, number = demodulate_slots(self._values, turn, self.site, self.settings)
-        found = found.rows(number >= since)
+        number, found = number[number >= since], found.rows(number >= since)
         seen = len(found)
-        if seen and self.joined and joins(self.site):
-            found = cycles(found, turn, self.site)
+        if seen and self.joined:
+            found = self._joined(found, number, turn)
         return found, seen
+
+    def _joined(self, found: FieldSamples, number: IntArray, turn: Turn) -> FieldSamples:  # noqa: ARG002
+        """Return the slots of each cycle as one epoch, where it is short."""
+        return cycles(found, turn, self.site) if joins(self.site) else found
 
     def _follow(self, waveform: Waveform) -> None:
         """Bring the slots to where the stream shows them, half the way: a look is noisy."""
@@ -546,8 +594,8 @@ class SlotReceiver(Receiver):
         rate_hz = 1.0 / self.admission.magnetometer_step
         return slot_values(waveform, turn, site, self.settings, windows, rate_hz)
 
-    def _driven(self, number: IntArray) -> BoolArray:
-        return driven_slots(self.site, number)
+    def _driven(self, windows: Windows) -> BoolArray:
+        return driven_slots(self.site, windows.number)
 
     def _growth(self, windows: Windows, time: Array) -> Array:  # noqa: ARG002
         """Return one: the few columns of a slot stay apart without a few samples."""

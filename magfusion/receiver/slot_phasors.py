@@ -6,26 +6,30 @@ samples are turned by the gyro into axes that do not turn with the body, in whic
 of a silent slot is the one of its neighbours, and back into those of the slot's own time.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import overload
 
 import numpy as np
 
 from magfusion.model.samples import FieldSamples, Waveform
-from magfusion.model.site import Site, Slots
+from magfusion.model.site import Site
 from magfusion.receiver.admission import Windows
-from magfusion.receiver.ambient import ambient_weights, removed
+from magfusion.receiver.ambient import ambient_weights, removed, uneven_weights
 from magfusion.receiver.noise import smoothed_over_windows
 from magfusion.receiver.slots import (
     NOISE_CYCLES,
     SlotSettings,
     carriers_hz,
+    is_marked,
     is_pulsed,
     owners,
+    places,
     schedule,
 )
 from magfusion.receiver.turn import Turn
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
+
+LONGEST_PAUSE = 1.0  # s; beyond, the noise of marked bursts is not that of others
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +48,10 @@ class SlotValues:
         Of a component, for samples of unit variance.
     noise : ndarray, shape (n, 3, 3)
         Covariance per sample of what is beside the carrier in this slot alone (T^2).
+    length : ndarray, shape (n,)
+        (s)
+    place : int ndarray, shape (n,)
+        In its cycle.
     """
 
     number: IntArray
@@ -52,15 +60,17 @@ class SlotValues:
     value: ComplexArray
     variance: Array
     noise: Array
+    length: Array
+    place: IntArray
 
     @staticmethod
     def none() -> "SlotValues":
         """Return no slots."""
         number, nothing = np.zeros(0, dtype=np.int64), np.zeros(0)
-        value = np.zeros((0, 3), dtype=np.complex128)
-        return SlotValues(number, nothing, nothing, value, nothing, np.zeros((0, 3, 3)))
+        value, noise = np.zeros((0, 3), dtype=np.complex128), np.zeros((0, 3, 3))
+        return SlotValues(number, nothing, nothing, value, nothing, noise, nothing, number)
 
-    def rows(self, kept: BoolArray) -> "SlotValues":
+    def rows(self, kept: BoolArray | IntArray) -> "SlotValues":
         """Return some slots."""
         return SlotValues(*(part[kept] for part in vars(self).values()))
 
@@ -102,17 +112,16 @@ def slot_values(
     """
     if len(windows) == 0:
         return SlotValues.none()
-    slots = schedule(site)
-    carrier = carriers_hz(site, slots)
+    carrier = carriers_hz(site, places(site))
     first, last = int(windows.first[0]), int(windows.first[-1] + windows.count[-1])
     time = waveform.time[first:last]
-    own = Windows(windows.number, windows.centre, windows.first - first, windows.count)
+    own = replace(windows, first=windows.first - first)
     clean = waveform.measured_sensor[first:last] - site.platform.magnetometer.offset
     still = _applied(measured_from_still.back(time), clean)
-    place = windows.number % slots.count
-    inside = _inside(time, still, own, slots, rate_hz)
-    sums = _slot_sums(inside, carrier[place], settings)
-    noise = _noise(inside, carrier[place], slots, rate_hz)
+    own_carrier = carrier[windows.place]
+    inside = _inside(time, still, own, rate_hz)
+    sums = _slot_sums(inside, own_carrier, settings)
+    noise = _noise(inside, own_carrier, windows.length, rate_hz)
     turn = measured_from_still(sums.time)
     return SlotValues(
         windows.number,
@@ -121,6 +130,8 @@ def slot_values(
         _applied(turn, sums.value),
         sums.variance,
         turn @ noise @ np.swapaxes(turn, 1, 2),
+        windows.length,
+        windows.place,
     )
 
 
@@ -155,21 +166,12 @@ def demodulate_slots(
     number : int ndarray, shape (n,)
         The slot of each row.
     """
-    slots, pulsed = schedule(site), is_pulsed(site)
     turn, still_from_measured = measured_from_still.both(values.time)
     still = _applied(still_from_measured, values.value)
-    noise = _smoothed_noise(values, still_from_measured, still, slots)
-    place = values.number % slots.count
-    owner = owners(site, slots)
+    noise = _smoothed_noise(values, still_from_measured, still, site)
+    place, owner = values.place, owners(site, places(site))
     driven, silent = np.flatnonzero(owner[place] >= 0), np.flatnonzero(owner[place] < 0)
-    index, weight = ambient_weights(
-        values.number[driven],
-        values.number[silent],
-        slots.count,
-        settings.removal,
-        cycles=settings.cycles,
-        mains_turns=settings.mains_hz * slots.duration if pulsed else 0.0,
-    )
+    index, weight = _ambient(values, driven, silent, site, settings)
     value = removed(still[driven], still[silent], index, weight)
     usable = np.isfinite(value).all(axis=1)
     kept, weight = driven[usable], weight[usable]
@@ -177,10 +179,32 @@ def demodulate_slots(
     shared = 0.0 if settings.removal == "none" else 1.0 / max(len(np.unique(place[silent])), 1)
     variance = values.variance[kept] * (1.0 + np.maximum(np.sum(weight**2, axis=1), shared))
     phasor = _applied(turn[kept], value[usable])
-    found = _rows(site, slots, values.time[kept], owner[place[kept]], phasor)
+    found = _rows(site, values.time[kept], values.length[kept], owner[place[kept]], phasor)
     cov = variance[:, None, None] * (turn[kept] @ noise[kept] @ np.swapaxes(turn[kept], 1, 2))
     found.phasor_cov[np.arange(len(kept)), owner[place[kept]]] = cov
     return found, values.number[kept]
+
+
+def _ambient(
+    values: SlotValues, driven: IntArray, silent: IntArray, site: Site, settings: SlotSettings
+) -> tuple[IntArray, Array]:
+    """Return from which silent slots, and with which weights, the ambient field is taken."""
+    mains_hz = settings.mains_hz if is_pulsed(site) else 0.0
+    if is_marked(site):
+        if settings.removal == "none":
+            return ambient_weights(driven, silent, 1, "none")
+        one, other = values.rows(driven), values.rows(silent)
+        where = (one.time, one.length, other.time, other.length)
+        return uneven_weights(*where, settings.cycles, mains_hz)
+    slots = schedule(site)
+    return ambient_weights(
+        values.number[driven],
+        values.number[silent],
+        slots.count,
+        settings.removal,
+        cycles=settings.cycles,
+        mains_turns=mains_hz * slots.duration,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,13 +238,13 @@ class _Inside:
     slot_begin: Array
 
 
-def _inside(time: Array, still: Array, windows: Windows, slots: Slots, rate_hz: float) -> _Inside:
+def _inside(time: Array, still: Array, windows: Windows, rate_hz: float) -> _Inside:
     owner = np.repeat(np.arange(len(windows.count)), windows.count)
     begins = np.concatenate([[0], np.cumsum(windows.count)[:-1]])
     sample = np.arange(len(owner)) + (windows.first - begins)[owner]
-    slot_begin, at = windows.centre - 0.5 * slots.duration, time[sample]
+    slot_begin, at = windows.centre - 0.5 * windows.length, time[sample]
     elapsed = at - slot_begin[owner]
-    hann = 1.0 - np.cos(2.0 * np.pi * (elapsed + 0.5 / rate_hz) / slots.duration)
+    hann = 1.0 - np.cos(2.0 * np.pi * (elapsed + 0.5 / rate_hz) / windows.length[owner])
     return _Inside(owner, begins, at, elapsed, still[sample], hann, slot_begin)
 
 
@@ -255,12 +279,12 @@ def _slot_sums(inside: _Inside, carrier_hz: Array, settings: SlotSettings) -> _S
     return _Sums(centre, value, 0.5 * (cov[:, 1, 1] + cov[:, 2, 2]))
 
 
-def _noise(inside: _Inside, carrier_hz: Array, slots: Slots, rate_hz: float) -> Array:
+def _noise(inside: _Inside, carrier_hz: Array, length: Array, rate_hz: float) -> Array:
     """Return the covariance per sample of what is beside the carrier, (n, 3, 3), still axes.
 
     It is the power three cycles a slot away, tapered so that neither carrier nor hum leaks there.
     """
-    away = 3.0 / slots.duration
+    away = 3.0 / length
     above = carrier_hz + away < 0.5 * rate_hz
     probe = np.where(above, carrier_hz + away, carrier_hz - away)
     turned = inside.hann * np.exp(-2j * np.pi * probe[inside.owner] * inside.elapsed)
@@ -271,25 +295,26 @@ def _noise(inside: _Inside, carrier_hz: Array, slots: Slots, rate_hz: float) -> 
 
 
 def _smoothed_noise(
-    values: SlotValues, still_from_measured: Array, still: ComplexArray, slots: Slots
+    values: SlotValues, still_from_measured: Array, still: ComplexArray, site: Site
 ) -> Array:
     """Return the covariance per sample over many cycles, (n, 3, 3), still axes."""
     cov = still_from_measured @ values.noise @ np.swapaxes(still_from_measured, 1, 2)
-    number = NOISE_CYCLES * slots.count
-    smooth = smoothed_over_windows(cov[:, None], values.centre, slots.cycle, number, None)[:, 0]
+    number = NOISE_CYCLES * places(site)
+    cycle = LONGEST_PAUSE if is_marked(site) else schedule(site).cycle
+    smooth = smoothed_over_windows(cov[:, None], values.centre, cycle, number, None)[:, 0]
     least = 1e-12 * np.max(np.abs(still))
     return smooth + least**2 * np.eye(3)
 
 
 def _rows(
-    site: Site, slots: Slots, time: Array, channel: IntArray, phasor: ComplexArray
+    site: Site, time: Array, length: Array, channel: IntArray, phasor: ComplexArray
 ) -> FieldSamples:
     shape = (len(time), len(site.channels), 3)
     every = np.full(shape, np.nan, dtype=np.complex128)
     every[np.arange(len(time)), channel] = phasor
     return FieldSamples(
         time=time,
-        window=np.full(len(time), slots.duration),
+        window=length,
         channels=site.channels,
         phasor_sensor=every,
         phasor_cov=np.full((*shape, 3), np.nan),

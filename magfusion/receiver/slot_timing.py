@@ -9,7 +9,7 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.model.samples import Waveform
 from magfusion.model.site import Site, Slots
-from magfusion.receiver.slots import carriers_hz, is_pulsed, owners, schedule
+from magfusion.receiver.slots import carriers_hz, is_marked, is_pulsed, owners, schedule
 from magfusion.units import AnyArray, Array
 
 BINS = 32  # of a slot
@@ -25,10 +25,10 @@ def is_searched(site: Site) -> bool:
     The schedule's clock is then not the log's, and the silent slots, beside a carrier, are told
     from each other by their places.
     """
-    if is_pulsed(site) or all(beacon.synchronised for beacon in site.beacons):
+    if is_marked(site) or is_pulsed(site) or all(beacon.synchronised for beacon in site.beacons):
         return False
     slots = schedule(site)
-    silent = owners(site, slots) < 0
+    silent = owners(site, slots.count) < 0
     alike = [np.array_equal(np.roll(silent, k), silent) for k in range(1, slots.count)]
     return not any(alike)
 
@@ -80,7 +80,7 @@ def slot_start(waveform: Waveform, site: Site, rate_hz: float) -> float | None:
     steps = np.add.reduce([np.roll(window, -k * BINS)[:BINS] ** 2 for k in range(slots.count)])
     best = int(np.argmax(steps))
     level = window[best::BINS][: slots.count] / BINS
-    silent = owners(site, slots) < 0
+    silent = owners(site, slots.count) < 0
     fits = []
     for k in range(slots.count):
         turned = np.roll(level, -k)
@@ -98,7 +98,7 @@ def slot_start(waveform: Waveform, site: Site, rate_hz: float) -> float | None:
 def _folded(time: Array, measured: Array, site: Site, slots: Slots, rate_hz: float) -> Array | None:
     """Return the mean size of the carriers in each bin of the cycle, from the first sample on."""
     size = np.zeros(len(time))
-    for carrier_hz in np.unique(carriers_hz(site, slots)):
+    for carrier_hz in np.unique(carriers_hz(site, slots.count)):
         carried = _alone(measured, round(rate_hz * STEADY_CYCLES / carrier_hz))
         carried = carried * np.exp(-2j * np.pi * carrier_hz * time)[:, None]
         length = max(2, round(rate_hz * max(2.0 / carrier_hz, slots.duration / 16.0)))

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.model.site import Site, Slots
+from magfusion.model.site import MarkedSlots, Site, Slots
 from magfusion.receiver.ambient import STRETCH, Removal
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray, IntArray
@@ -44,8 +44,34 @@ def has_schedule(site: Site) -> bool:
     return any(beacon.slots is not None for beacon in site.beacons)
 
 
+def is_marked(site: Site) -> bool:
+    """Return whether the log marks when which coil is driven."""
+    return any(isinstance(beacon.slots, MarkedSlots) for beacon in site.beacons)
+
+
 def schedule(site: Site) -> Slots:
     """Return the schedule that all beacons of the site keep.
+
+    Raises
+    ------
+    InputError
+        As `check_kept`.
+    """
+    slots = check_kept(site)
+    assert isinstance(slots, Slots)
+    return slots
+
+
+def places(site: Site) -> int:
+    """Return into how many slots a cycle is divided; of marked ones the last is the silence."""
+    slots = check_kept(site)
+    if isinstance(slots, Slots):
+        return slots.count
+    return 2 + max(slot for beacon in site.beacons for _, slot in beacon.tones if slot is not None)
+
+
+def check_kept(site: Site) -> Slots | MarkedSlots:
+    """Return what all beacons of the site keep.
 
     Raises
     ------
@@ -98,6 +124,9 @@ def slot_lockin(site: Site, mains_hz: float = 50.0) -> LockinSettings:
     InputError
         As `schedule`.
     """
+    if is_marked(site):
+        check_kept(site)
+        return LockinSettings(0.0, 0.0, mains_hz)  # each burst has a length of its own
     duration = schedule(site).duration
     return LockinSettings(duration, duration, mains_hz)
 
@@ -112,6 +141,13 @@ def slot_settings_of(site: Site, lockin: LockinSettings | None) -> SlotSettings:
     """
     if lockin is None:
         return default_slot_settings(site)
+    if is_marked(site):
+        if lockin.window > 0.0:
+            raise InputError(
+                f"--window {lockin.window:g} s: the marked bursts are the windows; leave the option"
+                " out"
+            )
+        return default_slot_settings(site, lockin.mains_hz)
     duration = schedule(site).duration
     if abs(lockin.window - duration) > 1e-9 * duration:
         raise InputError(
@@ -133,14 +169,14 @@ def history_of(site: Site, settings: SlotSettings) -> int:
 
 def driven_slots(site: Site, number: IntArray) -> BoolArray:
     """Tell in which slots, counted on, a coil is driven."""
-    slots = schedule(site)
-    return owners(site, slots)[number % slots.count] >= 0
+    count = places(site)
+    return owners(site, count)[number % count] >= 0
 
 
-def carriers_hz(site: Site, slots: Slots) -> Array:
+def carriers_hz(site: Site, count: int) -> Array:
     """Return the carrier of each slot of a cycle (Hz); that of the first coil in silent ones."""
     tones = [(slot, f) for beacon in site.beacons for f, slot in beacon.tones]
-    carrier = np.full(slots.count, tones[0][1])
+    carrier = np.full(count, tones[0][1])
     for slot, frequency in tones:
         assert slot is not None
         carrier[slot] = frequency
@@ -155,7 +191,7 @@ def check_carriers(site: Site, rate_hz: float, settings: SlotSettings) -> None:
     InputError
     """
     slots = schedule(site)
-    carrier = carriers_hz(site, slots)
+    carrier = carriers_hz(site, slots.count)
     if slots.duration * rate_hz < LEAST_SAMPLES * (1.0 - 1e-6):
         raise InputError(
             f"magnetometer: sampled at {rate_hz:.4g} Hz, too slow for slots of"
@@ -179,16 +215,16 @@ def check_carriers(site: Site, rate_hz: float, settings: SlotSettings) -> None:
             "silent slots cannot determine the ambient field at several carriers; demodulate"
             " without them, or drive all coils at one frequency"
         )
-    if (apart or highest == 0.0) and np.all(owners(site, slots) >= 0):
+    if (apart or highest == 0.0) and np.all(owners(site, slots.count) >= 0):
         raise InputError(
             f"all {slots.count} time slots are driven and none determines the ambient field; leave"
             " one silent, or drive the coils with a carrier"
         )
 
 
-def owners(site: Site, slots: Slots) -> IntArray:
+def owners(site: Site, count: int) -> IntArray:
     """Return the channel that each slot of a cycle drives; -1 where it is silent."""
-    owner = np.full(slots.count, -1)
+    owner = np.full(count, -1)
     tones = [slot for beacon in site.beacons for _, slot in beacon.tones]
     owner[np.array(tones)] = np.arange(len(tones))
     return owner

@@ -25,6 +25,7 @@ from magfusion.simulation.motion import (
     static_motion,
     turning_motion,
 )
+from magfusion.simulation.slots import Multiplexer, draw_marks, is_multiplexed
 from magfusion.simulation.waveform import Mains, simulate_waveform
 from magfusion.units import Array
 
@@ -69,6 +70,8 @@ class SimulationConfig:
     random_field : float
         Smooth random error of each beacon's field, as a share of it, alike within the site's
         ``model_error_length``; where there is one it takes the place of the ambient's bending.
+    multiplexer : Multiplexer
+        By which coils are driven whose slots the site declares as marked.
     """
 
     box_world: Array
@@ -88,6 +91,7 @@ class SimulationConfig:
     ambient: Ambient | None = None
     iron: int = 0
     random_field: float = 0.0
+    multiplexer: Multiplexer = field(default_factory=Multiplexer)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +163,9 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         config.mains,
         config.quantisation,
         ambient,
+        draw_marks(site, config.multiplexer, config.duration, rng.spawn(1)[0])
+        if is_multiplexed(site)
+        else None,
     )
     stamp = imu.samples.time
     clock = true_site.platform.imu

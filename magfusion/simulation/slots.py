@@ -1,15 +1,53 @@
 """Coils that are driven in turn: when each carries its current."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.model.site import Beacon
+from magfusion.model.marks import SILENT, Marks
+from magfusion.model.site import Beacon, MarkedSlots, Site
 from magfusion.units import Array
 
 LEAST_SAMPLES_PER_SLOT = 4
+SHORTEST_PAUSE = 0.05  # of the longest
 
 
-def check_slots(beacon: Beacon, rate_hz: float) -> None:
+@dataclass(frozen=True)
+class Multiplexer:
+    """A host that drives one coil after the other, and pauses as long as it happens to.
+
+    Parameters
+    ----------
+    burst : float
+        Of each coil, and of the silence after the last (s).
+    pause : float
+        Longest between two (s); each is drawn.
+    """
+
+    burst: float = 0.002
+    pause: float = 0.002
+
+
+def is_multiplexed(site: Site) -> bool:
+    """Return whether bursts of the site's coils follow no clock."""
+    return any(isinstance(beacon.slots, MarkedSlots) for beacon in site.beacons)
+
+
+def draw_marks(
+    site: Site, multiplexer: Multiplexer, duration: float, rng: np.random.Generator
+) -> Marks:
+    """Return the bursts of a host; in those of `SILENT` no coil is driven, as in the pauses."""
+    slots = sorted({s for beacon in site.beacons for _, s in beacon.tones if s is not None})
+    longest, burst = multiplexer.pause, multiplexer.burst
+    count = int(np.ceil(duration / burst))
+    pause = rng.uniform(SHORTEST_PAUSE * longest, longest, count)
+    begin = np.cumsum(pause + burst) - burst
+    turn = np.resize(np.array([*slots, SILENT], dtype=np.int64), count)
+    return Marks(begin, begin + burst, turn).rows(begin + burst < duration)
+
+
+def check_slots(beacon: Beacon, rate_hz: float, marks: Marks | None = None) -> None:
     """Refuse coils in time slots that no schedule drives, or that the samples cannot follow.
 
     Raises
@@ -18,21 +56,27 @@ def check_slots(beacon: Beacon, rate_hz: float) -> None:
     """
     if all(slot is None for _, slot in beacon.tones):
         return
-    if beacon.slots is None:
+    slots = beacon.slots
+    if slots is None or (isinstance(slots, MarkedSlots) and marks is None):
         raise InputError(
             f"beacons.{beacon.name}: found coils in time slots, of which no waveform can be "
             "simulated without the beacon's slots: {duration_s, count}; add it, or give each coil "
             "a frequency_hz instead"
         )
-    least = LEAST_SAMPLES_PER_SLOT / beacon.slots.duration
+    if isinstance(slots, MarkedSlots):
+        assert marks is not None
+        duration = float(np.min(marks.end - marks.begin, initial=np.inf))
+    else:
+        duration = slots.duration
+    least = LEAST_SAMPLES_PER_SLOT / duration
     if rate_hz < least:
         raise InputError(
-            f"magnetometer_rate_hz: found {rate_hz} Hz and slots of {beacon.slots.duration} s in "
+            f"magnetometer_rate_hz: found {rate_hz} Hz and slots of {duration} s in "
             f"beacon {beacon.name}; give at least {least:g} Hz"
         )
 
 
-def slot_gates(beacon: Beacon, time: Array) -> Array:
+def slot_gates(beacon: Beacon, time: Array, marks: Marks | None = None) -> Array:
     """Return one while a tone's coils are driven and zero otherwise, shape (n, tones).
 
     The current is switched at once: a real driver takes its time constant.
@@ -40,7 +84,13 @@ def slot_gates(beacon: Beacon, time: Array) -> Array:
     gates = np.ones((len(time), len(beacon.tones)))
     if beacon.slots is None:
         return gates
-    running = beacon.slots.running(time) % beacon.slots.count
+    if isinstance(beacon.slots, MarkedSlots):
+        assert marks is not None
+        row = np.searchsorted(marks.begin, time, side="right") - 1
+        inside = (row >= 0) & (time < marks.end[row])
+        running = np.where(inside, marks.slot[row], SILENT)
+    else:
+        running = beacon.slots.running(time) % beacon.slots.count
     for k, (_, slot) in enumerate(beacon.tones):
         if slot is not None:
             gates[:, k] = running == slot

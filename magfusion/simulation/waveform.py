@@ -5,12 +5,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.model.marks import Marks
 from magfusion.model.samples import Waveform
-from magfusion.model.site import Site
+from magfusion.model.site import Site, Slots
 from magfusion.simulation.disturbance import Ambient
 from magfusion.simulation.field import Drives, phasors_world
 from magfusion.simulation.motion import Motion
-from magfusion.simulation.slots import check_slots, slot_gates
+from magfusion.simulation.slots import Multiplexer, check_slots, slot_gates
 from magfusion.units import Array
 
 LEAST_SAMPLES_PER_CYCLE = 2.5
@@ -40,11 +41,21 @@ class Mains:
     direction_world: Array = field(default_factory=_vertical)
 
 
-def usual_rate_hz(site: Site) -> float:
-    """Return a sampling rate that suits the fastest tone and the shortest time slot (Hz)."""
+def usual_rate_hz(site: Site, burst: float = Multiplexer.burst) -> float:
+    """Return a sampling rate that suits the fastest tone and the shortest time slot (Hz).
+
+    Parameters
+    ----------
+    burst : float
+        Length of a slot that no clock tells (s).
+    """
     least = [LEAST_SAMPLES_PER_CYCLE * float(b.tone_frequencies_hz.max()) for b in site.beacons]
-    slots = [USUAL_SAMPLES_PER_SLOT / b.slots.duration for b in site.beacons if b.slots is not None]
-    return max(USUAL_RATE_HZ, *least, *slots)
+    lengths = [
+        b.slots.duration if isinstance(b.slots, Slots) else burst
+        for b in site.beacons
+        if b.slots is not None
+    ]
+    return max(USUAL_RATE_HZ, *least, *(USUAL_SAMPLES_PER_SLOT / length for length in lengths))
 
 
 def simulate_waveform(
@@ -57,6 +68,7 @@ def simulate_waveform(
     mains: Mains | None = None,
     quantisation: float | None = None,
     ambient: Ambient | None = None,
+    marks: Marks | None = None,
 ) -> Waveform:
     """Return the field of everything at each sample's own pose, as the magnetometer gives it.
 
@@ -75,6 +87,8 @@ def simulate_waveform(
         Step of the instrument (T).
     ambient : Ambient, optional
         Iron, bending, noise and drift of the room.
+    marks : Marks, optional
+        When the coils are driven whose slots no clock tells.
 
     Raises
     ------
@@ -82,7 +96,7 @@ def simulate_waveform(
         If the rate is too low for the tones or slots, coils are driven in time slots whose schedule
         the site does not declare, or the motion leads through iron.
     """
-    _check_tones(site, rate_hz)
+    _check_tones(site, rate_hz, marks)
     count = int(np.floor(duration * rate_hz * (1.0 + 1e-12)))
     if count < 1:
         raise InputError(
@@ -93,7 +107,7 @@ def simulate_waveform(
     world_from_body = motion.world_from_body(time)
     lever_world = world_from_body.apply(magnetometer.position_body)
     point_world = motion.position_world(time) + lever_world
-    field_world = _beacons_world(site, drives, time, point_world, ambient or Ambient())
+    field_world = _beacons_world(site, drives, time, point_world, ambient or Ambient(), marks)
     if site.earth_field_world is not None:
         field_world += site.earth_field_world
     if mains is not None:
@@ -105,10 +119,10 @@ def simulate_waveform(
     measured += rng.normal(0.0, magnetometer.noise_density * np.sqrt(rate_hz / 2.0), (count, 3))
     if quantisation:
         measured = quantisation * np.round(measured / quantisation)
-    return Waveform(time, measured)
+    return Waveform(time, measured, marks)
 
 
-def _check_tones(site: Site, rate_hz: float) -> None:
+def _check_tones(site: Site, rate_hz: float, marks: Marks | None) -> None:
     for beacon in site.beacons:
         highest = float(beacon.tone_frequencies_hz.max())
         if rate_hz < LEAST_SAMPLES_PER_CYCLE * highest:
@@ -116,11 +130,16 @@ def _check_tones(site: Site, rate_hz: float) -> None:
                 f"magnetometer_rate_hz: found {rate_hz} Hz and a tone of {highest} Hz in beacon "
                 f"{beacon.name}; give at least {LEAST_SAMPLES_PER_CYCLE * highest} Hz"
             )
-        check_slots(beacon, rate_hz)
+        check_slots(beacon, rate_hz, marks)
 
 
 def _beacons_world(
-    site: Site, drives: Drives, time: Array, point_world: Array, ambient: Ambient
+    site: Site,
+    drives: Drives,
+    time: Array,
+    point_world: Array,
+    ambient: Ambient,
+    marks: Marks | None,
 ) -> Array:
     field_world = np.zeros((len(time), 3))
     first = 0
@@ -128,7 +147,7 @@ def _beacons_world(
         phasors = phasors_world(beacon, point_world, ambient.spheres, ambient.layers)
         if ambient.bending is not None:
             phasors = ambient.bending.bent_world(i, phasors, point_world)
-        gates = slot_gates(beacon, time)
+        gates = slot_gates(beacon, time, marks)
         for k, frequency_hz in enumerate(beacon.tone_frequencies_hz):
             turns = 2.0 * np.pi * frequency_hz * (1.0 + drift) * time
             carrier = np.exp(1j * (turns + drives.phase[first + k]))

@@ -15,6 +15,7 @@ from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.settings import EstimatorSettings
 from magfusion.estimation.state import POSITION, ROTATION, State
 from magfusion.estimation.stream_buffer import Buffer
+from magfusion.model.marks import Marks
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
 from magfusion.model.site import Site
 from magfusion.model.trust import Trust, Verdict
@@ -87,6 +88,7 @@ def find_online_start(
     steady: list[SteadyFields],
     until: float,
     settings: EstimatorSettings,
+    marks: Marks | None = None,
 ) -> OnlineStart | NoStart:
     """Return the state at the last epoch before a time; or why the data lead to none.
 
@@ -98,6 +100,8 @@ def find_online_start(
         Beside ``fields``.
     until : float
         (s)
+    marks : Marks, optional
+        When which coil was driven, where the site's slots are marked.
     """
     time, rows = waveform.rows()
     if not fields:
@@ -111,7 +115,7 @@ def find_online_start(
         epoch_ns=0,
         source="online",
         imu=imu,
-        waveform=None if fields else Waveform(time[time <= until], rows[time <= until]),
+        waveform=None if fields else Waveform(time[time <= until], rows[time <= until], marks),
         fields=FieldSamples.joined(whole) if whole else None,
         steady=_joined_steady(steady, whole) if whole and steady else None,
         inertial=site.platform.inertial,
@@ -119,7 +123,7 @@ def find_online_start(
     asked = {f.name: getattr(settings, f.name) for f in fields_of(EstimatorSettings)}
     heard = log
     try:
-        if log.waveform is not None and has_schedule(site) and joins(site):
+        if log.waveform is not None and has_schedule(site) and joins(site, log.waveform.marks):
             log = _of_cycles(log, log.waveform, site, settings)
         result = smooth(log, site, SmootherSettings(loss="huber", **asked))
         honest, trust = judged(result, log)

@@ -29,7 +29,7 @@ from magfusion.estimation.integrity.motion_causes import (
 )
 from magfusion.estimation.integrity.motion_comparison import compared, surveyed
 from magfusion.estimation.integrity.phase_causes import phase_causes
-from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
+from magfusion.model.samples import FieldSamples, ImuSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.receiver.cycles import whole_cycles
@@ -251,9 +251,7 @@ def _part(log: Log) -> Log:
     return replace(
         log,
         imu=ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept]),
-        waveform=None
-        if wave is None
-        else Waveform(wave.time[w := within(wave.time)], wave.measured_sensor[w]),
+        waveform=None if wave is None else wave.rows(within(wave.time)),
         fields=None if fields is None else fields.rows(within(fields.time)),
         steady=None,
     )

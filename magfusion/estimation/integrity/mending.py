@@ -15,7 +15,7 @@ from magfusion.estimation.integrity.samples import (
     frozen_samples,
     streams,
 )
-from magfusion.model.samples import ImuSamples, Log, Waveform
+from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Verdict
 from magfusion.receiver.even_clocks import on_even_clocks
@@ -38,7 +38,7 @@ def mended(log: Log, site: Site) -> Log:
     imu = ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept])
     if wave is not None:
         kept = np.delete(np.arange(len(wave)), found["magnetometer"])
-        wave = Waveform(wave.time[kept], wave.measured_sensor[kept])
+        wave = wave.rows(kept)
     return replace(log, imu=imu, waveform=wave, noticed=(*log.noticed, *noticed))
 
 

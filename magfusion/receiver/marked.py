@@ -1,0 +1,159 @@
+"""The receiver of coils that a host drives one after the other, and says when: marked bursts."""
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.model.marks import Marks
+from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
+from magfusion.model.site import Site
+from magfusion.receiver.admission import Grid, Windows, sample_rate_hz
+from magfusion.receiver.cycles import cycles
+from magfusion.receiver.marked_bursts import LATE, LONGEST_BURST, Bursts
+from magfusion.receiver.receiver import LEAST_SHARE_OF_SLOT, SlotReceiver
+from magfusion.receiver.slots import (
+    LEAST_CYCLES,
+    LEAST_SAMPLES,
+    SlotSettings,
+    carriers_hz,
+    check_kept,
+    history_of,
+    is_pulsed,
+    owners,
+    places,
+    slot_settings_of,
+)
+from magfusion.receiver.turn import Turn
+from magfusion.receiver.windows import LockinSettings
+from magfusion.units import Array, BoolArray, IntArray
+
+TOO_SHORT = "burst too short for its tone"
+OUTSIDE = "burst outside of the samples"
+MEMORY = 2.0  # s; for which a burst tells later ones of the noise and the ambient field
+PATIENCE = 0.5  # s; marks that come later than their samples by more are too late
+ROUNDING = 1e-8  # s; of a stamp
+
+
+class MarkedReceiver(SlotReceiver):
+    """Each burst a row at its own time; those of a short cycle are one epoch."""
+
+    bursts: Bursts
+    _reached: float
+
+    def __init__(self, site: Site, settings: LockinSettings | SlotSettings | None = None) -> None:
+        super().__init__(site, settings)
+        self.bursts, self._reached = Bursts(site), -np.inf
+
+    @property
+    def remembered(self) -> int:
+        """For how many bursts one that was admitted is needed, where they are not too old."""
+        return history_of(self.site, self.settings) * places(self.site)
+
+    @property
+    def history(self) -> float:
+        """As of `Receiver.history`."""
+        return 0.0 if self.grid is None else MEMORY + PATIENCE + LONGEST_BURST
+
+    @property
+    def marks(self) -> Marks | None:
+        """The bursts that are kept."""
+        return self.bursts.marks
+
+    def hear_marks(self, marks: Marks) -> None:
+        """Take bursts, as `Receiver.hear_marks`."""
+        self.bursts.add(marks)
+
+    def hear_slots(self, time: Array, slot: IntArray) -> None:
+        """Take the bursts that the slots beside samples end, as `Receiver.hear_slots`."""
+        self.bursts.add(self.bursts.column.hear(time, slot))
+
+    def forget_marks(self, before: float) -> None:
+        """Drop bursts, as `Receiver.forget_marks`."""
+        self.bursts.forget(self.bursts.since(before))
+
+    def check(self) -> None:
+        """Refuse beacons of which not all are marked, as `Receiver.check`."""
+        check_kept(self.site)
+        slot_settings_of(self.site, None if isinstance(self._given, SlotSettings) else self._given)
+
+    def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
+        """Go on from the first burst that the samples hold, as `Receiver.begin`."""
+        check_kept(self.site)
+        rate_hz = sample_rate_hz(waveform)
+        highest = float(np.max(carriers_hz(self.site, places(self.site))))
+        if highest > 0.45 * rate_hz:
+            raise InputError(
+                f"magnetometer: sampled at {rate_hz:.4g} Hz, too slow for the carrier at"
+                f" {highest:g} Hz; at least {highest / 0.45:.4g} Hz are needed"
+            )
+        if len(self.bursts) == 0 and waveform.marks is not None:
+            self.bursts.add(waveform.marks)
+        if len(self.bursts) == 0:
+            raise InputError(
+                "magnetometer: the site's slots are marked, and nothing marks them; give each"
+                " sample its slot, or a table of marks with start_ns, end_ns and slot"
+            )
+        self.next_number = self.bursts.since(float(waveform.time[0]) - LATE / rate_hz)
+        # The plateau of a pulse is no saturation.
+        clips = not is_pulsed(self.site)
+        self._begin(waveform, imu, Grid(0.0, 0.0, 0.0), LEAST_SHARE_OF_SLOT, clips=clips)
+        assert self.admission is not None
+        self.admission.slack = 1
+
+    def _admitted(self, waveform: Waveform, imu: ImuSamples) -> Windows:
+        """Count the bursts that no samples are of, too."""
+        self.begin(waveform, imu)
+        before = self.next_number - self.bursts.first
+        found = self.admit(waveform, imu)
+        behind = self.bursts.first + len(self.bursts) - self.next_number
+        self._count(OUTSIDE, before + behind)
+        return found
+
+    def admit(self, waveform: Waveform, imu: ImuSamples, until: float | None = None) -> Windows:
+        """Leave out the bursts that are too short for their tone, too, as `Receiver.admit`."""
+        found = super().admit(waveform, imu, until)
+        turns = found.length * carriers_hz(self.site, places(self.site))[found.place]
+        short = (turns < LEAST_CYCLES) & (turns > 0.0) | (found.count < LEAST_SAMPLES)
+        self._count(TOO_SHORT, int(np.sum(short)))
+        return found.rows(~short)
+
+    def centre_of(self, number: int) -> float:
+        """Return the middle of a burst (s), as far as it is known."""
+        centre = self.bursts.next_centre(number)
+        known = number < self.bursts.first + len(self.bursts)
+        return centre if known else max(centre, self._reached - PATIENCE)
+
+    def _last(self, until: float) -> int:
+        assert self.admission is not None
+        self._reached = max(self._reached, until)
+        late = LATE * self.admission.magnetometer_step
+        return self.bursts.last(until + late, self.next_number)
+
+    def _last_of_log(self, waveform: Waveform) -> int:
+        assert self.admission is not None
+        late = LATE * self.admission.magnetometer_step
+        return self.bursts.until(float(waveform.time[-1]) + late)
+
+    def _windows(self, number: IntArray, time: Array) -> Windows:
+        marks, centre, place = self.bursts.rows(number)
+        first = np.searchsorted(time, marks.begin - ROUNDING)
+        count = np.searchsorted(time, marks.end - ROUNDING) - first
+        return Windows(number, centre, first, count, marks.end - marks.begin, place)
+
+    def _known(self, new: Windows) -> IntArray:
+        """Forget what is too old, and the marks of it."""
+        known = super()._known(new)
+        if len(new):
+            centre = self.bursts.rows(known)[1]
+            known = known[centre > new.centre[0] - MEMORY]
+        # The one before the first tells how far back samples are needed.
+        self.bursts.forget(min([*known[:1].tolist(), self.next_number]) - 1)
+        return known
+
+    def _joined(self, found: FieldSamples, number: IntArray, turn: Turn) -> FieldSamples:
+        return cycles(found, turn, self.site, self.bursts.epochs(number))
+
+    def _driven(self, windows: Windows) -> BoolArray:
+        return np.asarray(owners(self.site, places(self.site))[windows.place] >= 0)
+
+    def _follow(self, waveform: Waveform) -> None:
+        """Leave the bursts where they are marked."""

@@ -1,0 +1,167 @@
+"""Bursts that were marked and are not demodulated yet, and which of them are one epoch."""
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.model.marks import SILENT, Marks, SlotColumn
+from magfusion.model.site import Site
+from magfusion.receiver.slots import is_pulsed, places
+from magfusion.units import Array, IntArray
+
+# s; from the first to the last slot of an epoch. Half as long after its middle, a head that is
+# accelerated by 10 m/s^2 is 0.2 mm from where a steady velocity leads.
+LONGEST_EPOCH = 0.012
+LONGEST_BURST = 1.0  # s; a longer one is taken in pieces
+OVERLAP = 1e-6  # s; that rounding may make
+LATE = 0.6  # steps before a burst's end, after which no sample of it comes
+
+
+class Bursts:
+    """Bursts with their numbers, counted on, and their epochs.
+
+    A coil that comes again begins another epoch, as does a burst more than `LONGEST_EPOCH` after
+    the first.
+
+    Attributes
+    ----------
+    marks : Marks
+        Those that are kept, no longer than `LONGEST_BURST`.
+    first : int
+        Number of the first of these.
+    column : SlotColumn
+        Of samples beside which a slot stands.
+    """
+
+    # What a checkpoint holds.
+    marks: Marks
+    first: int
+    column: SlotColumn
+    _epoch: IntArray
+    _taken: list[int]
+    _since: float
+    _end: float
+    _newest: int
+
+    def __init__(self, site: Site) -> None:
+        self._count, self._silences = places(site), is_pulsed(site)
+        self._slots = sorted({s for b in site.beacons for _, s in b.tones if s is not None})
+        self.marks, self.first, self.column = Marks.none(), 0, SlotColumn()
+        self._epoch, self._taken = np.zeros(0, dtype=np.int64), []
+        self._since = self._end = -np.inf
+        self._newest = 0
+
+    def __len__(self) -> int:
+        return len(self.marks)
+
+    def add(self, marks: Marks) -> None:
+        """Take bursts that follow those that came.
+
+        Raises
+        ------
+        InputError
+            Where they do not, or a slot is of no coil.
+        """
+        self._check(marks)
+        if len(marks) == 0:
+            return
+        self._end = float(marks.end[-1])
+        if not self._silences:  # beside a carrier they determine nothing
+            marks = marks.rows(marks.slot != SILENT)
+        marks = _in_pieces(marks)
+        epochs = [self._epoch_of(*one) for one in zip(marks.slot, _centres(marks), strict=True)]
+        self._epoch = np.append(self._epoch, np.array(epochs, dtype=np.int64))
+        self.marks = self.marks.joined(marks)
+
+    def _check(self, marks: Marks) -> None:
+        known = np.isin(marks.slot, [*self._slots, SILENT])
+        if not np.all(known):
+            k = int(np.argmin(known))
+            slots = ", ".join(map(str, self._slots))
+            raise InputError(
+                f"marks: slot {marks.slot[k]} at {marks.begin[k]:.6f} s is of no coil; the site's"
+                f" coils have {slots}; write {SILENT} where none is driven"
+            )
+        before = np.append(self._end, marks.end)[:-1]
+        askew = (marks.end <= marks.begin) | (marks.begin < before - OVERLAP)
+        if np.any(askew):
+            k = int(np.argmax(askew))
+            raise InputError(
+                f"marks: the burst from {marks.begin[k]:.6f} to {marks.end[k]:.6f} s does not"
+                f" follow the one that ends at {before[k]:.6f} s; give bursts in order of time that"
+                " do not overlap"
+            )
+
+    def _epoch_of(self, slot: int, centre: float) -> int:
+        """Return the epoch of the next burst; a silent one is of that of the burst before."""
+        if slot == SILENT:
+            return self._newest
+        if not self._taken or slot in self._taken or centre - self._since > LONGEST_EPOCH:
+            self._newest, self._taken, self._since = self._newest + 1, [], float(centre)
+        self._taken.append(int(slot))
+        return self._newest
+
+    @property
+    def numbers(self) -> IntArray:
+        """Number of each burst."""
+        return self.first + np.arange(len(self))
+
+    def next_centre(self, number: int) -> float:
+        """Return the middle of a burst (s); of one to come when it may begin at the earliest."""
+        row = number - self.first
+        if row < 0:
+            return float(self.marks.begin[0]) - LONGEST_BURST if len(self) else -np.inf
+        return float(_centres(self.marks)[row]) if row < len(self) else self._end
+
+    def epochs(self, number: IntArray) -> IntArray:
+        """Return the epoch of each burst."""
+        return self._epoch[number - self.first]
+
+    def last(self, until: float, next_number: int) -> int:
+        """Return the number of the last burst that is complete at a time (s), and its epoch.
+
+        Parameters
+        ----------
+        next_number : int
+            From which on they are asked for.
+        """
+        begin = max(next_number - self.first, 0)
+        own = slice(begin, None)
+        full = len(self._taken) == len(self._slots)
+        closed = (self._epoch[own] < self._newest) | full | (self.marks.slot[own] == SILENT)
+        waiting = np.flatnonzero(~closed | (self.marks.end[own] > until))
+        return self.first + begin + (int(waiting[0]) if len(waiting) else len(closed)) - 1
+
+    def since(self, time: float) -> int:
+        """Return the number of the first burst that begins at a time (s) or later."""
+        return self.first + int(np.searchsorted(self.marks.begin, time))
+
+    def until(self, time: float) -> int:
+        """Return the number of the last burst that ends at a time (s) or before."""
+        return self.first + int(np.searchsorted(self.marks.end, time, side="right")) - 1
+
+    def rows(self, number: IntArray) -> tuple[Marks, Array, IntArray]:
+        """Return bursts by number, with their middle (s) and place in a cycle."""
+        found = self.marks.rows(number - self.first)
+        return found, _centres(found), found.slot % self._count
+
+    def forget(self, number: int) -> None:
+        """Drop the bursts before a number."""
+        gone = min(max(number - self.first, 0), len(self))
+        self.marks, self._epoch = self.marks.rows(slice(gone, None)), self._epoch[gone:]
+        self.first += gone
+
+
+def _centres(marks: Marks) -> Array:
+    return np.asarray(0.5 * (marks.begin + marks.end))
+
+
+def _in_pieces(marks: Marks) -> Marks:
+    """Return bursts of which none is longer than `LONGEST_BURST`."""
+    length = marks.end - marks.begin
+    pieces = np.maximum(np.ceil(length / LONGEST_BURST - 1e-9), 1.0).astype(np.int64)
+    if np.all(pieces == 1):
+        return marks
+    row = np.repeat(np.arange(len(marks)), pieces)
+    place = np.arange(len(row)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    begin = marks.begin[row] + LONGEST_BURST * place
+    return Marks(begin, np.minimum(begin + LONGEST_BURST, marks.end[row]), marks.slot[row])
