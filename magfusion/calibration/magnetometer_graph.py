@@ -20,7 +20,7 @@ from magfusion.model.strapdown import triad
 from magfusion.units import Array
 
 GYRO_BIAS_KEY = gtsam.symbol("g", 0)
-COLUMNS = 17  # matrix, offset, dip, accelerometer bias, size of the field
+COLUMNS = 17  # matrix, offset, dip, accelerometer bias, logarithm of the field's size
 MOST_STEPS = 40
 SETTLED = 1e-9  # relative decrease of the cost that ends the loop
 ATTITUDE_STEP, GYRO_BIAS_STEP = np.full(3, 0.3), np.full(3, 0.01)  # rad, rad/s
@@ -76,7 +76,7 @@ class Prior:
     dip_sigma : float
         Of the angle between field and vertical (rad).
     size_sigma : float
-        Of the size of the field, over its size.
+        Of the natural logarithm of the field's size.
     gravity : float
         (m/s^2)
     accel_bias_sigma, gyro_bias_sigma : float
@@ -148,7 +148,6 @@ class Readings:
         self.active[13:16] = self.force is not None and prior.accel_bias_sigma > 0.0
         self.active[16] = prior.size_sigma > 0.0
         self.declared = np.zeros(COLUMNS)
-        self.declared[16] = 1.0
         self.declared[:12] = np.concatenate([prior.matrix.ravel(), prior.offset / self.size])
 
     def prior_cov(self) -> Array:
@@ -178,7 +177,7 @@ class Readings:
         """Return whitened residuals (n, m) with derivatives by attitude and calibration."""
         c, mounting = self.all_columns(estimate), self.prior.body_from_sensor
         body_from_world = np.swapaxes(_attitudes(estimate.values, self.n), -1, -2)
-        field_world, by_dip = (c[16] * of_size_one for of_size_one in self.field_at(c[12]))
+        field_world, by_dip = (np.exp(c[16]) * of_size_one for of_size_one in self.field_at(c[12]))
         field_body = body_from_world @ field_world
         matrix, field_sensor = c[:9].reshape(3, 3), field_body @ mounting
         sensor_from_body = matrix @ mounting.T
@@ -188,7 +187,7 @@ class Readings:
         by_calibration[:, :, :9] = by_matrix(field_sensor)
         by_calibration[:, :, 9:12] = np.eye(3)
         by_calibration[:, :, 12] = body_from_world @ by_dip @ sensor_from_body.T
-        by_calibration[:, :, 16] = field_sensor @ matrix.T / c[16]
+        by_calibration[:, :, 16] = field_sensor @ matrix.T
         weight = self.field_weight
         if self.force is None:
             return weight * error, weight * by_attitude, weight * by_calibration[..., self.active]
@@ -245,7 +244,7 @@ def fit_graph(epochs: Epochs, prior: Prior, start: MagnetometerFit | None = None
         field_residual=readings.rows(found.estimate)[0][:, :3],
         chi_square=2.0 * found.cost,
         iterations=found.iterations,
-        size_ratio=float(c[16]),
+        size_ratio=float(np.exp(c[16])),
     )
 
 

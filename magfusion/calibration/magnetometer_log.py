@@ -32,7 +32,7 @@ FEWEST_EPOCHS = 20  # of slow turning
 ONE_AXIS = 1.5 * DEGREE  # RMS; a field that wanders less in its second direction saw no turning
 KNOWN_DIP = 3.0 * DEGREE  # sigma; what steel in a building does to a reference field
 UNKNOWN_DIP = 1.0  # rad
-WIDE_SIZE = 10.0  # of the field's size, where nobody declared it
+WIDE_SIZE = 3.0  # sigma of the logarithm of the field's size, where nobody declared it
 ACCEL_FLOOR = 0.03  # m/s^2; scale errors of MEMS accelerometers
 GYRO_SCALE = 0.001  # relative; errors of scale and axes of a calibrated MEMS gyro
 SHAKEN = 5  # epochs over which disturbed specific force is looked for
@@ -111,6 +111,9 @@ def calibrate_log(
     prior = _prior(site, readings)
     turns = _turns(imu, site, readings.time)
     begun = _starts(readings, imu, site, up_sensor, prior, missing)
+    if site.earth_field_world is None:
+        seen = _field_seen(readings, known, begun[0].matrix, begun[0].offset)
+        prior = replace(prior, field_world=seen)
     sigma = FIRST_SIGMA * float(np.linalg.norm(prior.field_world))
     for _ in range(PASSES):
         epochs = Epochs(
@@ -205,12 +208,7 @@ def _prior(site: Site, readings: SteadyField) -> Prior:
     known, imu = site.platform.magnetometer, site.platform.imu
     field, dip_sigma, size_sigma = site.earth_field_world, KNOWN_DIP, 0.0
     if field is None:
-        field_sensor = field_from_measured(readings.measured_sensor, known.matrix, known.offset)
-        field_body = field_sensor @ known.body_from_sensor.T
-        size = float(np.median(np.linalg.norm(field_body, axis=1)))
-        up = readings.accel_body / np.linalg.norm(readings.accel_body, axis=1, keepdims=True)
-        vertical = float(np.clip(np.median(np.sum(up * field_body, axis=1)) / size, -0.99, 0.99))
-        field = size * np.array([0.0, np.sqrt(1.0 - vertical**2), vertical])
+        field = _field_seen(readings, known, known.matrix, known.offset)
         dip_sigma, size_sigma = UNKNOWN_DIP, WIDE_SIZE
     return Prior(
         body_from_sensor=known.body_from_sensor,
@@ -224,6 +222,16 @@ def _prior(site: Site, readings: SteadyField) -> Prior:
         gyro_bias_sigma=imu.gyro_bias_sigma,
         size_sigma=size_sigma,
     )
+
+
+def _field_seen(readings: SteadyField, known: Magnetometer, matrix: Array, offset: Array) -> Array:
+    """Return the Earth field in a world whose north it sets, as a calibration sees it (T)."""
+    field_body = field_from_measured(readings.measured_sensor, matrix, offset)
+    field_body = field_body @ known.body_from_sensor.T
+    size = float(np.median(np.linalg.norm(field_body, axis=1)))
+    up = readings.accel_body / np.linalg.norm(readings.accel_body, axis=1, keepdims=True)
+    vertical = float(np.clip(np.median(np.sum(up * field_body, axis=1)) / size, -0.99, 0.99))
+    return size * np.array([0.0, np.sqrt(1.0 - vertical**2), vertical])
 
 
 def _starts(

@@ -16,7 +16,7 @@ from magfusion.calibration.magnetometer import (
     refined,
 )
 from magfusion.calibration.magnetometer_graph import GraphFit, Prior
-from magfusion.calibration.magnetometer_log import LINEARITY, WIDE_SIZE, LogCalibration
+from magfusion.calibration.magnetometer_log import LINEARITY, LogCalibration
 from magfusion.calibration.magnetometer_start import APART, UNLIKELY, mirrored, places
 from magfusion.calibration.steady_field import SteadyField, steady_alone
 from magfusion.errors import EstimationError, InputError
@@ -30,6 +30,7 @@ NEW = 1.0 * DEGREE  # of the field: what turned less since the last reading is n
 NARROW = 3.0 * DEGREE  # RMS in the second direction; less is turning about no axis
 FIRST_SIGMA = 1e-3  # of the field, before the scatter is known
 HOMOGENEOUS = 1e-3  # of the field; what steel changes it by over the length of an arm
+WIDE_SIZE = 10.0  # of the field's size, where nobody declared it
 PASSES = 3
 KNOWN_SIZE = 1e-6  # of the field's size, where it was declared
 SETTLED = 1e-4  # of a chi square, which another step would gain
