@@ -9,14 +9,27 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.at_rest import AtRest
 from magfusion.model.ground import in_ground
 from magfusion.model.samples import Log
 from magfusion.model.site import Beacon, BeaconSigma, Coil, Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.simulation.atmosphere import Atmosphere
 from magfusion.simulation.demo_site import demo_site
+from magfusion.simulation.disturbance import Ambient
 from magfusion.simulation.inertial import simulate_imu
-from magfusion.simulation.log import EPOCH_NS, draw_drives
+from magfusion.simulation.log import (
+    EPOCH_NS,
+    Reference,
+    SimulatedLog,
+    SimulationConfig,
+    draw_drives,
+    simulate_fields,
+    simulate_log,
+)
 from magfusion.simulation.motion import static_motion
 from magfusion.simulation.waveform import simulate_waveform
+from magfusion.units import Array
 
 DISTANCE = 300.0  # m, of each beacon from the middle
 DIRECTIONS = np.array([[1.0, 0.9, 0.4], [-0.9, 1.0, -0.5], [-1.0, -0.8, 0.6], [0.8, -1.0, -0.3]])
@@ -24,6 +37,7 @@ FREQUENCIES_HZ = (21.0, 24.0, 27.0, 31.0)
 RATE_HZ, IMU_RATE_HZ = 100.0, 25.0
 CONDUCTIVITY = 0.01  # S/m
 NOISE_DENSITY = 1e-11  # T/sqrt(Hz)
+NOTHING = 1e-30  # T
 SILENT = 1e-9  # of a moment: nothing
 
 
@@ -91,3 +105,51 @@ def noise_log(site: Site, duration: float, seed: int, *, heard: bool = False) ->
     waveform = simulate_waveform(motion, sending, drives, RATE_HZ, duration, rng)
     truth = motion.trajectory(imu.samples.time)
     return Log("far_and_weak", EPOCH_NS, "simulation", imu.samples, waveform, truth=truth)
+
+
+def witnessed_log(
+    site: Site,
+    duration: float,
+    seed: int,
+    place_world: Array,
+    storms: float,
+    late: float = 0.0,
+    rate: float = 0.0,
+) -> SimulatedLog:
+    """Return a log at rest with storms that a second magnetometer hears, too.
+
+    Parameters
+    ----------
+    place_world : ndarray, shape (3,)
+        Of the second magnetometer (m).
+    storms : float
+        Density at 1 Hz (T/sqrt(Hz)).
+    late, rate : float
+        Of its clock (s).
+    """
+    turned = Rotation.random(random_state=seed).as_matrix()
+    config = SimulationConfig(
+        box_world=np.array([[-20.0, -20.0, -10.0], [20.0, 20.0, 10.0]]),
+        duration=duration,
+        motion="static",
+        imu_rate_hz=IMU_RATE_HZ,
+        magnetometer_rate_hz=RATE_HZ,
+        perturb=False,
+        ambient=Ambient(atmosphere=Atmosphere(storms, seed, duration, 0.5 * RATE_HZ)),
+        reference=Reference(place_world, turned, late, rate),
+    )
+    known = replace(site, reference_world=place_world)
+    return simulate_log(known, config, np.random.default_rng(seed))
+
+
+def errors_in_sigmas(rested: AtRest, made: SimulatedLog) -> Array:
+    """Return the square of each phasor's error in its sigmas, shape (n, channels); six are due."""
+    truth, time = made.log.truth, rested.fields.time
+    assert truth is not None
+    pose = np.repeat(truth.world_from_body[:1], len(time), 0), truth.position_world[:1]
+    there = Trajectory(time, pose[0], np.repeat(pose[1], len(time), 0))
+    none = np.random.default_rng(0)
+    true = simulate_fields(made.true_site, there, NOTHING, none, made.drives).phasor_sensor
+    error = rested.fields.phasor_sensor - true
+    solved = np.linalg.solve(rested.fields.phasor_cov, error[..., None])[..., 0]
+    return np.asarray(np.real(np.sum(np.conj(error) * solved, axis=-1)))

@@ -9,20 +9,27 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.integrity.signal import Heard
+from magfusion.estimation.rest_witness import (
+    Freed,
+    Judged,
+    freed_pieces,
+    judged,
+    witness_of,
+    witnessed,
+)
 from magfusion.model.samples import FieldSamples, Log, Waveform
 from magfusion.model.site import Beacon, Site
 from magfusion.model.strapdown import resting
 from magfusion.model.trust import Finding, Verdict
-from magfusion.receiver.hum import Hum, hum_of
+from magfusion.receiver.hum import hum_of
 from magfusion.receiver.integration import (
     LEAST_LENGTHS,
     Integrated,
     Search,
     chance_of_any,
-    integrated,
     searched,
 )
-from magfusion.receiver.pieces import Pieces, pieces
+from magfusion.receiver.pieces import Pieces
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz, default_settings
 from magfusion.units import Array, BoolArray
@@ -53,6 +60,9 @@ class AtRest:
         Reason to number of rests.
     findings : tuple of Finding
         What is not heard, and how weak it must be.
+    gain : ndarray, shape (n, channels), optional
+        How many times smaller the reference sensor made the sigma of a phasor; NaN where it has no
+        part in it.
     """
 
     fields: FieldSamples
@@ -60,11 +70,14 @@ class AtRest:
     heard: BoolArray
     dropped: Mapping[str, int]
     findings: tuple[Finding, ...] = ()
+    gain: Array | None = None
 
     def log(self, log: Log) -> Log:
         """Return a log with these epochs in place of its waveform."""
         noticed = (*log.noticed, *self.findings)
-        return replace(log, waveform=None, fields=self.fields, drive=None, noticed=noticed)
+        return replace(
+            log, waveform=None, fields=self.fields, drive=None, reference=None, noticed=noticed
+        )
 
     def amplitude(self) -> Array:
         """Return the sizes of phasors, freed of what noise adds to a square, (n, channels) (T)."""
@@ -107,8 +120,7 @@ def at_rest(
     InputError
         Where there is no waveform, no long rest, or coils are driven in time slots.
     """
-    waveform = log.waveform
-    if waveform is None:
+    if log.waveform is None:
         raise InputError("holds no magnetometer.parquet to integrate at rest; give the raw log")
     if has_schedule(site):
         raise InputError("--at-rest integrates tones, and a beacon has time slots; leave it out")
@@ -116,7 +128,7 @@ def at_rest(
     given = usual if lockin is None else lockin
     longest = _coherent(site)
     dropped = Counter[str]()
-    parts = []
+    parts: list[_Rest] = []
     for span in rests(log, site):
         length = _piece(site, usual, lockin, span[1] - span[0])
         if length is None:
@@ -125,7 +137,8 @@ def at_rest(
         count = int(np.ceil((span[1] - span[0]) / longest))
         ends = np.linspace(*span, count + 1)
         for begin, end in itertools.pairwise(ends):
-            parts.append(_rest(waveform, (float(begin), float(end)), site, length, given.mains_hz))
+            one = (float(begin), float(end))
+            parts.append(_rest(log, one, site, length, given.mains_hz, false_alarm))
     if not parts:
         need = LEAST_LENGTHS * usual.window
         short = f" ({dropped[TOO_SHORT]} are shorter)" if dropped else ""
@@ -133,15 +146,19 @@ def at_rest(
             f"--at-rest: the log has no rest of {need:.3g} s{short}; leave the platform longer, or"
             " declare platform.motion by how it vibrates"
         )
-    fields = FieldSamples.joined([fields for fields, _ in parts])
-    chance = np.concatenate([chance for _, chance in parts])
+    fields = FieldSamples.joined([part.fields for part in parts])
+    chance = np.stack([part.chance for part in parts])
     heard = chance < false_alarm
     findings = _unheard(fields, heard, site, false_alarm)
+    gain = None
+    if log.reference is not None:
+        gain = np.array([[tone.gain for tone in part.tones] for part in parts])
+        findings += witnessed([part.tones for part in parts], site)
     free = np.array([not _beacon(site, name).synchronised for name, _ in site.channels])
     gone = free & ~heard
     phasor = np.where(gone[..., None], np.nan, fields.phasor_sensor)
     fields = replace(fields, phasor_sensor=phasor)
-    return AtRest(fields, chance, heard, dropped, findings)
+    return AtRest(fields, chance, heard, dropped, findings, gain)
 
 
 def rests(log: Log, site: Site) -> list[tuple[float, float]]:
@@ -217,17 +234,45 @@ def _walk(site: Site, frequency_hz: float, duration: float) -> float:
     return float(phase + drift + clock.log_moment_walk**2 / HOUR * duration / 12.0)
 
 
+@dataclass(frozen=True, eq=False)
+class _Rest:
+    """One rest, or as much of it as is one epoch."""
+
+    fields: FieldSamples
+    chance: Array
+    tones: list[Judged]
+
+
 def _rest(
-    waveform: Waveform, span: tuple[float, float], site: Site, length: float, mains_hz: float
-) -> tuple[FieldSamples, Array]:
-    """Return the epoch of a rest, and the chance of each channel to be noise, (1, channels)."""
-    rows = slice(*np.searchsorted(waveform.time, span))
-    wave = Waveform(waveform.time[rows], waveform.measured_sensor[rows])
+    log: Log,
+    span: tuple[float, float],
+    site: Site,
+    length: float,
+    mains_hz: float,
+    false_alarm: float,
+) -> _Rest:
+    """Return the epoch of a rest."""
+    assert log.waveform is not None
+    rows = slice(*np.searchsorted(log.waveform.time, span))
+    wave = Waveform(log.waveform.time[rows], log.waveform.measured_sensor[rows])
     hum = hum_of(wave, mains_hz)
     time, nominal_hz = 0.5 * (span[0] + span[1]), channel_frequencies_hz(site)
-    found, sent_hz, searches = _at_their_frequencies(wave, span, site, length, hum)
-    found = _at_declared_drives(found, site, time)
-    single = [integrated(found, c, time) for c in range(len(nominal_hz))]
+    witness = witness_of(wave, log.reference, nominal_hz, hum)
+
+    def by(sent_hz: Array) -> Freed:
+        return freed_pieces(wave, span, sent_hz, length, hum, witness)
+
+    found, sent_hz = by(nominal_hz), nominal_hz.copy()
+    searches = _searches(found.best(), site, nominal_hz)
+    if searches:
+        for c, (name, _) in enumerate(site.channels):
+            if name in searches:
+                sent_hz[c] *= 1.0 + searches[name].drift
+        found = by(sent_hz)
+    found = replace(found, raw=_at_declared_drives(found.raw, site, time))
+    best = _at_declared_drives(found.best(), site, time)
+    tones = [judged(found, best, c, time, site, false_alarm) for c in range(len(nominal_hz))]
+    single = [one.tone for one in tones]
     phase = np.exp(2j * np.pi * (sent_hz - nominal_hz) * time)
     cov = np.stack(
         [
@@ -242,26 +287,17 @@ def _rest(
         phasor_sensor=(np.stack([one.phasor for one in single]) * phase[:, None])[None],
         phasor_cov=cov[None],
     )
-    return fields, _chances(single, site, searches)[None]
+    return _Rest(fields, _chances(single, site, searches), tones)
 
 
-def _at_their_frequencies(
-    wave: Waveform, span: tuple[float, float], site: Site, length: float, hum: Hum | None
-) -> tuple[Pieces, Array, dict[str, Search]]:
-    """Return the pieces of a rest by the frequencies that are sent, these, and how found (Hz)."""
-    sent_hz = channel_frequencies_hz(site).copy()
-    found = pieces(wave, span, sent_hz, length, hum)
+def _searches(found: Pieces, site: Site, nominal_hz: Array) -> dict[str, Search]:
+    """Return how the frequency of each beacon without synchronisation was found."""
     searches = {}
     for beacon in site.beacons:
-        if beacon.synchronised:
-            continue
-        tones = [c for c, (name, _) in enumerate(site.channels) if name == beacon.name]
-        search = searched(found, tones, sent_hz, site.clock.drift_largest)
-        searches[beacon.name] = search
-    for c, (name, _) in enumerate(site.channels):
-        if name in searches:
-            sent_hz[c] *= 1.0 + searches[name].drift
-    return (pieces(wave, span, sent_hz, length, hum) if searches else found), sent_hz, searches
+        if not beacon.synchronised:
+            tones = [c for c, (name, _) in enumerate(site.channels) if name == beacon.name]
+            searches[beacon.name] = searched(found, tones, nominal_hz, site.clock.drift_largest)
+    return searches
 
 
 def _at_declared_drives(found: Pieces, site: Site, time: float) -> Pieces:

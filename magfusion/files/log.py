@@ -30,7 +30,7 @@ from magfusion.model.trust import Finding
 
 HEADER = "log.yaml"
 _NOTHING: tuple[Finding, ...] = ()
-STREAMS = ("imu", "magnetometer", "fields", "truth", "temperature", "marks")
+STREAMS = ("imu", "magnetometer", "fields", "truth", "temperature", "marks", "reference")
 
 
 class LogHeader(StrictModel):
@@ -99,6 +99,7 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
         noticed=(*of_imu, *of_waveform),
         temperatures=read_temperatures(tables["temperature"], header.epoch_ns),
         drive=read_drive(tables["magnetometer"], span),
+        reference=read_waveform(tables["reference"], span)[0],
     )
     if log.waveform is None and log.fields is None:
         raise InputError(f"{path}: holds no field {span}; choose a span that the log covers.")
@@ -133,6 +134,8 @@ def write_log(log: Log, path: Path) -> None:
             write_fields(log.fields, unfinished / "fields.parquet", log.epoch_ns)
         if log.truth is not None:
             write_trajectory(log.truth, unfinished / "truth.parquet", log.epoch_ns)
+        if log.reference is not None:
+            write_waveform(log.reference, unfinished / "reference.parquet", log.epoch_ns)
         if log.temperatures is not None and log.temperatures.readings:
             known = log.temperatures
             write_temperatures(known, unfinished / "temperature.parquet", log.epoch_ns)

@@ -113,6 +113,7 @@ def load_site(path: Path | str, *, unknown: bool = False, without: bool = False)
         clock=_model(ClockModel, entry.clock),
         earth=_model(EarthModel, entry.world.earth),
         region=None if entry.region is None else entry.region.region(),
+        reference_world=None if entry.reference is None else entry.reference.position_m,
     )
     if entry.correlation is None:
         return site
@@ -154,6 +155,8 @@ def save_site(site: Site, path: Path | str) -> None:
         **_model_entry("clock", site.clock, ClockEntry),
         **region_entry(site.region),
     }
+    if site.reference_world is not None:
+        content["reference"] = {"position_m": site.reference_world.tolist()}
     if site.calibration is not None:
         content["calibration"] = _plain(site.calibration)
     if maps:

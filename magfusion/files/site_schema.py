@@ -387,6 +387,12 @@ class PlatformEntry(StrictModel):
     motion_prior: MotionPriorEntry | None = None
 
 
+class ReferenceEntry(StrictModel):
+    """A second magnetometer, which witnesses the noise."""
+
+    position_m: _Position
+
+
 class SiteEntry(StrictModel):
     """The whole file."""
 
@@ -396,6 +402,7 @@ class SiteEntry(StrictModel):
     platform: PlatformEntry
     clock: ClockEntry = ClockEntry()
     region: RegionEntry | None = None
+    reference: ReferenceEntry | None = None
     calibration: dict[str, Any] | None = None
     correlation: Annotated[str, Field(min_length=1)] | None = None
 

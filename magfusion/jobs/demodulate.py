@@ -44,7 +44,7 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
 
     claimed, job = claim(output, "demodulate"), settings.job(output)
     lockin = settings.lockin(job)
-    log, site = read_job(job, report=report)
+    log, site = read_job(job, reference=settings.at_rest, report=report)
     if log.waveform is None:
         raise InputError(
             f"{job.log_path}: holds no magnetometer.parquet to demodulate; give the raw log"
@@ -85,7 +85,9 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
         figures |= rest_figures(rested)
     with claimed as whole:
         directory = found_in(whole, trust)
-        write_log(replace(log, waveform=None, fields=samples, drive=None), directory)
+        write_log(
+            replace(log, waveform=None, fields=samples, drive=None, reference=None), directory
+        )
         save_site(_freed(log, site), directory / "site.yaml")
         write_report(whole, figures)
     refuse_failed(job.log_path, job.output, trust)

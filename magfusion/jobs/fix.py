@@ -139,11 +139,12 @@ def run_fix(
     from magfusion.results.verdict import level_figures, trust_figures
 
     claimed = claim(job.output, "smooth", "fix")
-    log, site = read_job(job, coil=True, report=report)
+    used = rest is not None and rest.at_rest
+    log, site = read_job(job, coil=True, reference=used, report=report)
     began = time.perf_counter()
     report("demodulating", 0, 3)
     if len(site.platform.magnetometer.axes) == 1:
-        if rest is not None and rest.at_rest:
+        if used:
             raise InputError(
                 "--at-rest integrates samples of three axes; leave it out for one axis"
             )

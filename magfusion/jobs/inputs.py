@@ -30,7 +30,7 @@ from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.model.trust import Trust, Verdict
+from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.model.without_imu import logged
 from magfusion.receiver.receiver import Receiver
 from magfusion.results.page import PAGE
@@ -71,9 +71,18 @@ class Job:
 
 _SITE = {"site.yaml", "site_field_map.parquet", "site_correlation.parquet"}
 _RESULT = {"trajectory.tum", "trajectory.parquet", *_SITE, "run.rrd", "report.json", FAILED}
-_TABLES = {"imu.parquet", "magnetometer.parquet", "fields.parquet", "truth.parquet"}
+_TABLES = {
+    *("imu.parquet", "magnetometer.parquet", "fields.parquet", "truth.parquet"),
+    "reference.parquet",
+}
 _TRUE_SITE = {f"true_{name}" for name in _SITE}
 _LOG = {"log.yaml", *_SITE, *_TRUE_SITE, "report.json", *_TABLES}
+NOT_USED = Finding(
+    "reference_unused",
+    "The reference sensor is not used: what it tells of noise is taken off at rest alone, by"
+    " demodulate or fix with --at-rest.",
+    Verdict.TRUSTWORTHY,
+)
 UNFINISHED_DRIFT = "unfinished"
 KEPT, LOGS, LOGS_TABLE = "kept", "logs", "logs.csv"  # of several logs
 CHECKPOINT, ROWS = "checkpoint.bin", "checkpoint.rows"
@@ -239,6 +248,7 @@ def read_job(
     unknown: bool = False,
     without: bool = False,
     coil: bool = False,
+    reference: bool = False,
     report: Report = quiet,
 ) -> tuple[Log, Site]:
     """Read the log and the site of a job, and see that they belong together.
@@ -251,6 +261,8 @@ def read_job(
         Whether it can do without any.
     coil : bool
         Whether it can do with a receiver of one axis.
+    reference : bool
+        Whether it uses a reference sensor; that it does not is said.
 
     Raises
     ------
@@ -276,6 +288,8 @@ def read_job(
             log = replace(log, fields=order_channels(log.fields, site))
     with named(job.log_path):
         log, site = with_drives(log, site)
+    if log.reference is not None and not reference:
+        log = replace(log, reference=None, noticed=(*log.noticed, NOT_USED))
     return at_reference(log, site)
 
 

@@ -12,12 +12,13 @@ from magfusion.results.figures import Figure, Figures, Section, heading
 
 if TYPE_CHECKING:
     from magfusion.model.site import Site
-    from magfusion.simulation.log import SimulationConfig
+    from magfusion.simulation.log import Reference, SimulationConfig
     from magfusion.units import Array
 
 
 LARGEST_BOX, SMALLEST_BOX = 1e5, 1e-3  # m
 DRIFT_TIME = 600.0  # s
+LATE = 0.037  # s; the clock of a reference
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +51,18 @@ class SimulateSettings(RandomSettings):
         unit="T",
         least=0,
         most=1e-4,
+    )
+    storms: float = option(
+        0.0,
+        "Noise that is the same everywhere, density at 1 Hz, falling with its root",
+        unit="T/sqrt(Hz)",
+        least=0.0,
+        most=1e-6,
+    )
+    reference: str | None = option(
+        None,
+        "A second magnetometer that hears it, too; where it stands, m: x,y,z",
+        note="its clock is late by 37 ms",
     )
     random_field: float = option(
         0.0,
@@ -98,9 +111,35 @@ def box_option(text: str | None) -> Array | None:
     return box
 
 
+def reference_option(text: str | None) -> Reference | None:
+    """Read ``x,y,z`` (m).
+
+    Raises
+    ------
+    InputError
+    """
+    import numpy as np
+
+    from magfusion.simulation.log import Reference
+
+    if text is None:
+        return None
+    try:
+        place = np.array([float(part) for part in text.split(",")]).reshape(3)
+    except ValueError:
+        place = np.full(3, np.nan)
+    if not np.all(np.abs(place) <= LARGEST_BOX):
+        raise InputError(
+            f"--reference {text!r}: three numbers in metres are needed, x, y, z within"
+            f" {LARGEST_BOX:g} m of the origin"
+        )
+    return Reference(place, late=LATE)
+
+
 def run(settings: SimulateSettings, output: Path) -> Figures:
     """Simulate a log as the settings ask; see `run_simulate`."""
     from magfusion.files.site import load_site
+    from magfusion.simulation.atmosphere import Atmosphere
     from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
     from magfusion.simulation.disturbance import Ambient, FieldDrift, office_noise
     from magfusion.simulation.layers import layers_option
@@ -110,12 +149,17 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
 
     site = demo_site() if settings.site is None else load_site(settings.site)
     box = box_option(settings.box)
+    reference = reference_option(settings.reference)
+    if reference is not None:
+        site = replace(site, reference_world=reference.position_world)
+    rate_hz = settings.rate or usual_rate_hz(site, settings.burst)
     config = SimulationConfig(
         box_world=DEMO_BOX_WORLD if box is None else box,
         duration=settings.duration,
         motion=settings.motion,
         imu_rate_hz=settings.imu_rate,
-        magnetometer_rate_hz=settings.rate or usual_rate_hz(site, settings.burst),
+        magnetometer_rate_hz=rate_hz,
+        reference=reference,
         perturb=settings.perturb,
         iron=settings.iron,
         random_field=settings.random_field,
@@ -124,6 +168,9 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
             day_night=office_noise(EPOCH_NS) if settings.ambient == "day-night" else None,
             drift=FieldDrift(settings.drift, DRIFT_TIME) if settings.drift else None,
             layers=None if settings.ground is None else layers_option(settings.ground),
+            atmosphere=Atmosphere(settings.storms, settings.seed, settings.duration, 0.5 * rate_hz)
+            if settings.storms
+            else None,
         ),
     )
     return run_simulate(site, config, output, settings.seed)

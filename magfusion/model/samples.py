@@ -223,7 +223,8 @@ class Log:
     streams the stamps scatter, ``noticed`` what else was mended in it.  Where not ``inertial``, the
     samples of the IMU are those of a motion prior (`magfusion.model.without_imu`), and measured
     nothing.  ``temperatures`` are those of whatever the samples are not yet freed of,
-    ``drive`` is what was recorded of the currents of coils beside the waveform.
+    ``drive`` is what was recorded of the currents of coils beside the waveform, ``reference`` the
+    samples of a second magnetometer that stands elsewhere, by its own stamps.
     """
 
     name: str
@@ -239,3 +240,4 @@ class Log:
     inertial: bool = True
     temperatures: Temperatures | None = None
     drive: DriveSamples | None = None
+    reference: Waveform | None = None

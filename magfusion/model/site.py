@@ -361,6 +361,8 @@ class Site:
         Of its beacons' currents, likewise.
     log_conductivity_sigma : float
         Of the logarithm of the conductivity that its beacons have; zero means known.
+    reference_world : ndarray, shape (3,), optional
+        Where a second magnetometer stands that witnesses the noise (m).
     """
 
     gravity: float
@@ -378,6 +380,7 @@ class Site:
     temperatures: Temperatures | None = None
     drives: DriveShares | None = None
     log_conductivity_sigma: float = 0.0
+    reference_world: Array | None = None
 
     @cached_property
     def bounds(self) -> Bounds | None:

@@ -94,6 +94,8 @@ CODES = {
     "phase_units": "the drive phases are in another unit",
     "prior": "a calibration changed by more than the site's sigmas allow",
     "quantised": "the steps of an instrument are larger than its noise",
+    "reference_hears": "the reference sensor hears a beacon, or may",
+    "reference_unused": "the reference sensor tells nothing of the noise, or is not used",
     "region_edge": "a pose is so near the edge of its region that this tells no mirror from it",
     "repeated_samples": "an instrument is read faster than it measures",
     "repeated_stamps": "samples have the stamp of another",

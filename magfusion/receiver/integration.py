@@ -55,7 +55,8 @@ class Integrated:
         return trace_chance(float(np.sum(np.abs(white) ** 2)), self.freedom)
 
     def _sample_cov(self) -> Array:
-        return self.cov * (self.freedom - 4.0) / self.freedom
+        least = 1e-12 * np.trace(self.cov) + 1e-60  # of an axis that stands still
+        return (self.cov + least * np.eye(3)) * (self.freedom - 4.0) / self.freedom
 
 
 def trace_chance(trace: float, freedom: int) -> float:
@@ -84,8 +85,9 @@ def integrated(found: Pieces, tone: int, time: float) -> Integrated:
     time : float
         From which centroid and spread are counted (s).
     """
-    phasor = found.phasor[:, tone]
-    elapsed = found.centre - time
+    phasor, elapsed = found.phasor[:, tone], found.centre - time
+    there = np.isfinite(phasor).all(axis=1)
+    phasor, elapsed = phasor[there], elapsed[there]
     weight = _weights(phasor)
     mean = np.asarray(weight @ phasor)
     span = float(np.ptp(elapsed)) + found.length
@@ -149,12 +151,14 @@ def searched(found: Pieces, tones: list[int], frequencies_hz: Array, largest: fl
     largest : float
         Relative error that is searched, on either side.
     """
-    centre, half = found.centre, float(np.ptp(found.centre)) + found.length
+    there = np.isfinite(found.phasor[:, tones]).all(axis=(1, 2))
+    centre = found.centre[there]
+    half = float(np.ptp(centre)) + found.length
     elapsed = centre - np.mean(centre)
     highest = float(np.max(frequencies_hz[tones]))
     own = []
     for tone in tones:
-        phasor = found.phasor[:, tone]
+        phasor = found.phasor[there, tone]
         weight = _weights(phasor)
         noise = float(np.median(np.sum(np.abs(phasor) ** 2, axis=1)))
         own.append(weight[:, None] * phasor / np.sqrt(noise))

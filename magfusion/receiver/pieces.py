@@ -15,6 +15,7 @@ from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 CHUNK = 64  # pieces at once
 LEAST_SHARE = 0.9  # of the samples of a piece
+NO_PROBES = np.zeros(0)
 HUM_CLEAR = 2.0  # resolutions of a piece between a tone and a harmonic that is fitted beside it
 
 
@@ -28,13 +29,20 @@ class Pieces:
         (s)
     length : float
         (s)
-    phasor : complex ndarray, shape (n, tones, 3)
+    phasor : complex ndarray, shape (n, tones, components)
         (T), the axes of the sensor; their phase is that of a cosine at time zero of the log.
+    beside : complex ndarray, shape (n, probes, components)
+        The same of what is left at other frequencies.
     """
 
     centre: Array
     length: float
     phasor: ComplexArray
+    beside: ComplexArray
+
+    def rows(self, kept: BoolArray) -> "Pieces":
+        """Return some pieces."""
+        return Pieces(self.centre[kept], self.length, self.phasor[kept], self.beside[kept])
 
 
 def pieces(
@@ -43,6 +51,7 @@ def pieces(
     frequencies_hz: Array,
     length: float,
     hum: Hum | None = None,
+    beside_hz: Array = NO_PROBES,
 ) -> Pieces:
     """Return the phasors of pieces of a waveform at rest.
 
@@ -56,6 +65,8 @@ def pieces(
         Of a piece (s).
     hum : Hum, optional
         Whose harmonics are fitted beside the tones.
+    beside_hz : ndarray, shape (probes,)
+        Other frequencies at which what the fit leaves is told.
     """
     time = waveform.time
     step = float(np.median(np.diff(time)))
@@ -65,36 +76,49 @@ def pieces(
     held = np.searchsorted(time, centre + 0.5 * length) - first
     whole = held * step >= LEAST_SHARE * length
     centre, first, held = centre[whole], first[whole], held[whole]
+    fitted = _Fitted(waveform, frequencies_hz, beside_hz, length, hum)
     found = [
-        _fitted(waveform, centre[k], first[k], held[k], frequencies_hz, length, hum)
+        fitted.of(centre[k], first[k], held[k])
         for k in (slice(i, i + CHUNK) for i in range(0, len(centre), CHUNK))
     ]
-    empty = np.zeros((0, len(frequencies_hz), 3), dtype=np.complex128)
-    phasor = np.concatenate([empty, *found])
+    components = waveform.measured_sensor.shape[1]
+    none = [np.zeros((0, len(f), components), dtype=complex) for f in (frequencies_hz, beside_hz)]
+    phasor = np.concatenate([none[0], *(one for one, _ in found)])
+    beside = np.concatenate([none[1], *(other for _, other in found)])
     alive = np.any(phasor != 0.0, axis=(1, 2))
-    return Pieces(centre[alive], length, phasor[alive])
+    return Pieces(centre, length, phasor, beside).rows(alive)
 
 
-def _fitted(
-    waveform: Waveform,
-    centre: Array,
-    first: IntArray,
-    held: IntArray,
-    frequencies_hz: Array,
-    length: float,
-    hum: Hum | None,
-) -> ComplexArray:
-    reach = np.arange(int(np.max(held)))
-    index = np.minimum(first[:, None] + reach, len(waveform) - 1)
-    elapsed = waveform.time[index] - centre[:, None]
-    inside = reach < held[:, None]
-    taper = np.where(inside, np.cos(np.pi * elapsed / length) ** 2, 0.0)
-    design = _design(elapsed, waveform.time[index], frequencies_hz, length, hum)
-    weighted = np.swapaxes(design * taper[..., None], 1, 2)
-    fitted = np.linalg.solve(weighted @ design, weighted @ waveform.measured_sensor[index])
-    n = len(frequencies_hz)
-    turns = np.exp(-2j * np.pi * frequencies_hz * centre[:, None])
-    return np.asarray((fitted[:, 2 : 2 + n] - 1j * fitted[:, 2 + n : 2 + 2 * n]) * turns[..., None])
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    """The fit of pieces, some at once."""
+
+    waveform: Waveform
+    frequencies_hz: Array
+    beside_hz: Array
+    length: float
+    hum: Hum | None
+
+    def of(
+        self, centre: Array, first: IntArray, held: IntArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Return the phasors of tones, and of probes, shape (n, tones or probes, components)."""
+        reach, time = np.arange(int(np.max(held))), self.waveform.time
+        index = np.minimum(first[:, None] + reach, len(time) - 1)
+        elapsed, field = time[index] - centre[:, None], self.waveform.measured_sensor[index]
+        inside = reach < held[:, None]
+        taper = np.where(inside, np.cos(np.pi * elapsed / self.length) ** 2, 0.0)
+        design = _design(elapsed, time[index], self.frequencies_hz, self.length, self.hum)
+        weighted = np.swapaxes(design * taper[..., None], 1, 2)
+        fitted = np.linalg.solve(weighted @ design, weighted @ field)
+        n = len(self.frequencies_hz)
+        phasor = fitted[:, 2 : 2 + n] - 1j * fitted[:, 2 + n : 2 + 2 * n]
+        turns = np.exp(-2j * np.pi * self.frequencies_hz * centre[:, None])
+        if not len(self.beside_hz):
+            return phasor * turns[..., None], np.zeros((len(centre), 0, field.shape[2]), complex)
+        left = (field - design @ fitted) * (taper * 2.0 / np.sum(taper, axis=1)[:, None])[..., None]
+        carrier = np.exp(-2j * np.pi * elapsed[..., None] * self.beside_hz)
+        return phasor * turns[..., None], np.swapaxes(carrier, 1, 2) @ left
 
 
 def _design(

@@ -1,5 +1,7 @@
 """What is said of whole rests that were integrated."""
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from magfusion.estimation.at_rest import AtRest
@@ -36,4 +38,15 @@ def rest_figures(rested: AtRest) -> Figures:
             )
             for c, (beacon, tone) in enumerate(channels)
         ),
+        *_reference_figures(rested),
     )
+
+
+def _reference_figures(rested: AtRest) -> Iterator[Figure]:
+    """Yield how many times smaller the reference made each sigma; one where it has no part."""
+    if rested.gain is None:
+        return
+    gain = np.median(np.where(np.isnan(rested.gain), 1.0, rested.gain), axis=0)
+    for c, (beacon, tone) in enumerate(rested.fields.channels):
+        label = f"reference's gain at tone {tone}"
+        yield Figure(f"reference_gain_{{beacon}}_{tone}", float(gain[c]), "", beacon, label=label)

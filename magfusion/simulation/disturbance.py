@@ -7,6 +7,7 @@ from scipy.interpolate import CubicSpline
 
 from magfusion.errors import InputError
 from magfusion.model.physics.disturbance import induced_field, sphere_polarizability
+from magfusion.simulation.atmosphere import Atmosphere
 from magfusion.simulation.layers import Layers
 from magfusion.units import AnyArray, Array, ComplexArray
 
@@ -278,6 +279,7 @@ class Ambient:
     day_night: DayNight | None = None
     drift: FieldDrift | None = None
     layers: Layers | None = None
+    atmosphere: Atmosphere | None = None
 
     def background_world(self, time: Array, rate_hz: float, rng: np.random.Generator) -> Array:
         """Return noise and drift at the samples of an instrument.
@@ -298,6 +300,8 @@ class Ambient:
             field_world += sigma[:, None] * rng.standard_normal(field_world.shape)
         if self.drift is not None:
             field_world += _drift_world(self.drift, time, rng)
+        if self.atmosphere is not None:
+            field_world += self.atmosphere.field_world(time)
         return field_world
 
 

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.model.correlation import Component, Correlation
+from magfusion.model.marks import Marks
 from magfusion.model.physics.earth import earth_field_world
-from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.samples import FieldSamples, Log, Waveform
 from magfusion.model.site import Beacon, Magnetometer, Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.disturbance import Ambient, Spheres, draw_bending, draw_spheres
@@ -26,13 +27,32 @@ from magfusion.simulation.motion import (
     turning_motion,
 )
 from magfusion.simulation.slots import Multiplexer, draw_marks, is_multiplexed
-from magfusion.simulation.waveform import Mains, simulate_waveform
+from magfusion.simulation.waveform import Mains, beacons_world, simulate_waveform
 from magfusion.units import Array
 
 Draw = Callable[[str, str, str, Array], Array]
 EPOCH_NS = 1_700_000_000_000_000_000
 
 MotionKind = Literal["walk", "turn", "static"]
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """A second magnetometer that stands somewhere and hears the noise of the surroundings, too.
+
+    Parameters
+    ----------
+    position_world : ndarray, shape (3,)
+        (m)
+    world_from_sensor : ndarray, shape (3, 3)
+    late, rate : float
+        What it stamps t happened at t + late + rate t (s).
+    """
+
+    position_world: Array
+    world_from_sensor: Array = field(default_factory=lambda: np.eye(3))
+    late: float = 0.0
+    rate: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +84,8 @@ class SimulationConfig:
         Of the IMU, beside its bias walk.
     ambient : Ambient, optional
         Iron, noise and drift of the room.
+    reference : Reference, optional
+        Of the same noise density and rate as the magnetometer.
     iron : int
         Steel spheres drawn around the box, by `magfusion.simulation.disturbance.draw_spheres`;
         where there are any they take the place of the ambient's.
@@ -89,6 +111,7 @@ class SimulationConfig:
     quantisation: float | None = None
     instability: BiasInstability | None = None
     ambient: Ambient | None = None
+    reference: Reference | None = None
     iron: int = 0
     random_field: float = 0.0
     multiplexer: Multiplexer = field(default_factory=Multiplexer)
@@ -153,6 +176,9 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         config.instability,
         true_site.platform.imu.clock_rate,
     )
+    marks = None
+    if is_multiplexed(site):
+        marks = draw_marks(site, config.multiplexer, config.duration, rng.spawn(1)[0])
     waveform = simulate_waveform(
         motion,
         true_site,
@@ -163,9 +189,7 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         config.mains,
         config.quantisation,
         ambient,
-        draw_marks(site, config.multiplexer, config.duration, rng.spawn(1)[0])
-        if is_multiplexed(site)
-        else None,
+        marks,
     )
     stamp = imu.samples.time
     clock = true_site.platform.imu
@@ -175,6 +199,12 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         gyro_bias_body=interpolate(stamp, taken, imu.gyro_bias_body),
         accel_bias_body=interpolate(stamp, taken, imu.accel_bias_body),
     )
+    reference = None
+    if config.reference is not None:
+        # Spawned later than those of old, whose draws stay as they were.
+        reference = simulate_reference(
+            config.reference, true_site, drives, config, rng.spawn(1)[0], ambient, marks
+        )
     log = Log(
         name=f"simulated_{config.motion}",
         epoch_ns=EPOCH_NS,
@@ -182,8 +212,38 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         imu=imu.samples,
         waveform=waveform,
         truth=truth,
+        reference=reference,
     )
     return SimulatedLog(log, true_site, drives, motion, ambient)
+
+
+def simulate_reference(
+    reference: Reference,
+    site: Site,
+    drives: Drives,
+    config: SimulationConfig,
+    rng: np.random.Generator,
+    ambient: Ambient | None,
+    marks: Marks | None = None,
+) -> Waveform:
+    """Return what a reference records, with its stamps.
+
+    Mains and the noise of one place are not in it.
+    """
+    count = int(config.duration * config.magnetometer_rate_hz)
+    stamps: Array = np.arange(count) / config.magnetometer_rate_hz
+    time: Array = (1.0 + reference.rate) * stamps + reference.late
+    sensor = site.platform.magnetometer
+    common = None if ambient is None else Ambient(atmosphere=ambient.atmosphere)
+    there = np.tile(reference.position_world, (len(time), 1))
+    field_world = beacons_world(site, drives, time, there, ambient or Ambient(), marks)
+    if site.earth_field_world is not None:
+        field_world += site.earth_field_world
+    if common is not None:
+        field_world += common.background_world(time, config.magnetometer_rate_hz, rng)
+    measured = field_world @ reference.world_from_sensor
+    sigma = sensor.noise_density * np.sqrt(config.magnetometer_rate_hz / 2.0)
+    return Waveform(stamps, measured + rng.normal(0.0, sigma, measured.shape))
 
 
 def simulate_fields(

@@ -107,7 +107,7 @@ def simulate_waveform(
     world_from_body = motion.world_from_body(time)
     lever_world = world_from_body.apply(magnetometer.position_body)
     point_world = motion.position_world(time) + lever_world
-    field_world = _beacons_world(site, drives, time, point_world, ambient or Ambient(), marks)
+    field_world = beacons_world(site, drives, time, point_world, ambient or Ambient(), marks)
     if site.earth_field_world is not None:
         field_world += site.earth_field_world
     if mains is not None:
@@ -133,14 +133,15 @@ def _check_tones(site: Site, rate_hz: float, marks: Marks | None) -> None:
         check_slots(beacon, rate_hz, marks)
 
 
-def _beacons_world(
+def beacons_world(
     site: Site,
     drives: Drives,
     time: Array,
     point_world: Array,
     ambient: Ambient,
-    marks: Marks | None,
+    marks: Marks | None = None,
 ) -> Array:
+    """Return the field of all beacons at a place (m) of each time (s), shape (n, 3) (T)."""
     field_world = np.zeros((len(time), 3))
     first = 0
     for i, (beacon, drift) in enumerate(zip(site.beacons, drives.drift, strict=True)):

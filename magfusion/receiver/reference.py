@@ -1,0 +1,186 @@
+"""A second magnetometer as a witness of the noise that it has in common with the first.
+
+What both hear of storms, mains and machines is related by a matrix of three by three complex
+numbers about each tone.  It is found by least squares from pieces beside the tones, so that no
+signal has a part in it, and its worth from pieces that had no part in it.  A reference that tells
+nothing is left out: then nothing is changed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from magfusion.model.samples import Waveform
+from magfusion.receiver.pieces import Pieces
+from magfusion.units import Array, BoolArray, ComplexArray
+
+LARGEST_LAG = 5.0  # s; of the reference's clock
+BLOCK = 40.96  # s; by which lag and rate of the clock are found
+CLEAR_HZ = 0.6  # about tones and mains, which correlate at any lag of whole turns
+LEAST_PEAK = 8.0  # times the scatter of a correlation about its mean, a lag has
+NEAR_LAG = 8  # samples about the common lag, in which blocks find their own
+BESIDE = 8  # probes about a tone
+APART = 2.0  # resolutions of a piece, between them and from every tone
+GROUPS = 8  # of pieces in a row, of which every other one tells the matrix
+WORTH = 0.95  # of the power that is left, beyond which a reference tells nothing
+GAP = 2.5  # steps of the reference, over which it is not filled in
+
+
+@dataclass(frozen=True)
+class Lag:
+    """How the clock of a reference lies: what it stamped t happened at t + offset + rate t (s)."""
+
+    offset: float
+    rate: float
+
+    def of(self, time: Array) -> Array:
+        """Return when it was on the clock of the log (s)."""
+        return np.asarray(time + self.offset + self.rate * time)
+
+
+NO_LAG = Lag(0.0, 0.0)
+
+
+def beside(waveform: Waveform, reference: Waveform, lag: Lag) -> tuple[Array, BoolArray]:
+    """Return a reference at the samples of a waveform (n, 3), and where it has some (n,)."""
+    time = lag.of(reference.time)
+    step = float(np.median(np.diff(time)))
+    at = np.clip(np.searchsorted(time, waveform.time), 1, len(time) - 1)
+    there = (time[at] - time[at - 1] < GAP * step) & (waveform.time >= time[0] - step)
+    there &= waveform.time <= time[-1] + step
+    field = reference.measured_sensor - np.mean(reference.measured_sensor, axis=0)
+    inside = np.clip(waveform.time, time[0], time[-1])
+    return np.asarray(CubicSpline(time, field)(inside)), np.asarray(there)
+
+
+def lag_of(waveform: Waveform, reference: Waveform, lines_hz: Array) -> Lag:
+    """Return how the clock of a reference lies, by the noise that both hear; none where none is.
+
+    Parameters
+    ----------
+    lines_hz : ndarray
+        Tones and mains (Hz), which are left out.
+    """
+    step = float(np.median(np.diff(waveform.time)))
+    size = int(BLOCK / step) // 2 * 2
+    starts = np.arange(0, len(waveform) - size + 1, size)
+    even, there = beside(waveform, reference, NO_LAG)
+    if not len(starts) or not np.any(there):
+        return NO_LAG
+    found = np.stack(
+        [
+            _correlation(waveform.measured_sensor[k : k + size], even[k : k + size], step, lines_hz)
+            for k in starts
+        ]
+    )
+    reach = int(LARGEST_LAG / step)
+    lags = np.arange(-reach, reach + 1)
+    mean = np.mean(found, axis=0)[lags]
+    best = int(np.argmax(mean))
+    if mean[best] - np.median(mean) < LEAST_PEAK * _scatter(mean):
+        return NO_LAG
+    near = lags[best] + np.arange(-NEAR_LAG, NEAR_LAG + 1)
+    own = found[:, near]
+    peak = np.clip(np.argmax(own, axis=1), 1, own.shape[1] - 2)
+    clear = own[np.arange(len(own)), peak] > np.median(mean) + LEAST_PEAK * _scatter(mean)
+    middle = waveform.time[starts] + 0.5 * BLOCK
+    if np.sum(clear) < 3:
+        return Lag(float(lags[best]) * step, 0.0)
+    rows = np.flatnonzero(clear)
+    before, here, after = (own[rows, peak[rows] + k] for k in (-1, 0, 1))
+    finer = 0.5 * (before - after) / np.minimum(before - 2.0 * here + after, -1e-12)
+    seen = (near[peak[rows]] + np.clip(finer, -0.5, 0.5)) * step
+    rate, offset = np.polyfit(middle[rows], seen, 1)
+    # A line through lags that do not lie on one is worse than their median.
+    left = seen - offset - rate * middle[rows]
+    rough = np.std(left) / (np.std(middle[rows]) * np.sqrt(len(rows)) + 1e-300)
+    if abs(rate) < 3.0 * rough:
+        return Lag(float(np.median(seen)), 0.0)
+    return Lag(float(offset), float(rate))
+
+
+def _scatter(values: Array) -> float:
+    return float(1.4826 * np.median(np.abs(values - np.median(values)))) + 1e-300
+
+
+def _correlation(own: Array, other: Array, step: float, lines_hz: Array) -> Array:
+    """Return the power of the whitened correlation at each lag, of all pairs of axes."""
+    taper = np.hanning(len(own))[:, None]
+    hertz = np.fft.rfftfreq(len(own), step)
+    clear = hertz > CLEAR_HZ
+    for line in lines_hz:
+        clear &= np.abs(hertz - line) > CLEAR_HZ
+    spectra = []
+    for field in (own, other):
+        found = np.fft.rfft((field - np.mean(field, axis=0)) * taper, axis=0)
+        spectra.append(found / np.maximum(np.abs(found), 1e-300) * clear[:, None])
+    total = np.zeros(len(own))
+    for a in spectra[0].T:
+        for b in spectra[1].T:
+            total += np.fft.irfft(a * np.conj(b), len(own)) ** 2
+    return total
+
+
+def probes_hz(tone_hz: float, tones_hz: Array, length: float, highest_hz: float) -> Array:
+    """Return the frequencies beside a tone at which the matrix is found, clear of every tone."""
+    offsets = (APART / length) * np.arange(1, 4 * BESIDE)
+    tried = np.concatenate([tone_hz + offsets, tone_hz - offsets])
+    apart = np.min(np.abs(tried[:, None] - tones_hz), axis=1)
+    good = tried[(apart > 0.99 * APART / length) & (tried > APART / length) & (tried < highest_hz)]
+    return np.asarray(good[np.argsort(np.abs(good - tone_hz))][:BESIDE])
+
+
+@dataclass(frozen=True, eq=False)
+class Relation:
+    """What the noise of a sensor is of that of a reference, about a tone.
+
+    Parameters
+    ----------
+    matrix : complex ndarray, shape (3, 3)
+    left : float
+        Power of the noise that it leaves, of that without it, in pieces that it was not found by.
+    """
+
+    matrix: ComplexArray
+    left: float
+
+    @property
+    def tells(self) -> bool:
+        """Whether it takes anything off."""
+        return self.left < WORTH
+
+
+def relation(found: Pieces, there: BoolArray, columns: slice) -> Relation:
+    """Return how a sensor and its reference go together in the probes beside a tone.
+
+    Parameters
+    ----------
+    found : Pieces
+        Of six components: the sensor's, and the reference's.
+    there : bool ndarray, shape (n,)
+        Pieces with a reference.
+    columns : slice
+        Probes of the tone.
+    """
+    own, other = found.beside[:, columns, :3], found.beside[:, columns, 3:]
+    power = np.sum(np.abs(own) ** 2, axis=(1, 2))
+    witness = np.sum(np.abs(other) ** 2, axis=(1, 2))
+    usual = max(float(np.median(power)), 1e-300), max(float(np.median(witness)), 1e-300)
+    # What is loud counts for less: a bang beside one of them is none of the other.
+    weight = there / (1.0 + power / usual[0] + witness / usual[1])
+    group = np.arange(len(own)) * GROUPS // max(len(own), 1) % 2
+    left = before = 0.0
+    for half in (0, 1):
+        matrix = _matrix(own, other, weight * (group != half))
+        mine = (weight * (group == half))[:, None, None]
+        before += float(np.sum(mine * np.abs(own) ** 2))
+        left += float(np.sum(mine * np.abs(own - other @ matrix.T) ** 2))
+    return Relation(_matrix(own, other, weight), left / max(before, 1e-300))
+
+
+def _matrix(own: ComplexArray, other: ComplexArray, weight: Array) -> ComplexArray:
+    weighted = np.conj(other) * weight[:, None, None]
+    normal = np.einsum("npi,npj->ij", weighted, other)
+    normal += 1e-9 * np.trace(normal).real * np.eye(3) + 1e-300 * np.eye(3)
+    return np.asarray(np.linalg.solve(normal, np.einsum("npi,npj->ij", weighted, own)).T)
