@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet
 import pytest
+import yaml
 from conftest import Refuse, Worked, run_command
 
 from magfusion.files.site import load_site
@@ -39,6 +40,35 @@ def test_the_command_writes_a_site_that_has_what_the_report_says(
     assert report["random_layouts"] == 5
     assert report["protection_level_m_worst"] < report["random_worst_level_m_median"]
     assert report["search_complete"]
+
+
+def test_the_command_says_where_to_hold_the_platform_next(worked: Worked, tmp_path: Path) -> None:
+    site, place = worked.log / "site.yaml", tmp_path / "motion"
+    run_command("design", site, "-o", place, "--motion", 2, "--poses", "known", *QUICK)
+    assert {p.name for p in place.iterdir()} == {
+        "motion.parquet",
+        "motion.png",
+        "report.html",
+        "report.json",
+    }
+    report = json.loads((place / "report.json").read_text())
+    table = pyarrow.parquet.read_table(place / "motion.parquet").to_pydict()
+    assert len(table["parameter"]) == report["stops"] == 2
+    for number, name in enumerate(table["parameter"]):
+        assert table["sigma_after"][number] < table["sigma_before"][number]
+        assert name in report["notes"][number]
+    assert report["worst_excess_after"] <= report["worst_excess_before"]
+
+
+def test_a_site_that_is_known_exactly_has_nothing_to_calibrate(
+    worked: Worked, tmp_path: Path, refuse: Refuse
+) -> None:
+    site = yaml.safe_load((worked.log / "site.yaml").read_text())
+    for part in (*site["beacons"], site["platform"]["magnetometer"]):
+        del part["sigma"]
+    (tmp_path / "exact.yaml").write_text(yaml.safe_dump(site))
+    told = refuse("design", tmp_path / "exact.yaml", "-o", tmp_path / "m", "--motion", 2, *QUICK)
+    assert "all sigmas are zero" in told
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.jobs.coverage import finite, level_figures, write_points
+from magfusion.jobs.coverage import write_points
 from magfusion.jobs.settings import Command, RandomSettings, RiskSettings, argument, option
 from magfusion.jobs.simulate import box_option
 from magfusion.model.progress import Report, quiet
@@ -18,12 +18,9 @@ from magfusion.model.site import Site
 
 if TYPE_CHECKING:
     from magfusion.model.hall import Hall
-    from magfusion.model.site import Beacon
-    from magfusion.results.coverage import Coverage
     from magfusion.results.design.pattern import Band
-    from magfusion.results.design.planning import Design, Task
-    from magfusion.results.figures import Figure, Figures
-    from magfusion.results.plots.design import Panel
+    from magfusion.results.design.planning import Task
+    from magfusion.results.figures import Figures
     from magfusion.units import Array
 
 MOST_POINTS, MOST_PLACES = 10_000, 10_000
@@ -107,6 +104,16 @@ class DesignSettings(RiskSettings, RandomSettings):
     minutes: float = option(
         10.0, "After which the search ends with the best that it has", least=0.01, most=1e5
     )
+    motion: int | None = option(
+        None,
+        "Place no beacons: say where to hold the platform next for a calibration, so many stops",
+        least=1,
+        most=100,
+    )
+    stop: float = option(2.0, "Length of such a stop", unit="s", least=0.02, most=3600.0)
+    poses: Literal["open", "known"] = option(
+        "open", "Whether the stops' poses are measured: known for calibrate beacon"
+    )
     earlier: Path | None = option(
         None, "Start from the site.yaml of an earlier design of the same hall", name="continue"
     )
@@ -118,6 +125,11 @@ class DesignSettings(RiskSettings, RandomSettings):
         if self.hall is not None and self.box is not None:
             raise InputError("give --hall, or --box where there is no file; not both")
 
+    @property
+    def poses_known(self) -> bool:
+        """Whether the stops' poses are measured."""
+        return self.poses == "known"
+
 
 def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -> Figures:
     """Place beacons: a site, maps before and after, table, recording and report.
@@ -128,6 +140,8 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
         Where a file cannot be read, the settings do not fit, or ``output`` is in the way.
     """
     from magfusion.files.site import load_site, save_site
+    from magfusion.jobs.design_figures import design_figures
+    from magfusion.jobs.design_motion import run_motion
     from magfusion.jobs.inputs import claim
     from magfusion.results.coverage import coverage
     from magfusion.results.design.planning import designed
@@ -136,10 +150,12 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
     from magfusion.results.report import write_report
 
     begin = time.monotonic()
-    claimed = claim(output, "design")
     site = load_site(settings.site)
-    first = None if settings.earlier is None else load_site(settings.earlier)
     hall, spacing = _hall(settings, site)
+    if settings.motion is not None:
+        return run_motion(settings, site, hall, _points(hall, spacing), output)
+    claimed = claim(output, "design")
+    first = None if settings.earlier is None else load_site(settings.earlier)
     task = _task(settings, site, hall, spacing)
     alone = len(site.beacons) < 2
     found = designed(
@@ -165,7 +181,7 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
             Panel(f"before: {words}", before, maps[0]),
             Panel("after", new, maps[1]),
         ]
-        figures = _figures(settings, task, found, panels, spacing)
+        figures = design_figures(settings, task, found, panels, spacing)
         write_points(directory / "coverage.parquet", maps[1])
         write_plot(directory / "design.png", hall, panels)
         write_design_recording(directory / "run.rrd", hall, panels, spacing)
@@ -200,10 +216,8 @@ def _hall(settings: DesignSettings, site: Site) -> tuple[Hall, float]:
     return hall, spacing
 
 
-def _task(settings: DesignSettings, site: Site, hall: Hall, spacing: float) -> Task:
-    from magfusion.model.hall import mounting_places, points_of_use
-    from magfusion.results.design.pattern import template_of
-    from magfusion.results.design.planning import Task, with_moment
+def _points(hall: Hall, spacing: float) -> Array:
+    from magfusion.model.hall import points_of_use
 
     points = points_of_use(hall, spacing)
     if not 0 < len(points) <= MOST_POINTS:
@@ -212,6 +226,15 @@ def _task(settings: DesignSettings, site: Site, hall: Hall, spacing: float) -> T
             f" {MOST_POINTS} can be compared, so choose another spacing, or another margin_m in the"
             " hall's use"
         )
+    return points
+
+
+def _task(settings: DesignSettings, site: Site, hall: Hall, spacing: float) -> Task:
+    from magfusion.model.hall import mounting_places
+    from magfusion.results.design.pattern import template_of
+    from magfusion.results.design.planning import Task, with_moment
+
+    points = _points(hall, spacing)
     template = template_of(site, settings.template)
     moment = settings.moment
     if settings.moment_budget is not None:
@@ -272,112 +295,6 @@ def _band(settings: DesignSettings, site: Site) -> Band:
         low = max(low, float(response.frequency_hz[0]))
         high = min(high, float(response.frequency_hz[-1]))
     return Band(low, high, settings.window, settings.mains_hz)
-
-
-def _figures(
-    settings: DesignSettings, task: Task, found: Design, panels: list[Panel], spacing: float
-) -> Figures:
-    from magfusion.model.trust import Trust
-    from magfusion.results.figures import Figure, Figures, Section, heading
-    from magfusion.results.verdict import trust_figures
-
-    before, after = (panel.found for panel in panels)
-    notes = [] if found.complete else [_OUT_OF_TIME]
-    if before.protection_level_m is None or after.protection_level_m is None:
-        raise AssertionError("both have a risk")
-    worst = float(np.max(after.protection_level_m))
-    if not np.isfinite(worst):
-        notes.append(_OPEN)
-    figures = [
-        Figure("beacons_placed", len(found.new)),
-        Figure("beacons_kept", len(task.site.beacons)),
-        Figure("objective", settings.objective, section=Section.REPORT),
-        Figure("candidates", found.candidates),
-        Figure("points", len(task.points)),
-        Figure("spacing_m", spacing, "m", section=Section.REPORT),
-        Figure("window_s", settings.window, "s"),
-        Figure("search_complete", found.complete),
-        *level_figures(after),
-        *_sigma_figures(after),
-        *(
-            replace(f, name=f"before_{f.name}", label=f"before: {f.title}")
-            for f in [*level_figures(before), *_sigma_figures(before)]
-        ),
-        *_random_figures(found.random_worst_m[: settings.random], worst),
-        *(figure for beacon in found.new for figure in _of_beacon(beacon)),
-        Figure("notes", notes, section=Section.NOTES),
-    ]
-    return heading("design", settings.site.stem) | trust_figures(Trust()) | Figures(*figures)
-
-
-_OUT_OF_TIME = (
-    "The search ended because its time was over: this is the best layout up to then; give more"
-    " --minutes, or go on from its site.yaml by --continue."
-)
-_OPEN = (
-    "Somewhere there is no protection level: without one of the beacons nothing determines the pose"
-    " there. Place more beacons, or stronger ones."
-)
-
-
-def _sigma_figures(found: Coverage) -> list[Figure]:
-    from magfusion.results.figures import Figure
-
-    return [
-        Figure(
-            f"position_sigma_m_{key}",
-            finite(found.position_quantile(share)),
-            "m",
-            label=f"position sigma, {key}",
-        )
-        for key, share in (("median", 0.5), ("worst", 1.0))
-    ]
-
-
-def _random_figures(worst_m: Array, reached_m: float) -> list[Figure]:
-    """Return what random layouts of the same candidates have, and what the design gains."""
-    from magfusion.results.figures import Figure
-
-    if not len(worst_m):
-        return []
-    median, best = float(np.median(worst_m)), float(np.min(worst_m))
-    return [
-        Figure("random_layouts", len(worst_m)),
-        Figure("random_worst_level_m_median", finite(median), "m"),
-        Figure("random_worst_level_m_best", finite(best), "m"),
-        Figure("gain_over_random_median", finite(1.0 - reached_m / median)),
-        Figure("gain_over_random_best", finite(1.0 - reached_m / best)),
-    ]
-
-
-def _of_beacon(beacon: Beacon) -> list[Figure]:
-    from magfusion.results.design.pattern import pattern_axis, peak_moment
-    from magfusion.results.figures import Figure
-
-    name, axis = beacon.name, pattern_axis(beacon)
-    rows: list[tuple[str, float, str]] = [
-        (f"position_{letter}_m", float(value), "m")
-        for letter, value in zip("xyz", beacon.position_world, strict=True)
-    ]
-    if axis is not None:
-        along = beacon.world_from_beacon @ axis
-        rows += [
-            (f"axis_{letter}", round(float(value), 12) + 0.0, "")
-            for letter, value in zip("xyz", along, strict=True)
-        ]
-    rows += [
-        (f"frequency_{k}_hz" if k else "frequency_hz", float(f), "Hz")
-        for k, f in enumerate(beacon.tone_frequencies_hz)
-    ]
-    rows.append(("moment_a_m2", peak_moment(beacon), "A m^2"))
-    return [
-        Figure(f"{{beacon}}.{key}", value, unit, name, label=_spoken(key))
-        for key, value, unit in rows
-    ]
-
-
-def _spoken(key: str) -> str:
-    return key.removesuffix("_m").removesuffix("_a_m2").removesuffix("_hz").replace("_", " ")
 
 
 COMMAND = Command(

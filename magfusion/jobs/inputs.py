@@ -112,7 +112,9 @@ _WRITTEN = {
     "check": {"check.png", "report.json", FAILED},
     "match": {"attitude.parquet", "attitude.png", "report.json"},
     "coverage": {"coverage.parquet", "coverage.png", "run.rrd", "report.json"},
-    "design": _SITE | {"coverage.parquet", "design.png", "run.rrd", "report.json"},
+    "design": _SITE
+    | {"coverage.parquet", "design.png", "run.rrd", "report.json"}
+    | {"motion.parquet", "motion.png"},
 }
 
 

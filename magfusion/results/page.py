@@ -52,6 +52,7 @@ _CAPTIONS = {
     "drift": "Errors and claims over the days",
     "field_map": "Where the beacons' fields differ from their model",
     "magnetometer": "Magnetometer: field before and after",
+    "motion": "Where to hold the platform next, and what that determines",
     "stability": "Stability of the estimates",
     "survey": "Places of the survey",
 }

@@ -45,7 +45,7 @@ def write_design_recording(path: Path, hall: Hall, panels: list[Panel], spacing:
                 origin=place,
                 name=panel.words.capitalize(),
                 line_grid=rrb.LineGrid3D(spacing=1.0),
-                eye_controls=eye_on(Scale(scale.centre_world, 1.25 * scale.size, 1)),
+                eye_controls=eye_on(Scale(scale.centre_world, 0.9 * scale.size, 1)),
             )
             views.append(view)
         legend = rr.TextDocument(_legend(panels, between), media_type=rr.MediaType.MARKDOWN)

@@ -67,9 +67,13 @@ def write_plot(path: Path, hall: Hall, panels: list[Panel]) -> None:
             mesh = axes.pcolormesh(x, y, shown, norm=norm, cmap=colours, shading="nearest")
             _mark_worst(axes, points, panel.level, float(height))
             _outline(axes, hall)
+            reach = 0.05 * float(np.max(size))
             for beacon in panel.site.beacons:
-                _place(axes, beacon, 0.05 * float(np.max(size)))
+                _place(axes, beacon, reach)
+            _label(axes, panel.site, 0.5 * reach)
             axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+            low, high = hall.room.box_world[:, :2] + 1.5 * reach * np.array([[-1.0], [1.0]])
+            axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
             axes.set_title(f"{panel.words}\nat height {height:.3g} m; {_worst(panel)}", fontsize=10)
     bar = figure.colorbar(mesh, ax=every.tolist()[0] + every.tolist()[-1], ticks=levels, shrink=0.7)
     bar.ax.set_yticklabels([length(level) for level in levels])
@@ -113,18 +117,35 @@ def _outline(axes: Axes, hall: Hall) -> None:
 
 
 def _place(axes: Axes, beacon: Beacon, reach: float) -> None:
-    x, y, z = beacon.position_world
+    x, y, _ = beacon.position_world
     axis = pattern_axis(beacon)
     if axis is not None:
         way = reach * (beacon.world_from_beacon @ axis)[:2]
         axes.plot([x - way[0], x + way[0]], [y - way[1], y + way[1]], color="red", clip_on=False)
     axes.scatter(x, y, s=60, marker="^", c="red", edgecolors="white", zorder=3, clip_on=False)
-    axes.annotate(
-        f"{beacon.name} ({z:.3g} m)",
-        (x, y),
-        xytext=(0, 8),
-        textcoords="offset points",
-        ha="center",
-        fontsize=8,
-        bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "alpha": 0.7, "linewidth": 0},
-    )
+
+
+def _label(axes: Axes, site: Site, near: float) -> None:
+    """Write names and heights, those of beacons above each other or close by under each other."""
+    groups: list[list[Beacon]] = []
+    for beacon in site.beacons:
+        place = beacon.position_world[:2]
+        beside = (g for g in groups if np.linalg.norm(g[0].position_world[:2] - place) < near)
+        group = next(beside, None)
+        if group is None:
+            groups.append([beacon])
+        else:
+            group.append(beacon)
+    for number, group in enumerate(groups):
+        x, y, _ = group[0].position_world.tolist()
+        above = number % 2 == 0  # those of neighbours would lie on each other
+        axes.annotate(
+            "\n".join(f"{b.name} ({b.position_world[2]:.3g} m)" for b in group),
+            (x, y),
+            xytext=(0, 8 if above else -8),
+            va="bottom" if above else "top",
+            textcoords="offset points",
+            ha="center",
+            fontsize=8,
+            bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "alpha": 0.7, "linewidth": 0},
+        )

@@ -1,0 +1,119 @@
+"""The part of `design` that says where to hold the sensor next, for a calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magfusion.errors import InputError
+
+if TYPE_CHECKING:
+    from magfusion.jobs.design import DesignSettings
+    from magfusion.model.hall import Hall
+    from magfusion.model.site import Site
+    from magfusion.results.design.motion import Motion, Stop
+    from magfusion.results.figures import Figures
+    from magfusion.units import Array
+
+
+def run_motion(
+    settings: DesignSettings, site: Site, hall: Hall, points: Array, output: Path
+) -> Figures:
+    """Choose stops for a calibration: table, picture and report.
+
+    Raises
+    ------
+    InputError
+        Where the site says that everything is known, or ``output`` is in the way.
+    """
+    from magfusion.jobs.inputs import claim
+    from magfusion.results.design.motion import next_motion
+    from magfusion.results.plots.motion import write_motion_plot
+    from magfusion.results.report import write_report
+
+    assert settings.motion is not None
+    claimed = claim(output, "design")
+    found = next_motion(site, points, settings.motion, settings.stop, known=settings.poses_known)
+    if not len(found.parameters.sigma):
+        raise InputError(
+            f"{settings.site}: all sigmas are zero, so that nothing is left to calibrate; declare"
+            " how well beacons and magnetometer are known"
+        )
+    figures = _figures(settings, found)
+    with claimed as directory:
+        _write_stops(directory / "motion.parquet", found)
+        write_motion_plot(directory / "motion.png", site, hall, found)
+        write_report(directory, figures)
+    return figures
+
+
+def said(found: Motion, number: int) -> str:
+    """Return what to do at a stop, and what it is for."""
+    stop, parameters = found.stops[number], found.parameters
+    x, y, z = stop.position_world
+    roll, pitch, yaw = stop.rpy_deg
+    before, after = (parameters.sized(stop.worst, r) for r in (stop.before, stop.after))
+    return (
+        f"{number + 1}. Hold the platform at ({x:.2f}, {y:.2f}, {z:.2f}) m, turned by roll"
+        f" {roll:g}, pitch {pitch:g}, yaw {yaw:g} deg: the sigma of"
+        f" {parameters.names[stop.worst][0]} falls from {before} to {after}."
+    )
+
+
+def _figures(settings: DesignSettings, found: Motion) -> Figures:
+    from magfusion.model.trust import Trust
+    from magfusion.results.figures import Figure, Figures, Section, heading
+    from magfusion.results.verdict import trust_figures
+
+    parameters = found.parameters
+    start, left = (parameters.excess(r) for r in (np.ones(len(found.ratio)), found.ratio))
+    asked = parameters.asked
+    beyond = [parameters.names[k][0] for k in np.flatnonzero(~asked)]
+    notes = [said(found, k) for k in range(len(found.stops))]
+    if beyond:
+        notes.append(
+            f"No such stops determine {', '.join(beyond)}: only a better survey does, or"
+            " poses that are measured; of the lever arm, turning on the spot with an IMU."
+        )
+    figures = [
+        Figure("stops", len(found.stops)),
+        Figure("stop_s", settings.stop, "s"),
+        Figure("poses_known", settings.poses_known),
+        Figure("parameters", len(asked)),
+        Figure("parameters_in_reach", int(np.sum(asked))),
+        *(
+            Figure(
+                f"worst_excess_{name}",
+                float(np.max(value[asked], initial=0.0)),
+                label=f"worst parameter, {name}, in sigmas of the fields' noise",
+            )
+            for name, value in (("before", start), ("after", left))
+        ),
+        Figure("out_of_reach", beyond, section=Section.REPORT),
+        Figure("notes", notes, section=Section.NOTES),
+    ]
+    return heading("design", settings.site.stem) | trust_figures(Trust()) | Figures(*figures)
+
+
+def _write_stops(path: Path, found: Motion) -> None:
+    from magfusion.files.table import write_table
+
+    def column(of: str) -> Array:
+        return np.array([getattr(stop, of) for stop in found.stops])
+
+    parameters = found.parameters
+    size = np.array([parameters.sigma[stop.worst] for stop in found.stops])
+    where, turned = column("position_world").reshape(-1, 3), column("rpy_deg").reshape(-1, 3)
+    columns: dict[str, object] = dict(
+        zip(("position_x", "position_y", "position_z"), where.T, strict=True)
+    )
+    columns |= dict(zip(("roll_deg", "pitch_deg", "yaw_deg"), turned.T, strict=True))
+    columns["parameter"] = [_name(found, stop) for stop in found.stops]
+    columns |= {"sigma_before": size * column("before"), "sigma_after": size * column("after")}
+    write_table(columns, path)
+
+
+def _name(found: Motion, stop: Stop) -> str:
+    return found.parameters.names[stop.worst][0]

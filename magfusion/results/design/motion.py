@@ -1,0 +1,258 @@
+"""Where to hold the sensor next, for a calibration: stops chosen one by one by what they determine.
+
+A stop is a pose held for some time.  What it tells of the calibration is what its fields leave when
+the pose itself is marginalised, of which only gravity is known; or all of it, where poses are
+measured.  What an IMU tells of the way between stops is left out: a log determines more, not less.
+
+A parameter counts by how far one sigma of it moves the fields where it is to be navigated, in
+units of their noise: so metres, radians and shares can be compared.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.model.parameters import (
+    Block,
+    choose_blocks,
+    initial_calibration,
+    prior_sigma,
+)
+from magfusion.model.prior import prior_sqrt_information
+from magfusion.model.site import Site
+from magfusion.results.observability import parameter_names
+from magfusion.results.pose_information import (
+    NEAREST,
+    SURVEY_GROUPS,
+    is_free,
+    phasor_variance,
+    whitened,
+)
+from magfusion.units import Array, BoolArray, IntArray
+
+ATTITUDES_DEG = (
+    (0.0, 0.0, 0.0),
+    (0.0, 0.0, 90.0),
+    (0.0, 0.0, 180.0),
+    (0.0, 0.0, -90.0),
+    (90.0, 0.0, 0.0),
+    (-90.0, 0.0, 0.0),
+    (0.0, 90.0, 0.0),
+    (0.0, -90.0, 0.0),
+    (180.0, 0.0, 0.0),
+)  # roll, pitch, yaw
+MOST_PLACES = 120
+OUT_OF_REACH = 0.9  # of a sigma, that all stops together leave: no motion determines it
+LEVEL_SIGMA = 2e-3  # rad, of gravity, at the least
+UNKNOWN = 1e-4  # information (1/rad^2) of a phase of which nothing is known
+AT_ONCE = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Parameters:
+    """What is to be calibrated, number by number.
+
+    Parameters
+    ----------
+    names : list of (str, str, float)
+        In words, with unit and the unit's size.
+    sigma : ndarray, shape (k,)
+        Declared by the site, as tangent vector.
+    weight : ndarray, shape (k,)
+        By how many sigmas of their noise the fields move, for one sigma.
+    limit : ndarray, shape (k,)
+        Of the declared sigma, that is left after all stops that there are.
+    asked : bool ndarray, shape (k,)
+        Whether stops can determine it, and it is of the site rather than of one log.
+    """
+
+    names: list[tuple[str, str, float]]
+    sigma: Array
+    weight: Array
+    limit: Array
+    asked: BoolArray
+
+    def worst(self, ratio: Array) -> int:
+        """Return the one of which most can still be had: what moves the fields most.
+
+        Parameters
+        ----------
+        ratio : ndarray, shape (k,)
+            Of each sigma to the declared one.
+        """
+        return int(np.argmax(np.where(self.asked, self.excess(ratio), -1.0)))
+
+    def excess(self, ratio: Array) -> Array:
+        """Return how far what stops could still determine moves the fields, in sigmas of noise."""
+        left = np.maximum(ratio**2 - self.limit**2, 0.0)
+        return np.asarray(self.weight * np.sqrt(left))
+
+    def sized(self, index: int, ratio: float) -> str:
+        """Return a sigma with its unit, given as a share of the declared one."""
+        _, unit, size = self.names[index]
+        return f"{ratio * self.sigma[index] / size:.2g} {unit}".strip()
+
+
+@dataclass(frozen=True, eq=False)
+class Stop:
+    """A pose to hold, and what that does.
+
+    Parameters
+    ----------
+    worst : int
+        The parameter that it is for.
+    before, after : float
+        Its sigma, of the declared one.
+    """
+
+    position_world: Array
+    rpy_deg: tuple[float, float, float]
+    worst: int
+    before: float
+    after: float
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Stops in their order, and what they leave.
+
+    Parameters
+    ----------
+    ratio : ndarray, shape (k,)
+        Sigma of each parameter after all stops, of the declared one.
+    """
+
+    stops: tuple[Stop, ...]
+    parameters: Parameters
+    ratio: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Candidates for stops, and what each tells.
+
+    Parameters
+    ----------
+    position_world : ndarray, shape (n, 3)
+        (m)
+    attitude : int ndarray, shape (n,)
+        Of `ATTITUDES_DEG`.
+    root : ndarray, shape (n, rows, k)
+        Of the information on the calibration, in units of the declared sigmas.
+    """
+
+    position_world: Array
+    attitude: IntArray
+    root: Array
+
+
+def next_motion(site: Site, places: Array, count: int, stop: float, *, known: bool) -> Motion:
+    """Choose stops one after another, each for the parameter that is worst then.
+
+    Parameters
+    ----------
+    places : ndarray, shape (m, 3)
+        Where the platform may be held (m); evenly thinned where they are many.
+    stop : float
+        How long (s).
+    known : bool
+        Whether the poses are measured, as those of a survey.
+    """
+    blocks = choose_blocks(site, SURVEY_GROUPS)
+    poses = candidate_poses(site, blocks, places, stop, known=known)
+    information = prior_information(site, blocks)
+    limit = _ratio(information + np.sum(np.swapaxes(poses.root, 1, 2) @ poses.root, axis=0))
+    parameters = Parameters(
+        parameter_names(blocks, initial_calibration(site, 0.0)),
+        np.where(is_free(blocks), 1.0, prior_sigma(blocks)),
+        _weight(site, blocks, poses.position_world, stop),
+        limit,
+        ~is_free(blocks) & (limit < OUT_OF_REACH),
+    )
+    stops: list[Stop] = []
+    ratio = _ratio(information)
+    for _ in range(count if np.any(parameters.asked) else 0):
+        worst = parameters.worst(ratio)
+        chosen, reached = _best(information, poses, worst)
+        information = information + poses.root[chosen].T @ poses.root[chosen]
+        stops.append(
+            Stop(
+                poses.position_world[chosen],
+                ATTITUDES_DEG[int(poses.attitude[chosen])],
+                worst,
+                float(ratio[worst]),
+                reached,
+            )
+        )
+        ratio = _ratio(information)
+    return Motion(tuple(stops), parameters, ratio)
+
+
+def prior_information(site: Site, blocks: tuple[Block, ...]) -> Array:
+    """Return what the site knows of the calibration, in units of its sigmas, shape (k, k)."""
+    free = is_free(blocks)
+    root = (prior_sqrt_information(site, blocks) * prior_sigma(blocks))[~free]
+    return np.asarray(root.T @ root + UNKNOWN * np.diag(free.astype(float)))
+
+
+def candidate_poses(
+    site: Site, blocks: tuple[Block, ...], places: Array, stop: float, *, known: bool
+) -> Poses:
+    """Return every place in every attitude, with what a stop there tells."""
+    places = places[np.unique(np.linspace(0, len(places) - 1, MOST_PLACES).astype(int))]
+    centres = np.array([b.position_world for b in site.beacons])
+    apart = np.linalg.norm(places[:, None] - centres, axis=2).min(axis=1)
+    places = places[apart > NEAREST + np.linalg.norm(site.platform.magnetometer.position_body)]
+    variance, calibration = phasor_variance(site, stop), initial_calibration(site, 0.0)
+    sigma = np.where(is_free(blocks), 1.0, prior_sigma(blocks))
+    level = max(site.platform.imu.accel_bias_sigma / site.gravity, LEVEL_SIGMA)
+    roots = []
+    for rpy_deg in ATTITUDES_DEG:
+        attitude = Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix()
+        seen = whitened(calibration, blocks, variance, attitude, places)
+        by_calibration = seen.by_nuisance * sigma
+        if known:
+            roots.append(by_calibration)
+            continue
+        x, y, z = attitude[2]  # up, body axes: a turn about it is not felt
+        gravity = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) / level
+        rows = np.zeros((len(places), 3, 6 + len(sigma)))
+        rows[:, :, :3] = gravity
+        fields = np.concatenate([seen.by_pose, by_calibration], axis=2)
+        every = np.concatenate([fields, rows], axis=1)
+        missing = max(every.shape[2] - every.shape[1], 0)
+        every = np.pad(every, ((0, 0), (0, missing), (0, 0)))
+        triangle = np.asarray(np.linalg.qr(every, mode="r"))
+        roots.append(triangle[:, 6 : seen.by_pose.shape[1] + 3, 6:])
+    count = len(places)
+    return Poses(
+        np.tile(places, (len(roots), 1)),
+        np.repeat(np.arange(len(roots)), count),
+        np.concatenate(roots),
+    )
+
+
+def _weight(site: Site, blocks: tuple[Block, ...], places: Array, stop: float) -> Array:
+    """Return by how many sigmas of noise one of each parameter moves the fields, rms."""
+    level = places[: len(places) // len(ATTITUDES_DEG)]
+    calibration = initial_calibration(site, 0.0)
+    seen = whitened(calibration, blocks, phasor_variance(site, stop), np.eye(3), level)
+    moved = seen.by_nuisance * np.where(is_free(blocks), 1.0, prior_sigma(blocks))
+    return np.sqrt(np.mean(np.sum(moved**2, axis=1), axis=0))
+
+
+def _ratio(information: Array) -> Array:
+    return np.sqrt(np.diagonal(np.linalg.inv(information), axis1=-2, axis2=-1))
+
+
+def _best(information: Array, poses: Poses, worst: int) -> tuple[int, float]:
+    """Return the candidate that leaves the least sigma of a parameter, and that sigma."""
+    found = []
+    for start in range(0, len(poses.root), AT_ONCE):
+        root = poses.root[start : start + AT_ONCE]
+        ratio = _ratio(information + np.swapaxes(root, 1, 2) @ root)
+        found.append(ratio[:, worst])
+    each = np.concatenate(found)
+    chosen = int(np.argmin(each))
+    return chosen, float(each[chosen])

@@ -1,0 +1,15 @@
+"""Four beacons in an L-shaped hall beat random layouts by what is asked of a design."""
+
+import pytest
+from design_hall import Config, report, run
+
+
+@pytest.mark.slow
+def test_a_design_beats_the_median_of_random_layouts_and_the_best_of_them() -> None:
+    found = run(Config(spacing=2.0, grid=2.0, starts=3, searches=1))
+    assert found.gain_over_median > 0.3
+    assert found.gain_over_best > 0.05
+    # At points it was not designed for, too.
+    assert found.fine_designed < 0.7 * found.fine_random_median
+    assert sum(found.seconds) < 600.0
+    assert "below the median" in report(found)
