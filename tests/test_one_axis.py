@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import Refuse, run_command
 
-from magfusion.estimation.snapshot.coil_fix import CoilFixes, Gain, _at_point, _Problem, fix_coil
+from magfusion.estimation.snapshot.coil_fix import CoilFixes, Gain, _Problem, fix_coil
 from magfusion.estimation.snapshot.coil_poses import nearest_truth, poses_of
-from magfusion.estimation.snapshot.coil_starts import CoilEpochs
+from magfusion.estimation.snapshot.coil_starts import CoilEpochs, at_point
 from magfusion.files.site import load_site, save_site
 from magfusion.model.coil_field import as_points
 from magfusion.model.parameters import initial_calibration
@@ -91,7 +91,7 @@ def test_signed_phasors_of_a_known_gain_tell_which_way_it_points(site: Site) -> 
 @pytest.mark.parametrize("signed", [False, True])
 def test_the_gradient_is_that_of_the_cost(site: Site, *, signed: bool) -> None:
     own = epochs(seen(site, 2.0), signed=signed)
-    problem = _Problem(own, _at_point(initial_calibration(site, 0.0)), Gain(2.0, 0.1))
+    problem = _Problem(own, at_point(initial_calibration(site, 0.0)), Gain(2.0, 0.1))
     state = np.concatenate([PLACE[:1] + 0.01, 2.2 * AXIS[:1] + 0.1], axis=1)
     epoch, step = np.zeros(1, dtype=np.int64), 1e-6
     sigma = problem.sigma(epoch, state)
@@ -143,14 +143,16 @@ def test_a_site_keeps_the_axes_of_its_receiver(log: Path, tmp_path: Path) -> Non
 
 def test_other_jobs_refuse_it_in_a_sentence(log: Path, tmp_path: Path, refuse: Refuse) -> None:
     said = refuse("smooth", log, "-o", tmp_path / "run")
-    assert "one axis leaves its roll open" in said
+    assert "amplitudes without sign are located by fix alone" in said
 
 
-def test_two_axes_are_refused_in_a_sentence(log: Path, tmp_path: Path, refuse: Refuse) -> None:
+def test_amplitudes_of_two_axes_are_refused_in_a_sentence(
+    log: Path, tmp_path: Path, refuse: Refuse
+) -> None:
     text = (log / "site.yaml").read_text()
     (tmp_path / "site.yaml").write_text(text.replace("axes: [z]", "axes: [x, z]"))
     said = refuse("fix", log, "--site", tmp_path / "site.yaml", "-o", tmp_path / "run")
-    assert "a receiver of two axes is not located yet" in said
+    assert "is [x, z], and the fields of" in said
 
 
 def test_what_does_not_fit_the_receiver_is_refused(

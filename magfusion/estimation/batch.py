@@ -24,6 +24,7 @@ from magfusion.estimation.prepared import prepared
 from magfusion.estimation.relaxation import Step, part_of_the_way
 from magfusion.estimation.settings import SmootherSettings as SmootherSettings
 from magfusion.estimation.solve.bordered import Optimised, eliminate, marginal, optimise
+from magfusion.model.noise import twice
 from magfusion.model.parameters import Block, Calibration, placed
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import FieldSamples, Log
@@ -293,7 +294,7 @@ def posterior(
         pose_cov = pose_cov + response @ np.swapaxes(response, 1, 2)
     left = {type(m): graph.residual(m, estimate) for m in map(alone, graph.measurements)}
     error = left.get(FieldPhasors, np.nan)
-    residual = np.where(samples.valid[..., None], error, np.full(6, np.nan))
+    residual = np.where(twice(samples.there), error, np.full(6, np.nan))
     earth_field = next((m for m in graph.measurements if isinstance(m, EarthField)), None)
     earth = None if earth_field is None else left[EarthField][:, 0]
     return Smoothed(

@@ -18,7 +18,7 @@ from magfusion.estimation.motion_from_field import FieldMotion, motion_from_fiel
 from magfusion.estimation.solve.bordered import optimise
 from magfusion.estimation.state import State
 from magfusion.model.parameters import Calibration
-from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
+from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.trajectory import Trajectory
 from magfusion.receiver.admission import INERTIAL_GAP, Windows, longest_step, silences, usual_step
 from magfusion.receiver.receiver import LockinReceiver
@@ -43,6 +43,8 @@ def bridged(log: PreparedLog) -> PreparedLog:
     source = log.demodulation
     if log.fixes is not None or not len(source.without_turn):
         return log
+    if log.declared.site.platform.magnetometer.lacking:
+        return log  # fewer components than three do not tell a turn
     graph, _ = graph_of(log, log.states, log.declared)
     found = optimise(graph, initial_estimate(log.states, log.declared)).estimate
     states, calibration = read_states(found.values, log.states.time), found.calibration
@@ -79,7 +81,7 @@ def _followed(log: PreparedLog, states: Trajectory, calibration: Calibration) ->
             continue
         start = _state(states, known, calibration)
         inside = (waveform.time > start.time) & (waveform.time < last + window)
-        part = Waveform(waveform.time[inside], waveform.measured_sensor[inside])
+        part = waveform.rows(inside)
         near = (imu.time > start.time - window) & (imu.time < last + 2.0 * window)
         heard = ImuSamples(imu.time[near], imu.gyro_body[near], imu.accel_body[near])
         motion = motion_from_field(start, part, heard, longest_step(step))

@@ -460,7 +460,8 @@ class Arrivals:
         return replace(found, fields=replace(found.fields, phasor_cov=np.mean(self._noise, axis=0)))
 
     def _waveform_samples(self) -> Waveform:
-        return Waveform(*self.waveform.rows())
+        axes = self.receiver.site.platform.magnetometer.axes
+        return Waveform(*self.waveform.rows(), axes=axes)
 
     def _rate_body(self, time: float) -> Array:
         stamp = time - self.applied_offset

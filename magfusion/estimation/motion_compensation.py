@@ -137,7 +137,7 @@ def demodulate_predicted(
     assert receiver.admission is not None
     window = receiver.grid.windows(np.array([number]), waveform.time)
     inside = slice(int(window.first[0]), int(window.first[0] + window.count[0]))
-    samples = Waveform(waveform.time[inside], waveform.measured_sensor[inside])
+    samples = waveform.rows(inside)
     alone = replace(window, first=np.zeros(1, dtype=np.int64))
     calibration = replace(predicted.calibration, time_offset=offset)
     known = on_clock(imu, offset, predicted.gyro_bias_body)

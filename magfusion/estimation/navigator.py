@@ -142,12 +142,17 @@ class Navigator:
     def add_magnetometer(self, time: Array, measured_sensor: Array) -> None:
         """Take raw samples of the magnetometer: times (k,), fields (k, 3) (T).
 
+        What stands in the columns of axes that the site does not declare is not looked at.
+
         Raises
         ------
         InputError
             Where a number is not finite or the clock jumped.
         """
         known, sensor = self.site.temperatures, self.site.platform.magnetometer
+        if sensor.lacking:
+            measured_sensor = np.array(measured_sensor, dtype=np.float64)
+            measured_sensor[..., sensor.lacking] = 0.0
         samples = heard_at_reference(known, sensor, time, measured_sensor)
         self._arrived.add_magnetometer(time, samples)
         self._stand_still(np.atleast_1d(time), raw=True)
@@ -201,6 +206,10 @@ class Navigator:
             Where the clock jumped.
         """
         known, sensor = self.site.temperatures, self.site.platform.magnetometer
+        if sensor.lacking:
+            phasor = samples.phasor_sensor.copy()
+            phasor[..., sensor.lacking] = np.nan
+            samples = replace(samples, phasor_sensor=phasor, axes=sensor.axes)
         samples = heard_fields_at_reference(known, sensor, samples)
         after = -np.inf if self._estimator is None else self._estimator.state.time
         late = self._arrived.add_fields(samples, steady if self.settings.earth else None, after)

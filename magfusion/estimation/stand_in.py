@@ -55,7 +55,7 @@ class StandIn:
         # What is behind the newest sample is silent from it on.
         begin[-1] -= admission.imu_margin
         meets = (begin < until - admission.imu_margin) & (end > state.time)
-        if not np.any(meets):
+        if not np.any(meets) or state.calibration.site.platform.magnetometer.lacking:
             return
         time, rows = waveform.rows()
         within = (time > state.time) & (time < until)

@@ -37,11 +37,18 @@ def write_fields(fields: FieldSamples, path: Path, epoch_ns: int) -> None:
     names = pa.array([beacon for beacon, _ in fields.channels], pa.string())
     columns["beacon"] = names.take(pa.array(channel))
     columns["tone"] = np.array([tone for _, tone in fields.channels], dtype=np.int64)[channel]
-    columns |= dict(zip(_REAL, phasor.real.T, strict=True))
-    columns |= dict(zip(_IMAGINARY, phasor.imag.T, strict=True))
-    columns["sigma"] = np.sqrt(np.trace(cov, axis1=1, axis2=2) / 3.0)
+    kept = [name for axis in fields.axes for name in _PARTS[axis]]
+    if not fields.signed:
+        columns[_AMPLITUDE] = phasor[:, "xyz".index(fields.axes)].real
+        kept = []
+    parts = dict(zip(_REAL, phasor.real.T, strict=True))
+    parts |= dict(zip(_IMAGINARY, phasor.imag.T, strict=True))
+    columns |= {name: value for name, value in parts.items() if name in kept}
+    own = ["xyz".index(axis) for axis in fields.axes]
+    columns["sigma"] = np.sqrt(np.trace(cov[:, own][:, :, own], axis1=1, axis2=2) / len(own))
     columns["window"] = fields.window[row]
-    columns |= dict(zip(_COV, cov[:, *_UPPER].T, strict=True))
+    if fields.axes == "xyz":
+        columns |= dict(zip(_COV, cov[:, *_UPPER].T, strict=True))
     write_table(columns, path)
 
 
@@ -73,8 +80,11 @@ def read_fields(path: Path, span: Span) -> FieldSamples:
     phasor = np.full((len(time_ns), len(channels), 3), np.nan, dtype=np.complex128)
     for axis in axes:
         names = _PARTS[axis] if signed else (_AMPLITUDE,)
-        parts = table.numbers(names)
+        parts = table.numbers(names, nan=signed)
+        _refuse_half(table, names, parts)
         phasor[row, column, "xyz".index(axis)] = parts[:, 0] + (1j * parts[:, 1] if signed else 0)
+    nothing = ~np.any(np.isfinite(phasor[row, column]), axis=1)
+    table.refuse(nothing, "beacon", column, "every component is missing; leave the row out")
     if not signed:
         found = phasor[row, column, 0].real
         table.refuse(found < 0.0, _AMPLITUDE, found, "an amplitude has no sign; write re and im")
@@ -126,6 +136,13 @@ def _measured(table: Table, path: Path) -> tuple[str, bool]:
         raise InputError(f"{path}: holds a covariance of three axes, and only {axes}; leave it out")
     _refuse_blind(table, path, axes)
     return axes, True
+
+
+def _refuse_half(table: Table, names: tuple[str, ...], parts: Array) -> None:
+    """Refuse a component with one part of two; without both it was not measured."""
+    half = np.any(np.isnan(parts), axis=1) & ~np.all(np.isnan(parts), axis=1)
+    remedy = f"write both of {', '.join(names)}, or leave both out where nothing was measured"
+    table.refuse(half, names[0], parts[:, 0], remedy)
 
 
 def _refuse_blind(table: Table, path: Path, axes: str) -> None:

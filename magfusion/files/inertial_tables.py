@@ -24,6 +24,7 @@ _ACCEL = ("accel_x", "accel_y", "accel_z")
 _FIELD = ("field_x", "field_y", "field_z")
 IMU_LAYOUT = Layout(numbers=(*_GYRO, *_ACCEL), repeats=True)
 FIELD_LAYOUT = Layout(numbers=_FIELD, repeats=True)
+_SOME_AXES = Layout(numbers=(), repeats=True, some=_FIELD)
 
 
 def read_imu(
@@ -63,6 +64,8 @@ def read_waveform(
 ) -> tuple[Waveform | None, tuple[Finding, ...]]:
     """Read and check magnetometer samples; ``names`` as in `read_table`.
 
+    A receiver of fewer axes leaves columns out.
+
     Returns
     -------
     Waveform or None, tuple of Finding
@@ -75,12 +78,18 @@ def read_waveform(
     """
     if path is None:
         return None, ()
-    table = read_table(path, FIELD_LAYOUT, span, names)
+    table = read_table(path, _SOME_AXES, span, names)
     if not len(table):
         return None, ()
-    time, values, noticed = _measured(table, _FIELD, "magnetometer")
+    columns = tuple(name for name in _FIELD if table.has((name,)))
+    time, values, noticed = _measured(table, columns, "magnetometer")
     check_field(np.linalg.norm(values, axis=1), str(path))
-    return Waveform(time, values), noticed
+    if columns == _FIELD:
+        return Waveform(time, values), noticed
+    whole = np.zeros((len(time), 3))
+    whole[:, [_FIELD.index(name) for name in columns]] = values
+    axes = "".join(name[-1] for name in columns)
+    return Waveform(time, whole, axes=axes), noticed
 
 
 def _measured(
@@ -104,7 +113,8 @@ def write_waveform(
 ) -> None:
     """Write magnetometer samples, and the currents beside them, as Parquet."""
     columns: dict[str, object] = {TIME: Span(epoch_ns).stamps(waveform.time)}
-    columns |= dict(zip(_FIELD, waveform.measured_sensor.T, strict=True))
+    values = dict(zip(_FIELD, waveform.measured_sensor.T, strict=True))
+    columns |= {name: value for name, value in values.items() if name[-1] in waveform.axes}
     columns |= {} if drive is None else columns_beside(drive, waveform)
     write_table(columns, path)
 

@@ -99,7 +99,7 @@ def _phasor(value: object) -> ComplexArray:
     for i, tone in enumerate(value):
         if tone is None:
             continue
-        found = _numbers(tone, what)
+        found = _numbers(tone, what, missing=True)
         if found.shape != (2, 3):
             raise PydanticCustomError("phasor", "it should be {what}", {"what": what})
         out[i] = found[0] + 1j * found[1]
@@ -259,7 +259,7 @@ def field_samples(entry: FieldsRecord, channels: tuple[tuple[str, int], ...]) ->
                 raise InputError(f"holds beacon {name} tone {tone}; the site knows {known}")
             row = channels.index((name, tone))
             phasor[row] = value
-            if np.all(np.isfinite(value)):
+            if np.any(np.isfinite(value)):
                 cov[row] = _noise(entry, name, tone)
     return FieldSamples(
         time=np.array([entry.time]),
@@ -371,7 +371,9 @@ def imu_content(samples: ImuSamples) -> dict[str, Any]:
 
 def magnetometer_content(waveform: Waveform) -> dict[str, Any]:
     """Return raw samples of the magnetometer as a record."""
-    field = waveform.measured_sensor.tolist()
+    measured = waveform.measured_sensor.copy()
+    measured[:, [axis not in waveform.axes for axis in "xyz"]] = np.nan
+    field = [_or_none(row) for row in measured]
     return {"magnetometer": {"time": waveform.time.tolist(), "field": field}}
 
 
@@ -379,6 +381,11 @@ def marks_content(marks: Marks) -> dict[str, Any]:
     """Return bursts as a record."""
     start, end = marks.begin.tolist(), marks.end.tolist()
     return {"marks": {"start": start, "end": end, "slot": marks.slot.tolist()}}
+
+
+def _or_none(row: Array) -> list[float | None]:
+    """Return numbers as JSON has them: None where one is missing."""
+    return [value if np.isfinite(value) else None for value in row.tolist()]
 
 
 def temperature_content(time: float, part: str, degc: float) -> dict[str, Any]:
@@ -414,7 +421,7 @@ def fields_content(samples: FieldSamples) -> dict[str, Any]:
         for tone in range(max(rows) + 1):
             if tone in rows and valid[rows[tone]]:
                 value = samples.phasor_sensor[0, rows[tone]]
-                phasors[name].append([value.real.tolist(), value.imag.tolist()])
+                phasors[name].append([_or_none(value.real), _or_none(value.imag)])
                 covariance[name].append(samples.phasor_cov[0, rows[tone]].tolist())
             else:
                 phasors[name].append(None)

@@ -84,6 +84,8 @@ class Layout:
         Groups of columns with numbers: each whole or absent.
     repeats : bool
         Whether several rows may have the same time.
+    some : tuple of str
+        Columns with numbers, of which one at least must be there.
     """
 
     numbers: tuple[str, ...]
@@ -91,11 +93,13 @@ class Layout:
     texts: tuple[str, ...] = ()
     optional: tuple[tuple[str, ...], ...] = ()
     repeats: bool = False
+    some: tuple[str, ...] = ()
 
     def chosen(self, found: Sequence[str], path: Path) -> list[str]:
         """Return the columns to read of those found; refuse a table that lacks one."""
         groups = [g for g in self.optional if set(g) & set(found)]
         wanted = [*self.integers, *self.texts, *self.numbers, *(name for g in groups for name in g)]
+        wanted += [name for name in self.some if name in found] or self.some
         missing = [name for name in wanted if name not in found]
         if missing:
             raise InputError(

@@ -44,7 +44,8 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
 
     claimed, job = claim(output, "demodulate"), settings.job(output)
     lockin = settings.lockin(job)
-    log, site = read_job(job, reference=settings.at_rest, report=report)
+    used = settings.at_rest
+    log, site = read_job(job, fewer=not used, reference=used, report=report)
     if log.waveform is None:
         raise InputError(
             f"{job.log_path}: holds no magnetometer.parquet to demodulate; give the raw log"

@@ -140,15 +140,15 @@ def run_fix(
 
     claimed = claim(job.output, "smooth", "fix")
     used = rest is not None and rest.at_rest
-    log, site = read_job(job, coil=True, reference=used, report=report)
+    log, site = read_job(job, fewer=True, amplitudes=True, reference=used, report=report)
     began = time.perf_counter()
     report("demodulating", 0, 3)
+    if used and site.platform.magnetometer.lacking:
+        raise InputError(
+            "--at-rest integrates samples of three axes; leave it out for a receiver of fewer"
+        )
     if len(site.platform.magnetometer.axes) == 1:
-        if used:
-            raise InputError(
-                "--at-rest integrates samples of three axes; leave it out for one axis"
-            )
-        return _run_coil(claimed, job, log, site, free, report)
+        return _run_coil(claimed, job, log, site, lockin, free, report)
     with named(job.log_path):
         rested = None if rest is None else rest.integrated(log, site, lockin)
         recording, log = log, log if rested is None else rested.log(log)
@@ -187,15 +187,18 @@ def _run_coil(
     job: Job,
     log: Log,
     site: Site,
+    lockin: LockinSettings | None,
     free: tuple[str, ...],
     report: Report,
 ) -> Figures:
     """Fix a receiver of one axis, whose roll about it nothing tells."""
+    from magfusion.estimation.demodulation import phasors
     from magfusion.jobs.fix_coil import find_coil
-    from magfusion.jobs.inputs import found_in, refuse_failed
+    from magfusion.jobs.inputs import found_in, named, refuse_failed
 
-    assert log.fields is not None
-    found = find_coil(log, log.fields, site, free, report)
+    with named(job.log_path):
+        samples, _ = phasors(log, site, lockin)
+    found = find_coil(log, samples, site, free, report)
     with claimed as whole:
         directory = found_in(whole, found.trust)
         figures = write_fix_result(

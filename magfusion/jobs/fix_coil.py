@@ -80,11 +80,12 @@ def find_coil(
     epochs = CoilEpochs.of(fields, site)
     gain = Gain.of(site.platform.magnetometer, free="gain" in free)
     least = UNKNOWNS - int(np.isfinite(gain.sigma))
-    enough = epochs.heard >= least
+    enough = epochs.told >= least
     if not np.any(enough):
         raise EstimationError(
             f"{log.name}: no epoch holds as many as {least} beacons, which place, direction and"
-            " gain of a receiver of one axis need; add beacons, or write their fields at one time"
+            " gain of a receiver of one axis need (of those that rotate half as many); add beacons,"
+            " write their fields at one time, or smooth, so that the inertial sensor helps"
         )
     kept = epochs.rows(enough)
     calibration = initial_calibration(site, float(np.mean(kept.time)))

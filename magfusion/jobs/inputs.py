@@ -33,6 +33,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.model.without_imu import logged
 from magfusion.receiver.receiver import Receiver
+from magfusion.receiver.slots import has_schedule
 from magfusion.results.page import PAGE
 from magfusion.results.report import FAILED
 
@@ -249,7 +250,8 @@ def read_job(
     *,
     unknown: bool = False,
     without: bool = False,
-    coil: bool = False,
+    fewer: bool = False,
+    amplitudes: bool = False,
     reference: bool = False,
     report: Report = quiet,
 ) -> tuple[Log, Site]:
@@ -261,8 +263,10 @@ def read_job(
         Whether the job can do with beacons that were never surveyed.
     without : bool
         Whether it can do without any.
-    coil : bool
-        Whether it can do with a receiver of one axis.
+    fewer : bool
+        Whether it can do with a receiver of fewer than three axes.
+    amplitudes : bool
+        Whether it can do with amplitudes that have no sign.
     reference : bool
         Whether it uses a reference sensor; that it does not is said.
 
@@ -273,7 +277,7 @@ def read_job(
     """
     site = read_site(job, unknown=unknown, without=without)
     log = _open(job, report)
-    _check_axes(job, log, site, coil=coil)
+    _check_axes(job, log, site, fewer=fewer, amplitudes=amplitudes)
     log, site = logged(log, site)
     if log.inertial and site.platform.imu == NO_IMU:
         raise InputError(
@@ -295,39 +299,44 @@ def read_job(
     return at_reference(log, site)
 
 
-def _check_axes(job: Job, log: Log, site: Site, *, coil: bool) -> None:
+def _check_axes(job: Job, log: Log, site: Site, *, fewer: bool, amplitudes: bool) -> None:
     """Refuse components that are not those of the site's receiver, or that a job cannot take."""
-    declared, fields = site.platform.magnetometer.axes, log.fields
+    sensor, fields, wave = site.platform.magnetometer, log.fields, log.waveform
+    declared = sensor.axes
     key = f"{job.declared_path}: platform.magnetometer.axes:"
-    if declared == "xyz" and (fields is None or (fields.axes == "xyz" and fields.signed)):
+    whole = fields is None or (fields.axes == "xyz" and fields.signed)
+    if declared == "xyz" and whole and (wave is None or wave.axes == "xyz"):
         return
-    sensor = site.platform.magnetometer
     if len(declared) < 3 and (sensor.warming is not None or sensor.coil_kappa != 0.0):
         raise InputError(
             f"{key} of a receiver of fewer than three axes neither warming nor coil_kappa_m2 is"
             " taken into account; leave them out"
         )
-    if len(declared) == 2:
+    if len(declared) < 3 and has_schedule(site):
         raise InputError(
-            f"{key} a receiver of two axes is not located yet; give the third component, or one"
-            " axis alone"
+            f"{key} coils in time slots are not yet told apart by a receiver of fewer than three"
+            " axes; drive them by tones at once"
         )
-    if fields is None:
+    for stream, found in (
+        ("fields", None if fields is None else fields.axes if fields.signed else declared),
+        ("magnetometer", None if wave is None else wave.axes),
+    ):
+        one = fields is not None and not fields.signed and stream == "fields"
+        if found is not None and (found != declared or (one and len(declared) != 1)):
+            has = "one amplitude" if one else ", ".join(found)
+            raise InputError(
+                f"{key} is [{', '.join(declared)}], and the {stream} of {job.log_path} have {has};"
+                " declare the axes that the receiver has"
+            )
+    if not fewer:
         raise InputError(
-            f"{job.log_path}: a receiver of one axis is located by phasors or amplitudes; give"
-            " fields.parquet"
+            f"{key} this job needs all three axes; of a receiver of fewer, check, demodulate, fix,"
+            " smooth and navigate make what can be known"
         )
-    found = fields.axes if fields.signed else declared
-    if found != declared or (declared == "xyz" and not fields.signed):
-        has = ", ".join(fields.axes) if fields.signed else "one amplitude"
+    if fields is not None and not fields.signed and not amplitudes:
         raise InputError(
-            f"{key} is [{', '.join(declared)}], and the fields of {job.log_path} have {has};"
-            " declare the axes that the receiver has"
-        )
-    if not coil:
-        raise InputError(
-            f"{key} a receiver of one axis leaves its roll open, and is located by fix alone; run"
-            " magfusion fix"
+            f"{job.log_path}: amplitudes without sign are located by fix alone; run magfusion fix,"
+            " or give phasors (re and im)"
         )
 
 
@@ -355,7 +364,7 @@ def read_recording(job: Job, report: Report = quiet) -> tuple[Log, Site | None]:
     if job.site_path is not None or job.declared_path.is_file():
         site = load_site(job.declared_path, unknown=True, without=True)
         if site.beacons:
-            return read_job(job, unknown=True, report=report)
+            return read_job(job, unknown=True, fewer=True, report=report)
         return mended(_open(job, report), site), site
     return open_log(job.log_path, job.start, job.end, job.topics, report), None
 

@@ -122,7 +122,7 @@ def run_smooth(
     from magfusion.results.report import FAILED
 
     claimed = claim(job.output, "smooth", "fix")
-    log, site = read_job(job, unknown=True, report=report)
+    log, site = read_job(job, unknown=True, fewer=True, report=report)
     refuse_rate(job.log_path, log, rate)
     began = time.perf_counter()
     try:

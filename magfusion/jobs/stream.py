@@ -190,7 +190,9 @@ def _take_in(
         missing += Counter(imu=len(record.imu.time) - len(time))
         newest = max(newest, _last(time))
     if record.magnetometer is not None:
-        time, field = whole_rows(record.magnetometer.time, record.magnetometer.field)
+        own = record.magnetometer.field.copy()
+        own[:, site.platform.magnetometer.lacking] = 0.0
+        time, field = whole_rows(record.magnetometer.time, own)
         if len(time):
             navigator.add_magnetometer(time, field)
         missing += Counter(magnetometer=len(record.magnetometer.time) - len(time))

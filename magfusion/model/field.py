@@ -382,5 +382,9 @@ def model_error_cov(phasor_sensor: ComplexArray, model_error: float | Array) -> 
     ndarray, shape (..., 3, 3)
         (T^2)
     """
-    power = 0.5 * np.sum(np.abs(phasor_sensor) ** 2, axis=-1)
+    return power_error_cov(0.5 * np.sum(np.abs(phasor_sensor) ** 2, axis=-1), model_error)
+
+
+def power_error_cov(power: Array, model_error: float | Array) -> Array:
+    """Return the same of the field's mean square in either quadrature, shape (...) (T^2)."""
     return (model_error**2 * power)[..., None, None] / 3.0 * np.eye(3)

@@ -1,8 +1,10 @@
 """How much a phasor counts: noise, model error, and the error of the survey."""
 
+from dataclasses import replace
+
 import numpy as np
 
-from magfusion.model.field import model_error_cov
+from magfusion.model.field import power_error_cov, predict
 from magfusion.model.field_map import block_diagonal
 from magfusion.model.ground import conductivity_of, ground_error
 from magfusion.model.parameters import BeaconParameter, candidates
@@ -39,16 +41,50 @@ def calibration_error(site: Site, distance: Array) -> Array:
     return np.sqrt(variance)
 
 
-def _distances(site: Site, samples: FieldSamples) -> Array:
+def _distances(site: Site, square: Array) -> Array:
     """Range of each beacon from the strength of its field alone, within a sixth."""
     out, start = [], 0
     for beacon in site.beacons:
         rows = slice(start, start + len(beacon.tones))
         drive = beacon.moments_beacon.T @ beacon.excitation
-        power = np.sum(np.abs(samples.phasor_sensor[:, rows]) ** 2, axis=(1, 2))
+        power = np.sum(square[:, rows], axis=(1, 2))
         out.append(np.cbrt(MU0_OVER_4PI * np.sqrt(2.0 * np.sum(np.abs(drive) ** 2) / power)))
         start = rows.stop
     return np.stack(out, axis=1)
+
+
+def squares(site: Site, samples: FieldSamples, sensor_world: Array | None = None) -> Array:
+    """Return the squared amplitude of each component, shape (n, channels, 3) (T^2).
+
+    Where a channel lacks components all of its three are the mean of the field that the model has
+    at the place: the error of the model does not vanish with the component along a coil.  Without a
+    place they are the mean of those that are there.
+
+    Parameters
+    ----------
+    sensor_world : ndarray, shape (n, 3), optional
+        Where the magnetometer is (m).
+    """
+    square, partial = np.abs(samples.phasor_sensor) ** 2, samples.partial
+    if not np.any(partial):
+        return np.asarray(square)
+    rows = np.flatnonzero(np.any(partial, axis=1))
+    if sensor_world is None:
+        number = np.maximum(np.sum(samples.there[rows], axis=-1), 1)
+        mean = np.nansum(square[rows], axis=-1) / number
+    else:
+        sensor = site.platform.magnetometer
+        none, along = np.zeros(3), np.eye(3)
+        point = replace(
+            sensor, position_body=none, matrix=along, body_from_sensor=along, coil_kappa=0.0
+        )
+        point = replace(point, coil_centres_sensor=None)
+        turn = np.broadcast_to(along, (len(rows), 3, 3))
+        fields = [predict(beacon, point, turn, sensor_world[rows]) for beacon in site.beacons]
+        gain = np.sum(sensor.matrix**2) / 3.0
+        mean = gain * np.sum(np.abs(np.concatenate(fields, axis=1)) ** 2, axis=-1) / 3.0
+    square[rows] = np.where(partial[rows, :, None], mean[..., None], square[rows])
+    return np.asarray(square)
 
 
 def model_error(site: Site, sensor_world: Array | None = None) -> Array:
@@ -112,10 +148,11 @@ def measurement_cov(
     owner = [i for i, b in enumerate(site.beacons) for _ in b.tones]
     factor = windows * np.array([b.noise_factor for b in site.beacons])[owner] ** 2
     total = factor[:, None, None] * samples.phasor_cov
-    total = total + model_error_cov(samples.phasor_sensor, error)
+    square = squares(site, samples, sensor_world)
+    power = 0.5 * np.sum(square, axis=-1)
+    total = total + power_error_cov(power, error)
     if survey_error:
-        relative = calibration_error(site, _distances(site, samples))[:, owner]
-        power = 0.5 * np.sum(np.abs(samples.phasor_sensor) ** 2, axis=-1)
+        relative = calibration_error(site, _distances(site, square))[:, owner]
         total = total + (relative**2 * power / 3.0)[..., None, None] * np.eye(3)
     return total
 
@@ -131,8 +168,25 @@ def cholesky(cov: Array) -> Array:
         return np.asarray(np.linalg.cholesky(cov + ROUNDING * np.eye(cov.shape[-1])))
 
 
-def whitening(cov: Array, valid: BoolArray) -> Array:
-    """Return ``W`` with ``W^T W = cov^-1``, shape (..., 3, 3); zero where a channel is missing."""
+def whitening(cov: Array, there: BoolArray) -> Array:
+    """Return ``W`` with ``W^T W = cov^-1``, shape (..., 3, 3); zero where a component is missing.
+
+    Parameters
+    ----------
+    cov : ndarray, shape (..., 3, 3)
+    there : bool ndarray, shape (..., 3) or (...)
+        Of each component, or of all three.  The covariance of the components that are there is the inverted one: what is missing was
+        not measured, however large its noise is.
+    """
+    each = there.ndim == cov.ndim - 1
+    valid = np.any(there, axis=-1) if each else there
+    if each and np.any(valid & ~np.all(there, axis=-1)):
+        known = np.where(there[..., :, None] & there[..., None, :], cov, 0.0)
+        count = np.maximum(np.sum(there, axis=-1), 1)
+        size = np.trace(known, axis1=-2, axis2=-1) / count
+        other = np.where(there, 0.0, np.where(valid, size, 1.0)[..., None])
+        whole = known + other[..., None] * np.eye(3)
+        return np.where(there[..., None], whitening(whole, np.ones_like(there)), 0.0)
     safe = np.where(valid[..., None, None], cov, np.eye(3))
     scale = np.sqrt(np.trace(safe, axis1=-2, axis2=-1) / 3.0)[..., None, None]
     root = cholesky(safe / scale**2)
@@ -140,10 +194,15 @@ def whitening(cov: Array, valid: BoolArray) -> Array:
     return np.where(valid[..., None, None], sqrt_information, 0.0)
 
 
-def paired_whitening(cov: Array, valid: BoolArray) -> Array:
+def paired_whitening(cov: Array, there: BoolArray) -> Array:
     """Return the whitening of real and imaginary part together, shape (..., 6, 6)."""
-    single = whitening(cov, valid)
+    single = whitening(cov, there)
     return block_diagonal(np.stack([single, single], axis=-3))
+
+
+def twice(there: BoolArray) -> BoolArray:
+    """Return what is said of components (..., 3) of real part, then imaginary part, (..., 6)."""
+    return np.concatenate([there, there], axis=-1)
 
 
 def stacked(phasor: ComplexArray) -> Array:

@@ -49,21 +49,24 @@ class Waveform:
     time : ndarray, shape (n,)
         Seconds since the log's epoch, strictly increasing.
     measured_sensor : ndarray, shape (n, 3)
-        Uncalibrated flux density (T).
+        Uncalibrated flux density (T); zero in the columns of axes that the receiver lacks.
     marks : Marks, optional
         When which coil was driven, where that was recorded; bursts outside the samples, too.
+    axes : str
+        Those that the receiver has: the other columns say nothing.
     """
 
     time: Array
     measured_sensor: Array
     marks: Marks | None = None
+    axes: str = "xyz"
 
     def __len__(self) -> int:
         return len(self.time)
 
     def rows(self, kept: IntArray | BoolArray | slice) -> "Waveform":
         """Return some samples."""
-        return Waveform(self.time[kept], self.measured_sensor[kept], self.marks)
+        return Waveform(self.time[kept], self.measured_sensor[kept], self.marks, self.axes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +82,7 @@ class FieldSamples:
     channels : tuple of (str, int)
         Beacon name and tone of each channel, in the site's order.
     phasor_sensor : complex ndarray, shape (n, channels, 3)
-        (T), measured axes; NaN where the channel is missing.
+        (T), measured axes; NaN where the channel, or a component of it, is missing.
     phasor_cov : ndarray, shape (n, channels, 3, 3)
         Covariance of the real part, and of the imaginary part alike (T^2).
     ahead : ndarray, shape (n, channels), optional
@@ -161,9 +164,24 @@ class FieldSamples:
         return np.zeros(shape) if self.ahead is None else self.ahead
 
     @property
+    def there(self) -> BoolArray:
+        """Which components each row holds, shape (n, channels, 3)."""
+        return np.isfinite(self.phasor_sensor)
+
+    @property
     def valid(self) -> BoolArray:
-        """Which channels each row holds, shape (n, channels)."""
-        return np.all(np.isfinite(self.phasor_sensor), axis=2)
+        """Of which channels each row holds a component at least, shape (n, channels)."""
+        return np.any(self.there, axis=2)
+
+    @property
+    def partial(self) -> BoolArray:
+        """Of which channels each row holds some components and lacks others, (n, channels)."""
+        return self.valid & ~np.all(self.there, axis=2)
+
+    @property
+    def numbers(self) -> IntArray:
+        """How many real numbers of each channel each row holds, shape (n, channels)."""
+        return 2 * np.sum(self.there, axis=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,3 +259,9 @@ class Log:
     temperatures: Temperatures | None = None
     drive: DriveSamples | None = None
     reference: Waveform | None = None
+
+    @property
+    def vectors(self) -> Waveform | None:
+        """Raw samples of all three axes; None where there are none."""
+        wave = self.waveform
+        return None if wave is None or wave.axes != "xyz" else wave

@@ -298,6 +298,11 @@ class Magnetometer:
     response: FrequencyResponse | None = None
     axes: str = "xyz"
 
+    @property
+    def lacking(self) -> tuple[int, ...]:
+        """Numbers of the axes that it has not."""
+        return tuple(k for k, axis in enumerate("xyz") if axis not in self.axes)
+
 
 @dataclass(frozen=True)
 class Platform:

@@ -95,7 +95,7 @@ def logged(log: Log, site: Site) -> tuple[Log, Site]:
 
 
 def require_motion_prior(site: Site) -> None:
-    """Refuse a site that says nothing of the motion that no IMU measures.
+    """Refuse a site that says too little of the motion that no IMU measures.
 
     Raises
     ------
@@ -106,4 +106,11 @@ def require_motion_prior(site: Site) -> None:
             "holds no inertial samples (imu.parquet), and its site no platform.motion_prior to"
             " smooth by; record the IMU, or declare how the platform moves:"
             f" motion_prior: {EXAMPLE} is a hand's"
+        )
+    if not site.platform.inertial and len(site.platform.magnetometer.axes) == 1:
+        raise InputError(
+            "holds no inertial samples (imu.parquet), and a receiver of one axis"
+            " (platform.magnetometer.axes) tells nothing of the roll about it: neither attitude nor"
+            " lever arm would be determined; record the IMU, or run magfusion fix, which says of"
+            " each epoch what is told"
         )

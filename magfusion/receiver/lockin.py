@@ -56,6 +56,9 @@ class WindowOperator:
         square of it does is noise.
     apart : bool ndarray, shape (windows,)
         Whose noise is not that of their neighbours: there the turn was found without a gyro.
+    lacking : tuple of int
+        Axes that the receiver has not.  The samples of the others cannot be turned, so that the
+        square of any turn is noise, unless a prediction has been taken off.
     """
 
     designs: Designs
@@ -66,6 +69,7 @@ class WindowOperator:
     declared_noise: float
     unseen: BoolArray
     apart: BoolArray
+    lacking: tuple[int, ...] = ()
 
     def apply(self, measured_sensor: Array) -> ComplexArray:
         """Return the phasors of a waveform given at the same sample times.
@@ -110,7 +114,7 @@ class WindowOperator:
             parts.append(
                 (
                     found,
-                    self._bent(rows, maps) * np.sum(np.abs(found) ** 2, axis=-1),
+                    self._bent(rows, maps) * np.nansum(np.abs(found) ** 2, axis=-1),
                     0.5 * (own[:, 1 : 1 + n] + own[:, 1 + n :]),
                     turn[:, None] @ noise @ np.swapaxes(turn, 1, 2)[:, None],
                     (turn @ fitted[:, 0, :, None])[..., 0],
@@ -131,8 +135,10 @@ class WindowOperator:
             channels=self.channels,
             phasor_sensor=phasor,
             phasor_cov=unit[..., None, None] * smooth + bent[..., None, None] * np.eye(3),
+            axes="".join(axis for k, axis in enumerate("xyz") if k not in self.lacking),
         )
         beside = constant_unit[:, None, None] * np.mean(smooth, axis=1)
+        constant[:, self.lacking] = np.nan
         return samples, SteadyFields(centre, constant, beside)
 
     def unexplained(self, measured_sensor: Array) -> Array:
@@ -156,7 +162,7 @@ class WindowOperator:
         Shape (n, channels): what the design makes of a tone that falls with the square of time.
         """
         n = len(self.designs.frequencies_hz)
-        out, unseen = np.zeros((len(maps.elapsed), n)), self.unseen[rows]
+        out, unseen = np.zeros((len(maps.elapsed), n)), self.unseen[rows] | bool(self.lacking)
         if not np.any(unseen):
             return out
         elapsed = maps.elapsed[unseen]
@@ -171,7 +177,9 @@ class WindowOperator:
         cosine, sine = np.split(fitted, 2, axis=1)
         reference = np.exp(-2j * np.pi * frequencies * centre[:, None])
         still = (cosine - 1j * sine) * reference[..., None]
-        return still @ np.swapaxes(self.measured_from_still[rows], 1, 2)
+        found = still @ np.swapaxes(self.measured_from_still[rows], 1, 2)
+        found[..., self.lacking] = np.nan
+        return np.asarray(found)
 
 
 def _of_windows(still: Array, maps: Maps) -> Array:
@@ -210,15 +218,23 @@ def window_operator(
     still_from_body = body_turn_of(standing_in(imu, silence))
     from_body = measured_from_body(site)
     at_centre = matrices(inverse(still_from_body(windows.centre)))
+    still = still_from_body(waveform.time)
+    lacking = site.platform.magnetometer.lacking
+    if lacking:
+        from_body = np.eye(3)
+        at_centre = np.broadcast_to(from_body, at_centre.shape)
+        still = np.zeros_like(still)
+        still[0] = 1.0
     return WindowOperator(
         designs=designs_of(waveform, site, settings, windows) if designs is None else designs,
         channels=site.channels,
         body_from_measured=np.asarray(np.linalg.inv(from_body)),
-        still_from_body=still_from_body(waveform.time),
+        still_from_body=still,
         measured_from_still=from_body @ at_centre,
         declared_noise=site.platform.magnetometer.noise_density * float(np.sqrt(nyquist_hz)),
         unseen=meets_silence(windows, settings.window, waveform.time, silence),
         apart=np.zeros(len(windows), dtype=bool),
+        lacking=lacking,
     )
 
 

@@ -290,12 +290,14 @@ def simulate_fields(
     turned = world * np.exp(1j * phase)[..., None]
     phasor = turned @ world_from_sensor @ magnetometer.matrix.T
     noise = rng.normal(0.0, sigma, (2, *phasor.shape))
+    phasor[..., magnetometer.lacking] = np.nan
     return FieldSamples(
         time=time,
         window=np.full(len(time), window),
         channels=site.channels,
         phasor_sensor=phasor + noise[0] + 1j * noise[1],
         phasor_cov=np.broadcast_to(sigma**2 * np.eye(3), (*phasor.shape, 3)).copy(),
+        axes=magnetometer.axes,
     )
 
 

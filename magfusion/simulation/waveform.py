@@ -119,7 +119,8 @@ def simulate_waveform(
     measured += rng.normal(0.0, magnetometer.noise_density * np.sqrt(rate_hz / 2.0), (count, 3))
     if quantisation:
         measured = quantisation * np.round(measured / quantisation)
-    return Waveform(time, measured, marks)
+    measured[:, magnetometer.lacking] = 0.0
+    return Waveform(time, measured, marks, magnetometer.axes)
 
 
 def _check_tones(site: Site, rate_hz: float, marks: Marks | None) -> None:

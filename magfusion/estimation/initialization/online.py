@@ -103,7 +103,7 @@ def find_online_start(
     marks : Marks, optional
         When which coil was driven, where the site's slots are marked.
     """
-    time, rows = waveform.rows()
+    wave = Waveform(*waveform.rows(), marks, site.platform.magnetometer.axes)
     if not fields:
         receiver = Receiver.of(site, settings.lockin)
         receiver.check()
@@ -115,7 +115,7 @@ def find_online_start(
         epoch_ns=0,
         source="online",
         imu=imu,
-        waveform=None if fields else Waveform(time[time <= until], rows[time <= until], marks),
+        waveform=None if fields else wave.rows(wave.time <= until),
         fields=FieldSamples.joined(whole) if whole else None,
         steady=_joined_steady(steady, whole) if whole and steady else None,
         inertial=site.platform.inertial,

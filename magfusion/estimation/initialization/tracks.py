@@ -113,8 +113,8 @@ def heard(samples: FieldSamples, calibration: Calibration) -> Heard:
         calibration=calibration,
         time=samples.time,
         measured=stacked(samples.phasor_sensor),
-        sqrt_information=whitening(cov, samples.valid),
-        components=6.0 * np.sum(samples.valid, axis=1),
+        sqrt_information=whitening(cov, samples.there),
+        components=np.sum(samples.numbers, axis=1).astype(np.float64),
         free=np.array([not synchronised[name] for name, _ in samples.channels], dtype=bool),
         blocks=nuisance_blocks(site),
     )

@@ -78,9 +78,9 @@ def still_means(log: Log, site: Site | None, span: float = SPAN) -> StillMeans:
     still_from_body = attitude_from_gyro(imu.time, imu.gyro_body)
     force = still_from_body.apply(imu.accel_body)
     field = np.full_like(force, np.nan)
-    if log.waveform is not None:
+    if log.vectors is not None:
         known = field_body(log, site)
-        body = [np.interp(time, log.waveform.time, c) for c in known.T]
+        body = [np.interp(time, log.vectors.time, c) for c in known.T]
         field = still_from_body.apply(np.stack(body, axis=1))
     number = np.floor((time - time[0]) / span).astype(np.int64)
     count = np.bincount(number)
@@ -132,7 +132,7 @@ def wrong_compasses(
     here = None if poses is None else _at(means, poses)
     tilted = list(_tilted(here, site)) if here is not None else []
     yield from tilted
-    if site.earth_field_world is None or log.waveform is None:
+    if site.earth_field_world is None or log.vectors is None:
         return
     yield from wrong_size(means, site)
     if here is None:

@@ -41,13 +41,13 @@ def drowned(samples: FieldSamples) -> BoolArray:
     heard = detected(samples, DETECTION_CHI_SQUARE_ONLINE)
     power = np.where(heard, np.sum(np.abs(samples.phasor_sensor) ** 2, axis=-1), np.nan)
     usual = np.nanmedian(np.where(heard.any(axis=0), power, 0.0), axis=0)
-    share = np.sum(whitening(samples.phasor_cov, samples.valid) ** 2, axis=(-1, -2)) / 3.0
+    share = np.sum(whitening(samples.phasor_cov, samples.there) ** 2, axis=(-1, -2)) / 3.0
     return np.asarray(samples.valid & ~heard & (usual * share <= DETECTION_CHI_SQUARE_ONLINE))
 
 
 def above_noise(samples: FieldSamples, least: float) -> BoolArray:
     """Tell which phasors have more than so much of chi square against nothing, (n, channels)."""
-    sqrt_information = whitening(samples.phasor_cov, samples.valid)
+    sqrt_information = whitening(samples.phasor_cov, samples.there)
     phasor = np.nan_to_num(samples.phasor_sensor)[..., None]
     square = (
         np.abs(sqrt_information @ phasor.real) ** 2 + np.abs(sqrt_information @ phasor.imag) ** 2
@@ -66,7 +66,8 @@ def detected(samples: FieldSamples, least: float = DETECTION_CHI_SQUARE) -> Bool
     least : float
         Chi square of a phasor's six components against nothing.
     """
-    loud = above_noise(samples, least)
+    # What lies across the axes that a receiver has looks like silence.
+    loud = above_noise(samples, least) | samples.partial
     if len(samples) < 2:
         return loud
     step = float(np.median(np.diff(samples.time)))

@@ -198,9 +198,9 @@ def _demodulated(log: Log, site: Site, settings: LockinSettings | None) -> Field
 
 def _steady(log: Log, site: Site) -> float | None:
     """Return the usual size of the field, relative to the Earth's."""
-    if log.waveform is None or site.earth_field_world is None:
+    if log.vectors is None or site.earth_field_world is None:
         return None
-    size = np.linalg.norm(log.waveform.measured_sensor, axis=1)
+    size = np.linalg.norm(log.vectors.measured_sensor, axis=1)
     return float(np.median(size) / np.linalg.norm(site.earth_field_world))
 
 

@@ -128,8 +128,8 @@ class _How:
             gain_sigma=spread or GAIN_SIGMA,
             risk=self.risk,
         )
-        site, heard = self.calibration.site, np.sum(self.samples.valid, axis=1)
-        final, states, trust = judged_fixes(separated.fixes, separated.states, heard)
+        site, numbers = self.calibration.site, np.sum(self.samples.numbers, axis=1)
+        final, states, trust = judged_fixes(separated.fixes, separated.states, numbers)
         names = tuple(beacon.name for beacon in site.beacons)
         trust |= separation_trust(separated, names, self.risk)
         if spread:

@@ -72,7 +72,7 @@ class Snapshots:
     @property
     def freedom(self) -> float:
         """Residuals less poses."""
-        return float(6 * np.sum(self.samples.valid) - 6 * len(self.samples))
+        return float(np.sum(self.samples.numbers) - 6 * len(self.samples))
 
     @cached_property
     def fixes(self) -> Fixes:
@@ -110,7 +110,7 @@ class Snapshots:
     @cached_property
     def _weights(self) -> Array:
         cov = measurement_cov(self.site, self.samples, survey_error=True)
-        return whitening(cov, self.samples.valid)
+        return whitening(cov, self.samples.there)
 
     def fitted(
         self, free: Sequence[tuple[Parameter, str, float]], fixes: Fixes

@@ -89,7 +89,7 @@ class _How:
 
     def fits(self, fixes: Fixes) -> BoolArray:
         """Tell whether the residuals are not too large for what is declared."""
-        rows = 6 * np.sum(self.samples.valid, axis=1) + 3 * (self.gravity is not None)
+        rows = np.sum(self.samples.numbers, axis=1) + 3 * (self.gravity is not None)
         return np.asarray(fixes.cost[:, 0] < chdtri(rows, MISFIT))
 
 

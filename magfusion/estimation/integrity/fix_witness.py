@@ -18,7 +18,7 @@ UNKNOWNS = 6
 
 
 def judged_fixes(
-    fixes: Fixes, states: StateTrust, heard: IntArray
+    fixes: Fixes, states: StateTrust, numbers: IntArray
 ) -> tuple[Fixes, StateTrust, Trust]:
     """Return fixes with covariances that cover rivals and residuals, and what is to be said.
 
@@ -28,12 +28,12 @@ def judged_fixes(
 
     Parameters
     ----------
-    heard : ndarray, shape (n,)
-        Channels of each epoch.
+    numbers : ndarray, shape (n,)
+        Real numbers that each epoch measured.
     """
     rival = _rival(fixes)
     open_pose = ~fixes.determined[:, 0]
-    chi_square, freedom = _chi_square(fixes, heard)
+    chi_square, freedom = _chi_square(fixes, numbers)
     excess = np.where(freedom > 0.0, chi_square / np.maximum(freedom, 1.0), 0.0)
     unlikely = log_p_chi_square(chi_square, np.maximum(freedom, 1.0)) < np.log(
         FALSE_ALARMS / len(fixes)
@@ -66,11 +66,11 @@ def _rival(fixes: Fixes) -> BoolArray:
     return np.asarray(share[:, 1] > RIVAL) if share.shape[1] > 1 else np.zeros(len(fixes), bool)
 
 
-def _chi_square(fixes: Fixes, heard: IntArray) -> tuple[Array, Array]:
+def _chi_square(fixes: Fixes, numbers: IntArray) -> tuple[Array, Array]:
     """Return the chi square of each epoch's best pose and its degrees of freedom."""
     found = np.sum(fixes.phase[:, 0] != 0.0, axis=1) + np.sum(fixes.log_gain[:, 0] != 0.0, axis=1)
     known = 2.0 * (fixes.gravity_cost[:, 0] > 0.0)
-    return fixes.cost[:, 0], np.maximum(6.0 * heard + known - UNKNOWNS - found, 0.0)
+    return fixes.cost[:, 0], np.maximum(numbers + known - UNKNOWNS - found, 0.0)
 
 
 def rival_spread(fixes: Fixes, rival: BoolArray) -> Array:

@@ -179,7 +179,7 @@ def surveyed(samples: FieldSamples, calibration: Calibration) -> Surveyed:
     blocks = choose_blocks(site, OF_SURVEY)
     blocks = placed(block for block in blocks if block.parameter not in MOUNTED)
     _, by_pose, by_blocks = linearize_channels(calibration, blocks, samples.time, at, place)
-    weights = whitening(measurement_cov(site, samples, survey_error=False), samples.valid)
+    weights = whitening(measurement_cov(site, samples, survey_error=False), samples.there)
     by_sigma = by_blocks @ prior_sqrt_covariance(site, blocks)
     found = np.linalg.pinv(whitened(weights, by_pose)) @ whitened(weights, by_sigma)
     return Surveyed(fixes, np.where(np.isfinite(found), found, 0.0))

@@ -86,7 +86,7 @@ def recorded(
     found += turned_otherwise(log, site) if log.inertial else []
     if log.inertial and not any(finding.code in UNSTEADY for finding in found):
         found += wrong_compasses(log, site, poses, estimated)
-        if site is not None and log.waveform is not None:
+        if site is not None and log.vectors is not None:
             found += iron_on_body(still_means(log, site, IRON_SPAN), site)
     if beacons and site is not None and site.beacons:
         found += [f for f in undeclared_lines(log, site, lockin) if _matters(f)]
@@ -116,7 +116,7 @@ def beginning(log: Log, span: float = LONGEST) -> Log:
     wave = log.waveform
     if wave is not None and len(wave) and wave.time[-1] > end:
         kept = slice(0, int(np.searchsorted(wave.time, end)))
-        short = replace(wave, time=wave.time[kept], measured_sensor=wave.measured_sensor[kept])
+        short = wave.rows(kept)
         log = replace(log, waveform=short)
     return log
 

@@ -36,14 +36,16 @@ AXES = "xyz"
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Three axes of one instrument.
+    """The axes of one instrument.
 
     Parameters
     ----------
     time : ndarray, shape (n,)
         (s)
-    value : ndarray, shape (n, 3)
+    value : ndarray, shape (n, axes)
         In the unit times the scale.
+    axes : str
+        That it has.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Stream:
     value: Array
     unit: str
     scale: float = 1.0
+    axes: str = AXES
 
 
 def streams(log: Log) -> tuple[Stream, ...]:
@@ -61,7 +64,9 @@ def streams(log: Log) -> tuple[Stream, ...]:
         found.append(Stream("accelerometer", log.imu.time, log.imu.accel_body, "m/s^2"))
     if log.waveform is not None:
         wave = log.waveform
-        found.append(Stream("magnetometer", wave.time, wave.measured_sensor, "uT", 1e6))
+        own = [AXES.index(axis) for axis in wave.axes]
+        value = wave.measured_sensor[:, own] if len(own) < len(AXES) else wave.measured_sensor
+        found.append(Stream("magnetometer", wave.time, value, "uT", 1e6, wave.axes))
     return tuple(one for one in found if len(one.time) > 2)
 
 
@@ -109,11 +114,11 @@ def frozen_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
         if len(whole):
             yield _freeze(stream, "all axes", whole)
             continue
-        for axis in range(3):
+        for axis in range(len(stream.axes)):
             value = stream.value[:, axis]
             alone = frozen(stream, value[1:] == value[:-1])
             if len(alone) and not _at_limit(stream, axis, alone):
-                yield _freeze(stream, f"axis {AXES[axis]}", alone)
+                yield _freeze(stream, f"axis {stream.axes[axis]}", alone)
 
 
 def _all_frozen(stream: Stream) -> Runs:
@@ -136,7 +141,7 @@ def _freeze(stream: Stream, where: str, found: Runs) -> Finding:
     share = float(np.sum(length)) / span
     longest = int(np.argmax(length))
     at = stream.value[found.first[longest]] * stream.scale
-    value = f" at {at[AXES.index(where[-1])]:.4g} {stream.unit}" if where[-2] == " " else ""
+    value = f" at {at[stream.axes.index(where[-1])]:.4g} {stream.unit}" if where[-2] == " " else ""
     more = f" and {len(found) - 1} times more" if len(found) > 1 else ""
     dead = share > DEAD
     verdict = Verdict.FAILED if dead else Verdict.DOUBTFUL
@@ -198,7 +203,7 @@ def clipped_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
         if np.sum(kept) < LEAST_PILE:
             continue
         largest = float(np.max(np.abs(stream.value[kept])))
-        for axis in range(3):
+        for axis in range(len(stream.axes)):
             for sign in (-1.0, 1.0):
                 count, limit = clipped(sign * stream.value[kept, axis], largest)
                 if count == 0:
@@ -207,10 +212,10 @@ def clipped_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
                 first_at = stream.time[np.argmax(stream.value[:, axis] == sign * limit)]
                 yield Finding(
                     "saturated",
-                    f"{stream.name}: axis {AXES[axis]} stops at {sign * limit * stream.scale:+.4g}"
-                    f" {stream.unit} in {count} samples ({100.0 * share:.2g} %), first at"
-                    f" {first_at:.2f} s: its range ends there. Choose a larger range, or keep away"
-                    " from what drives it there.",
+                    f"{stream.name}: axis {stream.axes[axis]} stops at"
+                    f" {sign * limit * stream.scale:+.4g} {stream.unit} in {count} samples"
+                    f" ({100.0 * share:.2g} %), first at {first_at:.2f} s: its range ends there."
+                    " Choose a larger range, or keep away from what drives it there.",
                     weight=500.0 + 100.0 * share,
                 )
 

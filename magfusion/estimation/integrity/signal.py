@@ -40,6 +40,8 @@ class Heard:
         Of all its tones (T), noise and all.
     loud : bool ndarray, shape (n, beacons)
         Whether it is told from noise.
+    across : bool
+        Whether components are missing: a field across the axes that are there looks like silence.
     """
 
     time: Array
@@ -47,6 +49,7 @@ class Heard:
     snr: Array
     amplitude: Array
     loud: BoolArray
+    across: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +76,7 @@ def heard(samples: FieldSamples, site: Site) -> Heard:
     only be another's turn.
     """
     names = tuple(dict.fromkeys(name for name, _ in samples.channels))
-    sqrt_information = whitening(samples.phasor_cov, samples.valid)
+    sqrt_information = whitening(samples.phasor_cov, samples.there)
     phasor = np.nan_to_num(samples.phasor_sensor)[..., None]
     square = np.sum(np.abs(sqrt_information @ phasor) ** 2, axis=(-1, -2))
     square = np.where(samples.valid, square, -np.inf)
@@ -95,7 +98,9 @@ def heard(samples: FieldSamples, site: Site) -> Heard:
     if not has_schedule(site):
         best, there = np.maximum(best, 0.0), np.ones_like(there)
     snr = np.where(there, np.sqrt(np.maximum(best, 0.0) / 6.0), np.nan)
-    return Heard(samples.time, names, snr, amplitude, there & (best > DETECTION_CHI_SQUARE))
+    loud = there & (best > DETECTION_CHI_SQUARE)
+    across = bool(np.any(samples.partial))
+    return Heard(samples.time, names, snr, amplitude, loud, across)
 
 
 def heard_in(log: Log, site: Site, lockin: LockinSettings | None = None) -> Heard | None:
@@ -152,7 +157,7 @@ def unheard(found: Heard, site: Site) -> Iterator[Finding]:
         return
     told = np.isfinite(found.snr).any(axis=1)
     alone = float(np.mean(~found.loud[told].any(axis=1)))
-    if alone > UNHEARD:
+    if alone > UNHEARD and not found.across:
         yield Finding(
             "low_signal",
             f"no beacon is told from noise in {100.0 * alone:.0f} % of the epochs: all are far away"
@@ -170,7 +175,7 @@ def unheard(found: Heard, site: Site) -> Iterator[Finding]:
                 " frequency is another. Switch it on, or take it out of the site's file.",
                 weight=400.0,
             )
-        else:
+        elif not found.across:
             yield from _silences(found, k, tones)
 
 

@@ -13,7 +13,7 @@ from scipy.ndimage import median_filter
 
 from magfusion.errors import InputError
 from magfusion.estimation.integrity.turning import field_body
-from magfusion.model.samples import ImuSamples, Log, Waveform
+from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.strapdown import attitude_at, attitude_from_gyro
 from magfusion.model.trust import Finding, Verdict
@@ -91,14 +91,15 @@ class Line:
 def still_field(log: Log, site: Site | None) -> Array:
     """Return the field of a waveform in axes that stand still, shape (n, 3) (T).
 
-    Without a site nobody knows how magnetometer and gyroscope are mounted: the axes are the body's.
+    Without a site nobody knows how magnetometer and gyroscope are mounted, and of fewer than three
+    axes nothing can be turned: the axes are the body's.
     """
     field = field_body(log, site)
-    if log.waveform is None or site is None or len(log.imu) < 2:
+    if log.vectors is None or site is None or len(log.imu) < 2:
         return field
     imu, offset = log.imu, site.platform.imu.time_offset
     turns = attitude_from_gyro(imu.time, imu.gyro_body)
-    at = attitude_at(turns, imu.time, imu.gyro_body, log.waveform.time - offset)
+    at = attitude_at(turns, imu.time, imu.gyro_body, log.vectors.time - offset)
     return np.asarray(at.apply(field))
 
 
@@ -224,7 +225,7 @@ def beside_lines(log: Log, site: Site, lockin: LockinSettings | None) -> LockinS
     end = float(wave.time[0]) + BEGINNING
     few, first = wave.time < end, log.imu.time < end
     imu = ImuSamples(log.imu.time[first], log.imu.gyro_body[first], log.imu.accel_body[first])
-    wave = Waveform(wave.time[few], wave.measured_sensor[few])
+    wave = wave.rows(few)
     found = spectrum(replace(log, waveform=wave, imu=imu), site)
     try:
         settings = usual_lockin(site) if lockin is None else lockin

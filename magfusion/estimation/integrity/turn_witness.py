@@ -35,9 +35,9 @@ def turned_otherwise(log: Log, site: Site | None) -> Iterator[Finding]:
 
     Without a site nothing is known of the mounting, so that only sign, scale and clock are judged.
     """
-    if log.waveform is None or len(log.imu) < 2:
+    if log.vectors is None or len(log.imu) < 2:
         return
-    time, field = log.waveform.time, field_body(log, site)
+    time, field = log.vectors.time, field_body(log, site)
     offset = 0.0 if site is None else site.platform.imu.time_offset
     found = turning(log.imu, time, field, offset)
     if len(found.change) < 12:

@@ -170,10 +170,10 @@ def field_body(log: Log, site: Site | None) -> Array:
 
 def agrees(log: Log, site: Site) -> bool:
     """Tell whether there is a turn, and the gyroscope explains it as declared."""
-    if log.waveform is None or len(log.imu) < 2:
+    if log.vectors is None or len(log.imu) < 2:
         return False
     offset = site.platform.imu.time_offset
-    found = turning(log.imu, log.waveform.time, field_body(log, site), offset)
+    found = turning(log.imu, log.vectors.time, field_body(log, site), offset)
     if len(found.change) < 12 or not found.speed > LEAST_TURN:
         return False
     return found.explained(np.eye(3)) > CONTRADICTED

@@ -119,7 +119,7 @@ def earth_measurement(
     Parameters
     ----------
     steady : SteadyFields
-        A row that is NaN is missing.
+        What is NaN is missing.
     epoch : int ndarray, shape (n,)
         States that they belong to.
     rate_body : ndarray, shape (n, 3)
@@ -130,8 +130,8 @@ def earth_measurement(
         Between epochs (s).
     """
     repeats = max(1.0, AMBIENT_TIME / step)
-    valid = np.all(np.isfinite(steady.measured_sensor), axis=1)
-    sqrt_information = whitening(repeats * earth_cov(site, steady), valid)
+    there = np.isfinite(steady.measured_sensor)
+    sqrt_information = whitening(repeats * earth_cov(site, steady), there)
     measured = np.nan_to_num(steady.measured_sensor)
     return EarthField(
         epoch, steady.time, measured, sqrt_information, rate_body, repeats, applied_offset
@@ -165,6 +165,8 @@ def earth_cov(site: Site, steady: SteadyFields) -> Array:
     size = float(np.linalg.norm(site.earth_field_world))
     field = (steady.measured_sensor - sensor.offset) @ np.linalg.inv(sensor.matrix).T
     deviation = (np.linalg.norm(field, axis=1) - size) ** 2
+    if len(sensor.axes) < 3:  # of a component the size tells nothing
+        deviation = np.zeros(len(steady))
     ambient = (AMBIENT_SHARE * size) ** 2 + _moving_mean(steady.time, deviation)
     return steady.cov + ambient[:, None, None] * np.eye(3)
 

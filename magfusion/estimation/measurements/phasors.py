@@ -286,7 +286,7 @@ def field_phasors(
         epoch=epoch,
         time=samples.time,
         measured=stacked(phasor),
-        sqrt_information=paired_whitening(cov, samples.valid),
+        sqrt_information=paired_whitening(cov, samples.there),
         rate_body=rate_body,
         by_time_offset=stacked(by),
         applied_offset=applied_offset,

@@ -93,6 +93,6 @@ def survey_response(declared: Calibration, samples: FieldSamples, states: Trajec
         samples.time,
         states.world_from_body,
         states.position_world,
-        whitening(cov, samples.valid),
+        whitening(cov, samples.there),
     )
     return (np.linalg.pinv(by_found) @ by_survey)[:, :6]

@@ -12,8 +12,10 @@ import numpy as np
 from magfusion.estimation.snapshot.coil_starts import (
     CoilEpochs,
     Grid,
+    at_point,
     grid_about,
     middle_of,
+    mirror,
     softened,
 )
 from magfusion.estimation.solve.batched import (
@@ -26,7 +28,7 @@ from magfusion.estimation.solve.batched import (
 from magfusion.model.coil_field import as_points
 from magfusion.model.noise import calibration_error, model_error
 from magfusion.model.parameters import Calibration, linearize_channels, predict_channels
-from magfusion.model.site import Magnetometer, MagnetometerSigma, Site
+from magfusion.model.site import Magnetometer, Site
 from magfusion.units import Array, BoolArray, IntArray
 
 ALIKE = 1e-3  # of the distance; hypotheses nearer to one another are one
@@ -106,7 +108,7 @@ def fix_coil(epochs: CoilEpochs, calibration: Calibration, gain: Gain) -> CoilFi
     EstimationError
         Where the declared region holds no place that could be asked.
     """
-    known = _at_point(calibration)
+    known = at_point(calibration)
     places = grid_about(known.site)
     grid = Grid.of(known, float(epochs.time[0]), places, signed=epochs.signed)
     parts = [
@@ -194,21 +196,8 @@ def _solved(problem: "_Problem", start: Array) -> _Refined:
 
 def _mirrored(state: Array, site: Site) -> Array:
     """Return states on the other side of the plane to which the beacons are nearest."""
-    middle, _ = middle_of(site.beacons)
-    centres = np.array([beacon.position_world for beacon in site.beacons])
-    normal = np.linalg.svd(centres - middle)[2][-1]
-    turn = 2.0 * np.outer(normal, normal) - np.eye(3)
+    middle, turn = mirror(site)
     return np.concatenate([middle - (state[..., :3] - middle) @ turn, state[..., 3:] @ turn], -1)
-
-
-def _at_point(calibration: Calibration) -> Calibration:
-    """Return a calibration whose magnetometer is a point with the axes of the world."""
-    platform, zero = calibration.site.platform, np.zeros(3)
-    sigma = MagnetometerSigma(np.zeros((3, 3)), zero, zero, zero)
-    response = platform.magnetometer.response
-    plain = Magnetometer(zero, np.eye(3), 1.0, np.eye(3), zero, sigma, response=response)
-    site = replace(calibration.site, platform=replace(platform, magnetometer=plain))
-    return replace(calibration, site=site)
 
 
 def _of_points(calibration: Calibration) -> Calibration:

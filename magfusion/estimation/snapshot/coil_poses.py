@@ -3,11 +3,11 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.fix_witness import rival_spread
 from magfusion.estimation.integrity.priors import unexplained
 from magfusion.estimation.integrity.statistics import FALSE_ALARMS, log_p_chi_square
+from magfusion.estimation.snapshot.axis_starts import least_turn
 from magfusion.estimation.snapshot.coil_fix import CoilFixes
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.field import skew
@@ -53,7 +53,7 @@ def poses_of(found: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixe
     lever_body, sigma = coil_lever(sensor), sensor.sigma
     gain = np.linalg.norm(found.axis_world, axis=-1)
     towards = found.axis_world / gain[..., None]
-    rotation = _least_turn(axis_of(sensor), towards)
+    rotation = least_turn(axis_of(sensor), towards)
     back = np.swapaxes(rotation, -1, -2)
     lever = rotation @ lever_body
     # By the turn (world axes) and the place of the coil: the body moves about the coil.
@@ -94,20 +94,6 @@ def _outer(vector: Array) -> Array:
     return np.asarray(vector[..., :, None] * vector[..., None, :])
 
 
-def _least_turn(from_vector: Array, to_vector: Array) -> Array:
-    """Return the smallest rotations that take directions to others, shape (..., 3, 3)."""
-    start = np.broadcast_to(from_vector, to_vector.shape)
-    across = np.cross(start, to_vector)
-    sine = np.linalg.norm(across, axis=-1, keepdims=True)
-    angle = np.arctan2(sine, np.sum(start * to_vector, axis=-1, keepdims=True))
-    smallest = np.eye(3)[np.argmin(np.abs(start), axis=-1)]
-    other = np.cross(start, smallest)  # any axis across, for the opposite direction
-    other = other / np.linalg.norm(other, axis=-1, keepdims=True)
-    about = np.where(sine > 1e-12, across / np.maximum(sine, 1e-300), other)
-    turn = Rotation.from_rotvec((about * angle).reshape(-1, 3))
-    return np.asarray(turn.as_matrix().reshape(*to_vector.shape, 3))
-
-
 def axis_sigma(found: CoilFixes) -> Array:
     """Return the standard deviation of the axis across itself, shape (n, hypotheses) (rad)."""
     gain = np.linalg.norm(found.axis_world, axis=-1)
@@ -130,7 +116,7 @@ def nearest_truth(truth: Trajectory, poses: Trajectory, site: Site, *, signed: b
     found, actual = chosen @ axis, true.world_from_body @ axis
     if not signed:
         actual = actual * np.where(np.sum(found * actual, axis=1) < 0.0, -1.0, 1.0)[:, None]
-    turned = _least_turn(found, actual) @ chosen
+    turned = least_turn(found, actual) @ chosen
     return Trajectory(true.time, turned, coil - turned @ lever)
 
 

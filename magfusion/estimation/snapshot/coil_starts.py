@@ -5,14 +5,14 @@ linear in u where the place is given, and its square linear in ``u u^T`` where i
 known.  So a grid of places about the beacons is asked in closed form.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from magfusion.errors import EstimationError
 from magfusion.model.parameters import Calibration, predict_channels
 from magfusion.model.samples import FieldSamples
-from magfusion.model.site import Beacon, Site
+from magfusion.model.site import Beacon, Magnetometer, MagnetometerSigma, Site
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 DIRECTIONS, RADII = 400, 28  # of the grid about the beacons
@@ -38,12 +38,15 @@ class CoilEpochs:
         Of either part (T).
     signed : bool
         Whether the phase tells the sign.
+    parts : ndarray, shape (channels,), optional
+        How many numbers each tells: two where its field turns and phases are known, else one.
     """
 
     time: Array
     measured: ComplexArray
     sigma: Array
     signed: bool
+    parts: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -56,16 +59,31 @@ class CoilEpochs:
         signed = fields.signed and all(beacon.synchronised for beacon in site.beacons)
         if not signed:
             measured = np.where(np.isfinite(measured), np.abs(measured), np.nan)
-        return CoilEpochs(fields.time, measured.astype(np.complex128), sigma, signed)
+        parts = np.concatenate([_turning(beacon) for beacon in site.beacons]) if signed else None
+        return CoilEpochs(fields.time, measured.astype(np.complex128), sigma, signed, parts)
 
     def rows(self, kept: BoolArray | slice) -> "CoilEpochs":
         """Return some epochs."""
-        return CoilEpochs(self.time[kept], self.measured[kept], self.sigma[kept], self.signed)
+        own = self.time[kept], self.measured[kept], self.sigma[kept]
+        return CoilEpochs(*own, self.signed, self.parts)
 
     @property
     def heard(self) -> IntArray:
         """How many channels each row holds, shape (n,)."""
         return np.asarray(np.sum(np.isfinite(self.measured), axis=1))
+
+    @property
+    def told(self) -> IntArray:
+        """How many numbers each row tells, shape (n,)."""
+        parts = 1 if self.parts is None else self.parts
+        return np.asarray(np.sum(np.isfinite(self.measured) * parts, axis=1))
+
+
+def _turning(beacon: Beacon) -> IntArray:
+    """Return two for each tone whose field turns, and one for each that keeps its line."""
+    drive = beacon.moments_beacon.T @ beacon.excitation  # (3, tones)
+    square = np.abs(np.sum(drive**2, axis=0))
+    return np.where(square < (1.0 - 1e-9) * np.sum(np.abs(drive) ** 2, axis=0), 2, 1)
 
 
 def middle_of(beacons: tuple[Beacon, ...]) -> tuple[Array, float]:
@@ -75,6 +93,27 @@ def middle_of(beacons: tuple[Beacon, ...]) -> tuple[Array, float]:
     )
     middle = np.mean(centres, axis=0)
     return middle, 2.0 * float(np.sqrt(np.mean(np.sum((centres - middle) ** 2, axis=1))))
+
+
+def mirror(site: Site) -> tuple[Array, Array]:
+    """Return a point of the plane that beacons are nearest to, and half a turn about its normal.
+
+    Coils along the normal, or in the plane, look alike from both of its sides.
+    """
+    middle, _ = middle_of(site.beacons)
+    centres = np.array([beacon.position_world for beacon in site.beacons])
+    normal = np.linalg.svd(centres - middle)[2][-1]
+    return middle, 2.0 * np.outer(normal, normal) - np.eye(3)
+
+
+def at_point(calibration: Calibration) -> Calibration:
+    """Return a calibration whose magnetometer is a point with the axes of the world."""
+    platform, zero = calibration.site.platform, np.zeros(3)
+    sigma = MagnetometerSigma(np.zeros((3, 3)), zero, zero, zero)
+    response = platform.magnetometer.response
+    plain = Magnetometer(zero, np.eye(3), 1.0, np.eye(3), zero, sigma, response=response)
+    site = replace(calibration.site, platform=replace(platform, magnetometer=plain))
+    return replace(calibration, site=site)
 
 
 def grid_about(site: Site) -> Array:
@@ -162,7 +201,7 @@ class Grid:
                 cost = 1.0 - np.sum(along**2, axis=1) / np.maximum(total, _TINY)
                 best = np.argsort(cost, kind="stable")[:LIKELY]
                 found = np.swapaxes(right[best], 1, 2) @ (inverse[best] * along[best, :, None])
-                axes = found[..., 0] if epochs.signed else _roots(found[..., 0])
+                axes = found[..., 0] if epochs.signed else roots(found[..., 0])
                 misfit, axes = self._misfit(best, axes, epochs, row, soft[row])
                 again = np.argsort(misfit, kind="stable")[:count]
                 place[row], axis[row] = self.places_world[best[again]], axes[again]
@@ -192,7 +231,7 @@ def softened(epochs: CoilEpochs) -> Array:
     return np.asarray(np.sqrt(sigma**2 + (SOFT * size) ** 2 + (FLOOR * largest) ** 2))
 
 
-def _roots(pairs: Array) -> Array:
+def roots(pairs: Array) -> Array:
     """Return the vectors whose products come nearest to some symmetric matrices."""
     matrix = np.empty((len(pairs), 3, 3))
     matrix[:, *_PAIRS] = pairs

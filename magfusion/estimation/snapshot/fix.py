@@ -77,6 +77,16 @@ class Fixes:
         relative = np.exp(-0.5 * (self.cost - self.cost[:, :1]))
         return relative / np.sum(relative, axis=1, keepdims=True)
 
+    def padded(self, count: int) -> "Fixes":
+        """Return so many hypotheses of each epoch: the best again, of infinite cost, at the end."""
+        own = self.cost.shape[1]
+        if own >= count:
+            return self
+        chosen = np.concatenate([np.arange(own), np.zeros(count - own, dtype=np.int64)])
+        parts = {n: v if v.ndim == 1 else v[:, chosen] for n, v in vars(self).items()}
+        parts["cost"][:, own:] = np.inf
+        return Fixes(**parts)
+
     def rows(self, chosen: IntArray | BoolArray | slice) -> "Fixes":
         """Return the fixes of some epochs."""
         return Fixes(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))

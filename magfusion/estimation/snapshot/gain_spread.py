@@ -90,7 +90,7 @@ class _Asked:
         self.survey_error, self.free = survey_error, free
         site = calibration.site
         cov = measurement_cov(site, samples, survey_error=survey_error)
-        white = whitening(cov, samples.valid) @ np.nan_to_num(samples.phasor_sensor)[..., None]
+        white = whitening(cov, samples.there) @ np.nan_to_num(samples.phasor_sensor)[..., None]
         by_channel = np.sum(np.abs(white) ** 2, axis=(-1, -2))
         first = np.cumsum([0, *(len(beacon.tones) for beacon in site.beacons)])[:-1]
         self.known = np.add.reduceat(by_channel, first, axis=1)

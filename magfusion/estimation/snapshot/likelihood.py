@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.snapshot.axis_starts import mirrored, starts_on_grid, with_least_roll
 from magfusion.estimation.snapshot.candidates import attitudes, positions
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.place import outside
@@ -22,6 +23,7 @@ from magfusion.units import Array, BoolArray, IntArray
 
 CANDIDATES = 10  # positions that get an attitude
 REFINED = 6  # of these, how many are refined
+REFINED_OF_AXES = 8  # where components are missing; and as many mirrors of them
 HYPOTHESES = 4  # of these, how many are returned
 SOFT = 0.03  # relative error of a phasor, in the first refinement beside coils of true size
 SAME_POSITION = 0.02  # m; two solutions closer than this and SAME_ROTATION are one
@@ -72,8 +74,27 @@ def fix_epochs(
 
 
 def _solve(epochs: Epochs) -> Fixes:
+    lacking = _lacking(epochs.samples)
+    if not np.any(lacking):
+        return _solved(epochs)
+    parts = [(rows, _solved(epochs.rows(rows))) for rows in (lacking, ~lacking) if np.any(rows)]
+    order = np.argsort(np.concatenate([np.flatnonzero(rows) for rows, _ in parts]))
+    most = max(part.cost.shape[1] for _, part in parts)
+    return joined([part.padded(most) for _, part in parts]).rows(order)
+
+
+def _lacking(samples: FieldSamples) -> BoolArray:
+    """Tell which epochs hold more channels without some component than whole ones."""
+    partial = np.sum(samples.partial, axis=1)
+    return np.asarray(partial > np.sum(samples.valid, axis=1) - partial)
+
+
+def _solved(epochs: Epochs) -> Fixes:
     problem = epochs.problem
-    start, count = _starts(problem)
+    if _lacking(epochs.samples)[0]:
+        start, count = _starts_of_axes(epochs)
+    else:
+        start, count = _starts(problem)
     epoch = np.repeat(np.arange(len(problem.time)), count)
     if any(is_sized(beacon) for beacon in problem.calibration.site.beacons):
         # Candidates are those of dipoles: at full weight some end short of the minimum.
@@ -83,6 +104,9 @@ def _solve(epochs: Epochs) -> Fixes:
     again = epochs.reweighed(solved.state.rotation[best], solved.state.position[best])
     if again is not None:
         problem, solved = again, solved_from(again.rows(epoch), solved.state)
+    if np.any(epochs.samples.partial):
+        rolled = with_least_roll(problem.rows(epoch), solved.state)
+        solved = solved_from(problem.rows(epoch), rolled)
     order, ranked = _ranked(
         solved.state.rotation.reshape(-1, count, 3, 3),
         solved.state.position.reshape(-1, count, 3),
@@ -91,6 +115,22 @@ def _solve(epochs: Epochs) -> Fixes:
     kept = (order + count * np.arange(len(order))[:, None]).ravel()
     found = Solved(solved.state.rows(kept), solved.cost[kept], solved.information[kept])
     return replace(as_fixes(problem.rows(epoch[kept]), found, order.shape[1]), cost=ranked)
+
+
+def _starts_of_axes(epochs: Epochs) -> tuple[State, int]:
+    """Return the most likely states of epochs that lack components, so many rows an epoch."""
+    start, count = starts_on_grid(epochs.problem)
+    n = len(epochs.samples)
+    epoch = np.repeat(np.arange(n), count)
+    soft = _softened(epochs.problem)
+    rough = solved_from(soft.rows(epoch), start)
+    order = np.argsort(rough.cost.reshape(n, count), axis=1, kind="stable")[:, :REFINED_OF_AXES]
+    kept = (order + count * np.arange(n)[:, None]).ravel()
+    ahead = rough.state.rows(kept)
+    behind = mirrored(epochs.problem, ahead)
+    again = solved_from(soft.rows(np.repeat(np.arange(n), order.shape[1])), behind).state
+    both = (np.stack(pair, axis=1) for pair in zip(ahead, again, strict=True))
+    return State(*(part.reshape(-1, *part.shape[2:]) for part in both)), 2 * order.shape[1]
 
 
 def _softened(problem: Problem) -> Problem:

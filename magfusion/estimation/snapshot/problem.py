@@ -126,13 +126,19 @@ class Epochs:
     samples: FieldSamples
     survey_error: bool
 
+    def rows(self, chosen: Chosen) -> "Epochs":
+        """Return some of the epochs."""
+        return Epochs(self.problem.rows(chosen), self.samples.rows(chosen), self.survey_error)
+
     def reweighed(self, rotation: Array, position: Array) -> Problem | None:
         """Return the problem as weighed at poses (n, ...); None where these make no difference.
 
-        A field map is not equally well known everywhere.
+        A field map is not equally well known everywhere, and how large the field is of which only
+        some components were measured is known by the place.
         """
         site = self.problem.calibration.site
-        if all(beacon.field_map is None for beacon in site.beacons):
+        mapped = any(beacon.field_map is not None for beacon in site.beacons)
+        if not mapped and not np.any(self.samples.partial):
             return None
         sensor_world = position + rotation @ site.platform.magnetometer.position_body
         sqrt_information, noise = _weights(site, self.samples, self.survey_error, sensor_world)
@@ -208,11 +214,11 @@ def _weights(
     site: Site, samples: FieldSamples, survey_error: bool, sensor_world: Array | None
 ) -> tuple[Array, Array | None]:
     """Return the whitening, and the covariance of the whitened noise where the two differ."""
-    valid = samples.valid
+    there = samples.there
     known = measurement_cov(site, samples, sensor_world=sensor_world)
     if not survey_error:
-        return whitening(known, valid), None
+        return whitening(known, there), None
     cov = measurement_cov(site, samples, survey_error=True, sensor_world=sensor_world)
-    sqrt_information = whitening(cov, valid)
-    noise = np.where(valid[..., None, None], known, 0.0)
+    sqrt_information = whitening(cov, there)
+    noise = np.where(samples.valid[..., None, None], known, 0.0)
     return sqrt_information, sqrt_information @ noise @ np.swapaxes(sqrt_information, -1, -2)

@@ -1,0 +1,259 @@
+"""Where the fix of a receiver may start that lacks components: one or two axes, or a gap of three.
+
+No Gram matrix of three components tells a range then.  What each axis ``s`` measures of a beacon is
+``s . B_j(p)``, so a grid of places about the beacons is asked in closed form, as for a coil alone
+(`magfusion.estimation.snapshot.coil_starts`); the axes that fit best there must then be as long,
+and lie to one another, as those of the receiver do.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.snapshot.candidates import wahba
+from magfusion.estimation.snapshot.coil_starts import (
+    FLAT,
+    FLOOR,
+    LIKELY,
+    SOFT,
+    Grid,
+    at_point,
+    grid_about,
+    mirror,
+    roots,
+)
+from magfusion.estimation.snapshot.problem import Problem, State
+from magfusion.model.parameters import predict_channels
+from magfusion.units import Array, BoolArray, ComplexArray, IntArray
+
+KEPT = 24  # places of the grid that are refined roughly
+SHAPE = 0.2  # error of the axes that are found there, of their length
+LEAST_TURN = 1e-6  # weight of the world's axes: of all turns that are left open the smallest
+_TINY = 1e-300
+
+
+def starts_on_grid(problem: Problem) -> tuple[State, int]:
+    """Return the likeliest states of epochs that lack components, so many rows an epoch.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its whitening is zero where a component is missing.
+
+    Raises
+    ------
+    EstimationError
+        Where no grid can be laid about the beacons.
+    """
+    asked = _Asked.of(problem)
+    found = [asked.starts(row) for row in range(len(problem.time))]
+    rotation, place = (np.stack(part) for part in zip(*found, strict=True))
+    position = place - rotation @ problem.calibration.site.platform.magnetometer.position_body
+    if problem.prior is not None:
+        rotation = np.concatenate([problem.prior.rotation[:, None], rotation], axis=1)
+        position = np.concatenate([problem.prior.position[:, None], position], axis=1)
+    n, count = rotation.shape[:2]
+    state = problem.start(rotation.reshape(-1, 3, 3), position.reshape(-1, 3))
+    if np.any(asked.free):
+        own = problem.rows(np.repeat(np.arange(n), count))
+        state = state._replace(phase=_phases(own, state, asked.free))
+    return state, count
+
+
+def mirrored(problem: Problem, state: State) -> State:
+    """Return states on the other side of the plane that the beacons are nearest to."""
+    middle, turn = mirror(problem.calibration.site)
+    lever = problem.calibration.site.platform.magnetometer.position_body
+    place, rotation = state.position + state.rotation @ lever, turn @ state.rotation
+    position = middle - (place - middle) @ turn - rotation @ lever
+    return state._replace(rotation=rotation, position=position)
+
+
+def with_least_roll(problem: Problem, state: State) -> State:
+    """Return states with the smallest turn where nothing tells the roll about the one axis heard.
+
+    Equal epochs have equal poses then, wherever they began.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the same rows.
+    """
+    informed = problem.prior is not None and problem.prior.sqrt_information is not None
+    heard = np.any(np.einsum("...ii->...i", problem.sqrt_information) > 0.0, axis=1)
+    rows = np.sum(heard, axis=1) == 1
+    if problem.gravity is not None:
+        rows &= ~np.isfinite(problem.gravity.sigma)
+    if informed or not np.any(rows):
+        return state
+    sensor = problem.calibration.site.platform.magnetometer
+    axes = (sensor.matrix @ sensor.body_from_sensor.T)[np.argmax(heard[rows], axis=1)]
+    axes = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    rotation, position = state.rotation.copy(), state.position.copy()
+    rotation[rows] = least_turn(axes, (state.rotation[rows] @ axes[..., None])[..., 0])
+    position[rows] += (state.rotation[rows] - rotation[rows]) @ sensor.position_body
+    return state._replace(rotation=rotation, position=position)
+
+
+def least_turn(from_vector: Array, to_vector: Array) -> Array:
+    """Return the smallest rotations that take directions to others, shape (..., 3, 3)."""
+    start = np.broadcast_to(from_vector, to_vector.shape)
+    across = np.cross(start, to_vector)
+    sine = np.linalg.norm(across, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, np.sum(start * to_vector, axis=-1, keepdims=True))
+    smallest = np.eye(3)[np.argmin(np.abs(start), axis=-1)]
+    other = np.cross(start, smallest)  # any axis across, for the opposite direction
+    other = other / np.linalg.norm(other, axis=-1, keepdims=True)
+    about = np.where(sine > 1e-12, across / np.maximum(sine, 1e-300), other)
+    turn = Rotation.from_rotvec((about * angle).reshape(-1, 3))
+    return np.asarray(turn.as_matrix().reshape(*to_vector.shape, 3))
+
+
+def _phases(problem: Problem, state: State, free: BoolArray) -> Array:
+    """Return the drive phases with which states explain the phasors best, (m, channels)."""
+    seen = predict_channels(problem.at(state), problem.time, state.rotation, state.position)
+    measured = problem.measured[..., :3] + 1j * problem.measured[..., 3:]
+    there = np.einsum("...ii->...i", problem.sqrt_information) > 0.0
+    lag = np.angle(np.sum(np.where(there, np.conj(seen) * measured, 0.0), axis=-1))
+    return np.where(free, lag, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """The grid, and what each axis measured at every epoch.
+
+    Parameters
+    ----------
+    phasor : complex ndarray, shape (n, channels, 3)
+        (T)
+    there : bool ndarray, shape (n, channels, 3)
+    sigma : ndarray, shape (n, channels, 3)
+        Of either part (T).
+    axes_body : ndarray, shape (3, 3)
+        The receiver's axes, row by row, each times its gain.
+    free : bool ndarray, shape (channels,)
+        Whose drive phase is unknown: where one is, signs are left out of the grid.
+    """
+
+    problem: Problem
+    grid: Grid
+    phasor: ComplexArray
+    there: BoolArray
+    sigma: Array
+    axes_body: Array
+    free: BoolArray
+    bases: dict[bytes, tuple[Array, Array]] = field(default_factory=dict)
+
+    @staticmethod
+    def of(problem: Problem) -> "_Asked":
+        """Return the epochs of a problem."""
+        site, known = problem.calibration.site, at_point(problem.calibration)
+        sensor = site.platform.magnetometer
+        free = np.concatenate([np.full(len(b.tones), not b.synchronised) for b in site.beacons])
+        places, time = grid_about(site), float(np.mean(problem.time))
+        inverse = np.einsum("...ii->...i", problem.sqrt_information)
+        there = inverse > 0.0
+        return _Asked(
+            problem,
+            Grid.of(known, time, places, signed=not np.any(free)),
+            problem.measured[..., :3] + 1j * problem.measured[..., 3:],
+            there,
+            np.divide(1.0, inverse, out=np.ones_like(inverse), where=there),
+            sensor.matrix @ sensor.body_from_sensor.T,
+            free,
+        )
+
+    @property
+    def signed(self) -> bool:
+        """Whether phases tell signs."""
+        return not np.any(self.free)
+
+    def starts(self, row: int) -> tuple[Array, Array]:
+        """Return attitudes of the body and places of the receiver at an epoch, the likeliest."""
+        own = np.flatnonzero(np.any(self.there[row], axis=0))
+        cost = np.zeros(len(self.grid.places_world))
+        for k in own:
+            cost += self._misfit(row, int(k))
+        best = np.argsort(cost, kind="stable")[:LIKELY]
+        axes, misfit = np.empty((len(best), len(own), 3)), np.zeros(len(best))
+        for i, k in enumerate(own):
+            axes[:, i], part = self._axes(row, int(k), best)
+            misfit += part
+        misfit += _misshapen(axes, self.axes_body[own])
+        again = np.argsort(misfit, kind="stable")[:KEPT]
+        axes, place = axes[again], self.grid.places_world[best[again]]
+        if self.signed:
+            return self._turns(row, own, axes), place
+        axes = self._one_sign(row, own, axes, best[again])
+        turns = [self._turns(row, own, sign * axes) for sign in (1.0, -1.0)]
+        return np.concatenate(turns), np.concatenate([place, place])
+
+    def _rows(self, row: int, k: int) -> tuple[Array, BoolArray]:
+        """Return what an axis measured as rows of the grid's design, and which are there."""
+        value, there = self.phasor[row, :, k], self.there[row, :, k]
+        if not self.signed:
+            return np.abs(value) ** 2, there
+        return np.concatenate([value.real, value.imag]), np.concatenate([there, there])
+
+    def _misfit(self, row: int, k: int) -> Array:
+        """Return what no axis explains at each place, shape (g,), in shares of the field there."""
+        given, there = self._rows(row, k)
+        scale, basis = self._basis(there)
+        target = np.where(there, given, 0.0) * scale
+        along = (target[:, None] @ basis)[:, 0]
+        total = np.sum(target**2, axis=1)
+        return np.asarray(1.0 - np.sum(along**2, axis=1) / np.maximum(total, _TINY))
+
+    def _basis(self, there: BoolArray) -> tuple[Array, Array]:
+        """Return the weights of rows at each place, and a basis of all that axes make of them."""
+        if there.tobytes() not in self.bases:
+            scale = np.where(there, self.grid.scale, 0.0)
+            left, size, _ = np.linalg.svd(self.grid.design * scale[..., None], full_matrices=False)
+            felt = (size > FLAT * size[:, :1])[:, None]
+            self.bases.clear()  # of the usual pattern alone
+            self.bases[there.tobytes()] = scale, np.where(felt, left, 0.0)
+        return self.bases[there.tobytes()]
+
+    def _axes(self, row: int, k: int, best: IntArray) -> tuple[Array, Array]:
+        """Return the axis that fits best at places, shape (m, 3), and its chi square."""
+        given, there = self._rows(row, k)
+        size = np.abs(self.phasor[row, :, k]) * self.there[row, :, k]
+        noise = np.where(self.there[row, :, k], self.sigma[row, :, k], 1.0)
+        soft = np.sqrt(noise**2 + (SOFT * size) ** 2 + (FLOOR * np.max(size)) ** 2)
+        soft = np.concatenate([soft, soft]) if self.signed else 2.0 * soft * np.maximum(size, soft)
+        weight = np.where(there, 1.0 / soft, 0.0)
+        design, target = self.grid.design[best] * weight[:, None], np.where(there, given, 0.0)
+        found = np.linalg.pinv(design, rcond=1e-6) @ (target * weight)
+        left = (design @ found[..., None])[..., 0] - target * weight
+        axes = found if self.signed else roots(found)
+        return axes, np.sum(left**2, axis=1)
+
+    def _one_sign(self, row: int, own: IntArray, axes: Array, places: IntArray) -> Array:
+        """Return axes whose signs agree with the first's: their phasors have the same phase."""
+        seen = np.einsum("gcx,gax->gac", self.grid.field[places], axes)
+        measured = np.where(self.there[row], self.phasor[row], 0.0).T[own]
+        ours = np.real(seen[:, :1] * np.conj(seen))
+        theirs = np.real(measured[:1] * np.conj(measured))
+        sign = np.where(np.sum(ours * theirs, axis=-1) < 0.0, -1.0, 1.0)
+        return np.asarray(sign[..., None] * axes)
+
+    def _turns(self, row: int, own: IntArray, axes: Array) -> Array:
+        """Return the attitudes whose axes point as they were found, shape (m, 3, 3)."""
+        length = np.linalg.norm(axes, axis=-1, keepdims=True)
+        body = self.axes_body[own]
+        body = body / np.linalg.norm(body, axis=-1, keepdims=True)
+        along = np.einsum("gki,kj->gij", axes / np.maximum(length, _TINY), body)
+        gravity = self.problem.gravity
+        if gravity is not None and np.isfinite(gravity.sigma[row]):
+            along[:, 2] += gravity.up_body[row]
+        return wahba(along + LEAST_TURN * np.eye(3))
+
+
+def _misshapen(axes: Array, body: Array) -> Array:
+    """Return how far axes (m, k, 3) are from being turned ones of the body, as a chi square."""
+    gain = np.linalg.norm(body, axis=-1)
+    unit, own = axes / gain[:, None], body / gain[:, None]
+    product = unit @ np.swapaxes(unit, 1, 2) - own @ own.T
+    pairs = np.triu_indices(len(body))
+    return np.asarray(np.sum((product[:, *pairs] / (2.0 * SHAPE)) ** 2, axis=1))
