@@ -175,8 +175,8 @@ def whitening(cov: Array, there: BoolArray) -> Array:
     ----------
     cov : ndarray, shape (..., 3, 3)
     there : bool ndarray, shape (..., 3) or (...)
-        Of each component, or of all three.  The covariance of the components that are there is the inverted one: what is missing was
-        not measured, however large its noise is.
+        Of each component, or of all three.  The covariance of the components that are there is
+        what is inverted: what is missing was not measured, however large its noise is.
     """
     each = there.ndim == cov.ndim - 1
     valid = np.any(there, axis=-1) if each else there

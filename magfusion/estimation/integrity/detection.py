@@ -39,7 +39,7 @@ def drowned(samples: FieldSamples) -> BoolArray:
     would hide it, as fast motion beside another coil does before it is compensated.
     """
     heard = detected(samples, DETECTION_CHI_SQUARE_ONLINE)
-    power = np.where(heard, np.sum(np.abs(samples.phasor_sensor) ** 2, axis=-1), np.nan)
+    power = np.where(heard, np.nansum(np.abs(samples.phasor_sensor) ** 2, axis=-1), np.nan)
     usual = np.nanmedian(np.where(heard.any(axis=0), power, 0.0), axis=0)
     share = np.sum(whitening(samples.phasor_cov, samples.there) ** 2, axis=(-1, -2)) / 3.0
     return np.asarray(samples.valid & ~heard & (usual * share <= DETECTION_CHI_SQUARE_ONLINE))
