@@ -11,8 +11,14 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import Refuse, run_command
 
+from magfusion.estimation.snapshot.axis_starts import least_turn
 from magfusion.estimation.snapshot.coil_fix import CoilFixes, Gain, _Problem, fix_coil
-from magfusion.estimation.snapshot.coil_poses import nearest_truth, poses_of
+from magfusion.estimation.snapshot.coil_poses import (
+    judged_poses,
+    nearest_told,
+    nearest_truth,
+    poses_of,
+)
 from magfusion.estimation.snapshot.coil_starts import CoilEpochs, at_point
 from magfusion.files.site import load_site, save_site
 from magfusion.model.coil_field import as_points
@@ -191,3 +197,24 @@ def test_wound_coils_locate_it_with_both_mirrors_and_one_in_front() -> None:
     # Of all epochs, not of each as the scenario's verdict has it: noise takes one to 0.0107 rad.
     assert found.axis_rad <= scenario.LIMIT
     assert 1.5 <= found.nees <= 6.0
+
+
+def test_errors_are_those_of_the_nearest_mirror(site: Site) -> None:
+    beacons = tuple(replace(b, hemisphere_beacon=None) for b in site.beacons)
+    both = replace(site, beacons=beacons)
+    rng = np.random.default_rng(2)
+    noisy = seen(both, 1.0) + SIGMA * rng.standard_normal((3, len(beacons)))
+    own = epochs(noisy, signed=True)
+    found = fix_coil(own, initial_calibration(both, 0.0), Gain(1.0, 0.01))
+    fixes = poses_of(found, own.time, both, signed=True)
+    judged = judged_poses(fixes, found, 0, signed=True)
+    truth = Trajectory(own.time, np.broadcast_to(np.eye(3), (3, 3, 3)).copy(), PLACE)
+    turned = least_turn(np.array([0.0, 0.0, 1.0]), AXIS)
+    truth = replace(truth, world_from_body=turned)
+    nearest, _ = nearest_told(judged.alone, truth, both)
+    np.testing.assert_allclose(nearest.position_world, PLACE, atol=1e-4)
+    against = nearest_truth(truth, nearest, both, signed=True)
+    errors = trajectory_errors(nearest, against, max_gap=2.0)
+    assert errors.nees is not None
+    assert (errors.nees < 30.0).all()
+    assert (np.sum(np.isfinite(judged.fixes.cost), axis=1) == 2).all()

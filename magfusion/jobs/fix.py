@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from magfusion.jobs.inputs import Job
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
+    from magfusion.model.trajectory import Trajectory
     from magfusion.model.trust import Risk, StateTrust, Trust
     from magfusion.receiver.windows import LockinSettings
     from magfusion.units import Array
@@ -211,6 +212,7 @@ def _run_coil(
             found.trust,
             relation=found.relation,
             columns=found.columns,
+            nearest=found.compared,
         )
         if directory != whole:
             (directory / "report.json").rename(whole / "report.json")
@@ -229,6 +231,7 @@ def write_fix_result(
     *,
     relation: NDArray[np.str_] | None = None,
     columns: Mapping[str, Array] | None = None,
+    nearest: Trajectory | None = None,
 ) -> Figures:
     """Write the fixes; return the figures with the errors against the truth.
 
@@ -238,6 +241,8 @@ def write_fix_result(
         As in `write_hypotheses`, where it is not that of the symmetries.
     columns : mapping, optional
         More of them.
+    nearest : Trajectory, optional
+        What is compared with the truth, where it is not the best hypotheses.
     """
     from magfusion.estimation.snapshot.ambiguity import relations
     from magfusion.files.fix_table import write_hypotheses
@@ -248,7 +253,7 @@ def write_fix_result(
     from magfusion.results.report import compared_with_truth, write_report
 
     best = fixes.best()
-    errors, compared = compared_with_truth(best, log)
+    errors, compared = compared_with_truth(best if nearest is None else nearest, log)
     write_tum(best, directory / "trajectory.tum", log.epoch_ns)
     write_trajectory(best, directory / "trajectory.parquet", log.epoch_ns, states)
     write_hypotheses(

@@ -17,6 +17,7 @@ from magfusion.estimation.snapshot.coil_fix import UNKNOWNS, CoilFixes, Gain, fi
 from magfusion.estimation.snapshot.coil_poses import (
     axis_sigma,
     judged_poses,
+    nearest_told,
     nearest_truth,
     poses_of,
 )
@@ -25,6 +26,7 @@ from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import StateTrust, Trust
 from magfusion.results.figures import Column, Figure, Figures, Section, heading
 from magfusion.results.report import where_found
@@ -45,6 +47,8 @@ class FoundCoil:
         Whose truth is turned to the roll that was chosen.
     columns : dict
         More columns of the hypotheses' table, shape (n, hypotheses) each.
+    compared : Trajectory, optional
+        Of the places told the nearest to the truth, with their own covariance.
     """
 
     log: Log
@@ -54,6 +58,7 @@ class FoundCoil:
     figures: Figures
     relation: NDArray[np.str_]
     columns: dict[str, Array]
+    compared: Trajectory | None = None
 
 
 def find_coil(
@@ -101,9 +106,13 @@ def find_coil(
     figures = heading("fix", log.name) | trust_figures(trust)
     figures |= _figures(fixes, found, signed=kept.signed)
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
+    compared = None
     if log.truth is not None:
-        turned = nearest_truth(log.truth, fixes.best(), site, signed=kept.signed)
+        # Against the other mirror nothing would be compared but how far apart the two are.
+        compared, other = nearest_told(judged.alone, log.truth, site)
+        turned = nearest_truth(log.truth, compared, site, signed=kept.signed)
         log = replace(log, truth=turned)
+        figures |= Figures(where_found("compared_rivals", bool(np.any(other)), int(np.sum(other))))
     decided = replace(fixes, determined=np.ones_like(fixes.determined))
     return FoundCoil(
         log=log,
@@ -113,6 +122,7 @@ def find_coil(
         figures=figures,
         relation=relations(decided, site).label,
         columns=_columns(found),
+        compared=compared,
     )
 
 

@@ -120,11 +120,45 @@ def nearest_truth(truth: Trajectory, poses: Trajectory, site: Site, *, signed: b
     return Trajectory(true.time, turned, coil - turned @ lever)
 
 
+def nearest_told(fixes: Fixes, truth: Trajectory, site: Site) -> tuple[Trajectory, BoolArray]:
+    """Return of every epoch the place told that is nearest to the truth, and where it is not first.
+
+    Parameters
+    ----------
+    fixes : Fixes
+        As `JudgedPoses.alone`.
+    """
+    true, there = interpolate(truth, fixes.time, LONGEST_STEP)
+    rows = np.arange(len(fixes))
+    chosen = np.zeros(len(fixes), dtype=np.int64)
+    lever = coil_lever(site.platform.magnetometer)
+    coil = true.position_world + true.world_from_body @ lever
+    found = fixes.position_world[there] + fixes.world_from_body[there] @ lever
+    away = np.linalg.norm(found - coil[:, None], axis=2)
+    told = fixes.probability[there] > AMBIGUOUS
+    told[:, 0] = True
+    chosen[there] = np.argmin(np.where(told, away, np.inf), axis=1)
+    nearest = Trajectory(
+        fixes.time,
+        fixes.world_from_body[rows, chosen],
+        fixes.position_world[rows, chosen],
+        pose_cov=fixes.pose_cov[rows, chosen],
+    )
+    return nearest, chosen > 0
+
+
 @dataclass(frozen=True, eq=False)
 class JudgedPoses:
-    """Poses whose covariances cover rivals and residuals, and what is to be said of them."""
+    """Poses whose covariances cover rivals and residuals, and what is to be said of them.
+
+    Parameters
+    ----------
+    alone : Fixes
+        Of whose covariances each is that of its own hypothesis.
+    """
 
     fixes: Fixes
+    alone: Fixes
     states: StateTrust
     trust: Trust
 
@@ -151,10 +185,10 @@ def judged_poses(fixes: Fixes, found: CoilFixes, left_out: int, *, signed: bool)
     remedy = "Check the beacons; where the common gain is not as declared, --free gain."
     whole = unexplained("the median epoch", *median, remedy)
     excess = np.where(odd, found.cost[:, 0] / np.maximum(found.freedom, 1.0), 1.0)
-    cov = fixes.pose_cov.copy()
-    cov[:, 0] *= np.maximum(excess, whole.excess)[:, None, None]
+    enlarged = fixes.pose_cov * np.maximum(excess, whole.excess)[:, None, None, None]
+    cov = enlarged.copy()
     cov[:, 0] += rival_spread(fixes, rival)
-    fixes = replace(fixes, pose_cov=cov)
+    alone, fixes = replace(fixes, pose_cov=enlarged), replace(fixes, pose_cov=cov)
     findings = [Finding("roll_open", roll + turned, Verdict.TRUSTWORTHY), *whole.findings]
     for code, rows, what in (
         (
@@ -182,7 +216,7 @@ def judged_poses(fixes: Fixes, found: CoilFixes, left_out: int, *, signed: bool)
     none, doubt = np.full(count, np.nan), rival | odd | open_ | bool(whole.findings)
     verdicts = tuple(Verdict.DOUBTFUL if d else Verdict.TRUSTWORTHY for d in doubt.tolist())
     states = StateTrust(verdicts, none, none.copy(), ((),) * count)
-    return JudgedPoses(fixes, states, Trust(tuple(findings)))
+    return JudgedPoses(fixes, alone, states, Trust(tuple(findings)))
 
 
 def _share(code: str, rows: BoolArray, what: str) -> list[Finding]:
