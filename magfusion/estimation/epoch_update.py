@@ -249,6 +249,9 @@ class EpochUpdate:
             return
         self._compared_at, self._since_compared = state.time, 0
         fix = agreed_fix(samples, state.calibration)
+        lacking = self.site.platform.magnetometer.lacking
+        if fix is not None and lacking and not fix.fixes.determined[0, 0]:
+            return  # a roll that is open is as far from any state
         if fix is not None and explains(fix, samples, state.calibration):
             self.witness.compared(*_apart(state, fix))
 

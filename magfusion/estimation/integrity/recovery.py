@@ -132,8 +132,9 @@ def explains(fix: AgreedFix, samples: FieldSamples, calibration: Calibration) ->
     if not np.any(kept):
         return False
     phasor = predict_channels(calibration, best.time, best.world_from_body, best.position_world)
-    measured = samples.phasor_sensor[0, kept]
-    left = np.linalg.norm(measured - phasor[0, kept], axis=1)
+    measured = np.nan_to_num(samples.phasor_sensor[0, kept])
+    there = samples.there[0, kept]
+    left = np.linalg.norm(np.where(there, measured - phasor[0, kept], 0.0), axis=1)
     share = left / np.linalg.norm(measured, axis=1)
     return bool(np.sqrt(np.mean(share**2)) < EXPLAINED)
 
@@ -206,6 +207,6 @@ def _repeated(prior: Trajectory, count: int) -> Trajectory:
 
 
 def _agrees(fix: AgreedFix, samples: FieldSamples) -> bool:
-    rows = 6 * int(np.sum(samples.valid[0] & ~fix.refused))
+    rows = int(np.sum(samples.numbers[0] * ~fix.refused))
     cost = float(fix.fixes.cost[0, 0] - fix.fixes.prior_cost[0, 0])
     return cost <= float(chdtri(rows, DOUBT))
