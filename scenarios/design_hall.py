@@ -8,6 +8,9 @@ the walls and more.  Random layouts are drawn from the same candidates under the
    protection level?
 2. Does that hold at points it was not designed for, four times as many in plan, and by `coverage`?
 3. Do several searches find the same value?
+4. Are the protection levels those that fixes of simulated fields have there?
+5. What does it cost where no beacon is false?  The worst sigma of the position, beside that of the
+   median layout and of a design for the mean variance (A).
 """
 
 import time
@@ -16,13 +19,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from harness import conclude, scenario_parser
 
+from magfusion.estimation.integrity.fix_separation import separate_fixes
+from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.hall import Hall, Mounts, Prism, mounting_places, points_of_use
-from magfusion.model.site import Site
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.site import Beacon, Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Risk
-from magfusion.results.coverage import coverage
+from magfusion.results.coverage import Coverage, coverage, phasor_variance
 from magfusion.results.design.pattern import Band
 from magfusion.results.design.planning import Task, designed
 from magfusion.simulation.demo_site import demo_site
+from magfusion.simulation.log import simulate_fields
+from magfusion.units import Array
 
 PLAN = np.array([[0, 0], [24, 0], [24, 10], [10, 10], [10, 20], [0, 20]], dtype=float)  # m
 GATE = np.array([[19.0, -0.1], [24.1, -0.1], [24.1, 4.0], [19.0, 4.0]])
@@ -56,6 +65,9 @@ class Outcome:
     fine_random_median: float  # of the layout that is the median
     gain_over_median: float  # of the first search
     gain_over_best: float
+    fix_over_predicted: tuple[float, float, float]  # levels of fixes: 5, 50 and 95 % of the points
+    worst_sigma: tuple[float, float, float]  # designed, random median, designed by A (m)
+    level_by_a: float  # of the design by A
 
 
 def hall() -> Hall:
@@ -92,6 +104,15 @@ def run(config: Config) -> Outcome:
     levels = tuple(_worst(one.site, task) for one in found)
     fine = replace(task, points=points_of_use(hall(), 0.5 * config.spacing))
     assert first.median_random is not None
+    by_a = designed(
+        replace(task, objective="A"),
+        starts=config.starts,
+        layouts=0,
+        rng=np.random.default_rng([config.seed, config.searches]),
+    )
+    sites = (first.site, first.median_random, by_a.site)
+    sigma = tuple(float(np.max(_map(site, task).position_sigma)) for site in sites)
+    low, middle, high = _fixes_over_predicted(first.site, task, config.seed)
     median, best = (float(f(first.random_worst_m)) for f in (np.median, np.min))
     return Outcome(
         candidates=first.candidates,
@@ -104,14 +125,44 @@ def run(config: Config) -> Outcome:
         fine_random_median=_worst(first.median_random, fine),
         gain_over_median=1.0 - levels[0] / median,
         gain_over_best=1.0 - levels[0] / best,
+        fix_over_predicted=(low, middle, high),
+        worst_sigma=(sigma[0], sigma[1], sigma[2]),
+        level_by_a=_worst(by_a.site, task),
     )
+
+
+def _map(site: Site, task: Task) -> Coverage:
+    return coverage(site, task.points, task.band.window, risk=task.risk)
+
+
+def _levels(site: Site, task: Task) -> Array:
+    level = _map(site, task).protection_level_m
+    assert level is not None
+    return level
 
 
 def _worst(site: Site, task: Task) -> float:
     """Return the worst protection level as `coverage` has it (m)."""
-    level = coverage(site, task.points, task.band.window, risk=task.risk).protection_level_m
-    assert level is not None
-    return float(np.max(level))
+    return float(np.max(_levels(site, task)))
+
+
+def _fixes_over_predicted(site: Site, task: Task, seed: int) -> tuple[float, float, float]:
+    """Return quantiles of the levels of fixes of simulated fields, over those predicted."""
+    dipoles = replace(site, beacons=tuple(_as_dipoles(b) for b in site.beacons))
+    noise = float(np.sqrt(phasor_variance(dipoles, task.band.window)[0]))
+    count, calibration = len(task.points), initial_calibration(dipoles, 0.0)
+    attitude = np.broadcast_to(np.eye(3), (count, 3, 3))
+    still = Trajectory(task.band.window * np.arange(count), attitude, task.points)
+    samples = simulate_fields(dipoles, still, noise, np.random.default_rng(seed))
+    fixes = fix_epochs(samples, calibration)
+    found = separate_fixes(samples, calibration, fixes, risk=task.risk).states
+    ratio = found.protection_level_m / _levels(dipoles, task)
+    low, middle, high = np.nanquantile(ratio, [0.05, 0.5, 0.95])
+    return float(low), float(middle), float(high)
+
+
+def _as_dipoles(beacon: Beacon) -> Beacon:
+    return replace(beacon, coils=tuple(replace(c, radius=None) for c in beacon.coils))
 
 
 def report(found: Outcome) -> str:
@@ -129,6 +180,11 @@ def report(found: Outcome) -> str:
             f"  searches                 {searches}, in {took} (the first with the random ones)",
             f"  at points half as far    {found.fine_designed:8.3f} m, random median"
             f" {found.fine_random_median:.3f} m",
+            "  levels of fixes over predicted, 5, 50, 95 % of the points: "
+            + ", ".join(f"{r:.3f}" for r in found.fix_over_predicted),
+            "  worst position sigma     designed {:.3f} m, random median {:.3f} m, designed by A"
+            " {:.3f} m".format(*found.worst_sigma),
+            f"  worst level by A         {found.level_by_a:8.3f} m",
         ]
     )
 

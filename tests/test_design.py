@@ -10,7 +10,11 @@ from example_site import mixed_site
 
 from magfusion.errors import InputError
 from magfusion.files.hall import load_hall
+from magfusion.model.correlation import Correlation
+from magfusion.model.ground import in_ground
 from magfusion.model.hall import Hall, Mounts, Prism, mounting_places, points_of_use, prism_of
+from magfusion.model.parameters import choose_blocks
+from magfusion.model.prior import parameters_of
 from magfusion.model.site import Site
 from magfusion.model.trust import Risk
 from magfusion.results.coverage import coverage, volume
@@ -21,10 +25,12 @@ from magfusion.results.design.pattern import (
     axes_offered,
     frequencies_for,
     pattern_axis,
+    tuned,
     turned,
 )
 from magfusion.results.design.planning import Task, candidates_of, designed
-from magfusion.results.design.tuning import divided
+from magfusion.results.design.tuning import assigned, divided
+from magfusion.results.pose_information import SURVEY_GROUPS
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 
 WINDOW = 0.4  # s
@@ -50,9 +56,30 @@ def task(count: int = 2, places: int = 7, **changes: object) -> Task:
     return replace(plain, **changes)
 
 
-@pytest.mark.parametrize("kept", [0, 2])
+def correlated_site() -> Site:
+    """Return a site whose first two beacons and magnetometer were refined by one log."""
+    site = demo_site(coil_radius=None)
+    refined = replace(site, beacons=site.beacons[:2])
+    names = parameters_of(choose_blocks(refined, SURVEY_GROUPS))
+    drawn = np.random.default_rng(0).normal(size=(len(names), 2 * len(names)))
+    return replace(site, correlation=Correlation(tuple(names), np.corrcoef(drawn)))
+
+
+def site_in_the_sea() -> Site:
+    return replace(in_ground(demo_site(coil_radius=None), 4.0), log_conductivity_sigma=0.1)
+
+
 @pytest.mark.parametrize(
-    "site", [demo_site(coil_radius=None), demo_site(synchronised=False), mixed_site()]
+    ("site", "kept"),
+    [
+        (demo_site(coil_radius=None), 0),
+        (demo_site(coil_radius=None), 2),
+        (demo_site(synchronised=False), 0),
+        (mixed_site(), 2),
+        (correlated_site(), 2),
+        (site_in_the_sea(), 0),
+        (site_in_the_sea(), 1),
+    ],
 )
 def test_design_and_coverage_agree_on_a_layout_to_rounding(site: Site, kept: int) -> None:
     """One marginalises beacon by beacon and adds up, the other everything at once."""
@@ -126,6 +153,18 @@ def test_a_budget_divided_is_spent_and_serves_better() -> None:
     assert np.sum(share) == pytest.approx(len(beacons))
     assert np.ptp(share) > 0.0
     assert value_of(info, new, "worst")[0] < value_of(info, beacons, "worst")[0]
+
+
+def test_frequencies_are_exchanged_where_the_ground_weakens_some() -> None:
+    site = site_in_the_sea()
+    info = information(site)
+    hz = np.array([[1000.0], [2000.0], [3000.0], [4000.0]])
+    beacons = tuple(tuned(b, f) for b, f in zip(site.beacons, hz, strict=True))
+    new = assigned(info, beacons, np.array([1500.0, 5000.0]), "worst", lambda: True)
+    assert value_of(info, new, "worst")[0] < value_of(info, beacons, "worst")[0]
+    frequencies = [b.frequency_hz for b in new]
+    assert len(set(frequencies)) == 4
+    assert set(frequencies) <= {*hz.ravel().tolist(), 1500.0, 5000.0}
 
 
 def test_tones_are_told_apart_from_each_other_and_from_the_mains() -> None:

@@ -29,6 +29,7 @@ Objective = Literal["worst", "D", "A"]
 LESS = 1e-4  # of the objective; an exchange that gains less is none
 FIRST_POINTS = 24  # compared from the start
 MORE_POINTS = 6  # added in a round, apart from each other
+MOST_COMPARED = 64  # points, for the memory that all candidates take there
 ROUNDS = 8
 SWEEPS = 20
 DRAWN = 30  # random layouts, of which the best is a start
@@ -308,7 +309,8 @@ def _settled(search: Search, layout: tuple[int, ...]) -> Found:
         if best is None or value < best.value:
             best = Found(layout, value, complete=True)
         enough = search.objective != "worst" or value <= search.value(layout) * (1.0 + LESS)
-        if enough or not search.in_time():
+        full = len(search.active) + MORE_POINTS > MOST_COMPARED
+        if enough or full or not search.in_time():
             break
         search.add(_worst_apart(search, each))
     assert best is not None

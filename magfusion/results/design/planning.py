@@ -33,7 +33,7 @@ from magfusion.results.design.tuning import assigned, divided
 from magfusion.results.pose_information import NEAREST
 from magfusion.units import Array
 
-MOST_CANDIDATES = 10_000
+MOST_CANDIDATES = 6000
 
 
 @dataclass(frozen=True, eq=False)
