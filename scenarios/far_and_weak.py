@@ -1,16 +1,26 @@
-"""Beacons heard after minutes or hours at rest, far below the noise: what integration is worth.
+"""Beacons far below the noise, after an hour at rest: what integration and a witness are worth.
 
-A receiver rests 300 m from four beacons, through rock, and samples at 100 Hz.  Their fields are 10
+A receiver rests 300 m from four beacons, through rock, and samples at 100 Hz.  Their fields are 14
 to 30 dB below the noise of a single sample.  ``--at-rest`` makes one epoch of the rest.
+
+1. An hour: errors of phasors against the bound of Cramer and Rao, the NEES of phasors and of the
+   pose, with beacons on the log's clock and with clocks of their own.
+2. Noise alone: how often it is taken for a beacon, where one in a hundred was asked for.
+3. Storms that fall with the root of the frequency, 40 dB above the instrument at 1 Hz, with a
+   second magnetometer whose clock is late and runs otherwise; one that hears other storms, and one
+   beside a beacon.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from harness import conclude, rms, scenario_parser
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.at_rest import AtRest
+from magfusion.estimation.at_rest import AtRest, at_rest
+from magfusion.estimation.demodulation import first_fixes
 from magfusion.model.ground import in_ground
+from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import Log
 from magfusion.model.site import Beacon, BeaconSigma, Coil, Site
 from magfusion.model.trajectory import Trajectory
@@ -29,7 +39,7 @@ from magfusion.simulation.log import (
 )
 from magfusion.simulation.motion import static_motion
 from magfusion.simulation.waveform import simulate_waveform
-from magfusion.units import Array
+from magfusion.units import Array, ComplexArray
 
 DISTANCE = 300.0  # m, of each beacon from the middle
 DIRECTIONS = np.array([[1.0, 0.9, 0.4], [-0.9, 1.0, -0.5], [-1.0, -0.8, 0.6], [0.8, -1.0, -0.3]])
@@ -37,6 +47,9 @@ FREQUENCIES_HZ = (21.0, 24.0, 27.0, 31.0)
 RATE_HZ, IMU_RATE_HZ = 100.0, 25.0
 CONDUCTIVITY = 0.01  # S/m
 NOISE_DENSITY = 1e-11  # T/sqrt(Hz)
+FAR_AWAY = np.array([5e3, 0.0, 0.0])  # m
+STORMS = 1e-9  # T/sqrt(Hz) at 1 Hz
+LATE, RATE = 0.137, 2e-5  # s, and as a share: the clock of the second magnetometer
 NOTHING = 1e-30  # T
 SILENT = 1e-9  # of a moment: nothing
 
@@ -142,14 +155,188 @@ def witnessed_log(
     return simulate_log(known, config, np.random.default_rng(seed))
 
 
-def errors_in_sigmas(rested: AtRest, made: SimulatedLog) -> Array:
-    """Return the square of each phasor's error in its sigmas, shape (n, channels); six are due."""
+def true_phasors(rested: AtRest, made: SimulatedLog) -> ComplexArray:
+    """Return what was there at the middle of each rest, shape (n, channels, 3) (T)."""
     truth, time = made.log.truth, rested.fields.time
     assert truth is not None
     pose = np.repeat(truth.world_from_body[:1], len(time), 0), truth.position_world[:1]
     there = Trajectory(time, pose[0], np.repeat(pose[1], len(time), 0))
     none = np.random.default_rng(0)
-    true = simulate_fields(made.true_site, there, NOTHING, none, made.drives).phasor_sensor
-    error = rested.fields.phasor_sensor - true
+    return simulate_fields(made.true_site, there, NOTHING, none, made.drives).phasor_sensor
+
+
+def errors_in_sigmas(rested: AtRest, made: SimulatedLog) -> Array:
+    """Return the square of each phasor's error in its sigmas, shape (n, channels); six are due."""
+    error = rested.fields.phasor_sensor - true_phasors(rested, made)
     solved = np.linalg.solve(rested.fields.phasor_cov, error[..., None])[..., 0]
     return np.asarray(np.real(np.sum(np.conj(error) * solved, axis=-1)))
+
+
+@dataclass(frozen=True)
+class Config:
+    """What is simulated."""
+
+    hour: float = 3600.0  # s
+    silence: float = 120.0  # s
+    storm: float = 600.0  # s
+    runs: int = 10
+    silent_runs: int = 150
+    seed: int = 10
+
+
+@dataclass(frozen=True)
+class Hour:
+    """What an hour gives of phasors and poses, with a site that is known."""
+
+    name: str
+    below_noise_db: float  # a tone's mean power over that of a sample's noise, all axes
+    heard: float  # share of the tones
+    times_bound: float  # rms error of a phasor
+    nees: float  # of phasors; six are due
+    position_m: float
+    pose_nees: float
+
+
+@dataclass(frozen=True)
+class Silence:
+    """How often noise is taken for a beacon."""
+
+    name: str
+    asked: float
+    alarms: int
+    tried: int
+
+
+@dataclass(frozen=True)
+class Storm:
+    """What a second magnetometer is worth."""
+
+    name: str
+    gain: float  # median, of the sigma
+    best_gain: float  # that two instruments of the same noise allow
+    error_gain: float  # of the rms error
+    nees: float
+    said: str
+
+
+def run_hour(name: str, density: float, config: Config, *, synchronised: bool) -> Hour:
+    """Measure hours at rest."""
+    site, square, nees = far_site(noise_density=density, synchronised=synchronised), [], []
+    heard, places, pose_nees, power = [], [], [], []
+    for seed in range(config.seed, config.seed + config.runs):
+        made = witnessed_log(site, config.hour, seed, FAR_AWAY, 0.0)
+        log = replace(made.log, reference=None)
+        rested = at_rest(log, site)
+        heard.append(rested.heard)
+        error = rested.fields.phasor_sensor - true_phasors(rested, made)
+        square.append(np.abs(error) ** 2 / 2.0)
+        nees.append(errors_in_sigmas(rested, made))
+        power.append(np.sum(np.abs(true_phasors(rested, made)) ** 2, axis=-1) / 2.0)
+        off, ratio = pose_error(rested, log, site)
+        places.append(off)
+        pose_nees.append(ratio)
+    sigma = density * np.sqrt(RATE_HZ / 2.0)
+    bound = sigma * np.sqrt(2.0 / (config.hour * RATE_HZ))
+    return Hour(
+        name,
+        float(10.0 * np.log10(np.mean(power) / (3.0 * sigma**2))),
+        float(np.mean(heard)),
+        float(np.sqrt(np.nanmean(square)) / bound),
+        float(np.nanmean(nees)),
+        rms(np.array(places)),
+        float(np.mean(pose_nees)),
+    )
+
+
+def pose_error(rested: AtRest, log: Log, site: Site) -> tuple[float, float]:
+    """Return the error of the position (m), and the NEES of the pose."""
+    truth, time = log.truth, float(rested.fields.time[0])
+    assert truth is not None
+    best = first_fixes(rested.fields, log, initial_calibration(site, time)).best()
+    assert best.pose_cov is not None
+    rotation, true = best.world_from_body[0], truth.world_from_body[0]
+    turn = Rotation.from_matrix(true.T @ rotation).as_rotvec()
+    offset = best.position_world[0] - truth.position_world[0]
+    error = np.concatenate([turn, rotation.T @ offset])
+    return float(np.linalg.norm(offset)), float(error @ np.linalg.solve(best.pose_cov[0], error))
+
+
+def run_silence(config: Config, *, synchronised: bool) -> Silence:
+    """Count false alarms in noise alone."""
+    site, asked, alarms, tried = far_site(synchronised=synchronised), 0.01, 0, 0
+    for seed in range(config.silent_runs):
+        rested = at_rest(noise_log(site, config.silence, seed), site, false_alarm=asked)
+        alarms, tried = alarms + int(np.sum(rested.heard)), tried + rested.heard.size
+    name = "on the log's clock" if synchronised else "clocks of their own"
+    return Silence(name, asked, alarms, tried)
+
+
+def run_storm(name: str, place_world: Array, config: Config, *, other: bool = False) -> Storm:
+    """Measure what a second magnetometer takes off."""
+    site, gains, nees, square, said = far_site(), [], [], [], set[str]()
+    for seed in range(config.seed, config.seed + config.runs):
+        storm = (config.storm, seed, place_world, STORMS, LATE, RATE)
+        made = witnessed_log(site, *storm)
+        log = made.log
+        if other:
+            strange = witnessed_log(site, config.storm, seed + 1000, place_world, STORMS)
+            log = replace(log, reference=strange.log.reference)
+        found = at_rest(log, made.true_site)
+        alone = at_rest(replace(log, reference=None), made.true_site)
+        true = true_phasors(found, made)
+        square.append([np.mean(np.abs(r.fields.phasor_sensor - true) ** 2) for r in (alone, found)])
+        assert found.gain is not None
+        gains.append(np.where(np.isnan(found.gain), 1.0, found.gain))
+        nees.append(errors_in_sigmas(found, made))
+        said |= {finding.code for finding in found.findings}
+    density = np.hypot(STORMS / np.sqrt(np.array(FREQUENCIES_HZ)), NOISE_DENSITY)
+    best = float(np.median(density / (np.sqrt(2.0) * NOISE_DENSITY)))
+    total = np.sqrt(np.mean(square, axis=0))
+    codes = ", ".join(sorted(said))
+    gain = float(np.median(gains))
+    return Storm(name, gain, best, float(total[0] / total[1]), float(np.mean(nees)), codes)
+
+
+def report(hours: list[Hour], silences: list[Silence], storms: list[Storm]) -> str:
+    """Return the three tables."""
+    lines = [
+        "an hour                  tone/noise  heard  error/bound  NEES (6)  position  NEES (6)"
+    ]
+    for one in hours:
+        heard = f"{one.below_noise_db:8.1f} dB{100.0 * one.heard:6.0f} %{one.times_bound:13.3f}"
+        pose = f"{one.nees:10.2f}{one.position_m:8.2f} m{one.pose_nees:10.2f}"
+        lines.append(f"{one.name:24}{heard}{pose}")
+    for alone in silences:
+        share = f"{alone.alarms} of {alone.tried}"
+        lines.append(f"noise alone, {alone.name}: {share} heard, {alone.asked:g} asked")
+    lines.append("second magnetometer      gain of sigma  at best  gain of error  NEES (6)")
+    for storm in storms:
+        gain = f"{storm.gain:13.2f}{storm.best_gain:9.2f}{storm.error_gain:15.2f}"
+        lines.append(f"{storm.name:25}{gain}{storm.nees:10.2f}  {storm.said}")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure hours, silence and storms."""
+    parser = scenario_parser(__doc__, Config.seed, output=None)
+    parser.add_argument("--runs", type=int, default=Config.runs, help="of each kind")
+    given = parser.parse_args()
+    config = Config(runs=given.runs, seed=given.seed, silent_runs=15 * given.runs)
+    hours = [
+        run_hour("10 pT/rtHz", 1e-11, config, synchronised=True),
+        run_hour("30 pT/rtHz", 3e-11, config, synchronised=True),
+        run_hour("30 pT/rtHz, own clocks", 3e-11, config, synchronised=False),
+    ]
+    silences = [run_silence(config, synchronised=one) for one in (True, False)]
+    beside = far_site().beacons[0].position_world + np.array([60.0, 0.0, 0.0])
+    storms = [
+        run_storm("5 km away", FAR_AWAY, config),
+        run_storm("hears other storms", FAR_AWAY, config, other=True),
+        run_storm("60 m from beacon A", beside, config),
+    ]
+    found = {"hours": hours, "silences": silences, "storms": storms}
+    conclude(report(hours, silences, storms), found)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,5 +1,6 @@
 """Whole rests as one epoch: error, covariance and false alarms against what is independent."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from conftest import Refuse, run_command
 from far_and_weak import far_site, noise_log
+from mine_noise import Config, Interference, mains, run_kind, switches, vehicles, wandering_mains
 from scipy.stats import binom
 
 from magfusion.errors import InputError
@@ -20,9 +22,11 @@ from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.hum import hum_of
 from magfusion.receiver.integration import trace_chance
+from magfusion.simulation.log import SimulationConfig, simulate_log
+from magfusion.simulation.motion import Rests
 from magfusion.units import Array, ComplexArray
 
-RATE_HZ, SIGMA, DURATION = 100.0, 7e-11, 150.0
+RATE_HZ, SIGMA, DURATION = 100.0, 7e-11, 100.0
 ALARM = 0.05
 
 
@@ -113,7 +117,7 @@ def test_a_bang_hardly_harms() -> None:
     log = noisy_log(site, np.random.default_rng(2), phasor)
     assert log.waveform is not None
     loud = log.waveform.measured_sensor.copy()
-    loud[5000:5200] += 1e-7 * np.random.default_rng(4).standard_normal((200, 3))
+    loud[4000:4200] += 1e-7 * np.random.default_rng(4).standard_normal((200, 3))
     banged = replace(log, waveform=replace(log.waveform, measured_sensor=loud))
     quiet, found = (at_rest(one, site).fields for one in (log, banged))
     share = np.trace(found.phasor_cov[0], axis1=1, axis2=2) / np.trace(
@@ -121,6 +125,13 @@ def test_a_bang_hardly_harms() -> None:
     )
     assert np.max(share) < 2.0
     assert np.max(np.abs(found.phasor_sensor - quiet.phasor_sensor)) < 4e-12
+
+
+@pytest.mark.parametrize("kind", [mains, wandering_mains, vehicles, switches])
+def test_what_a_mine_does_hardly_harms(kind: Interference) -> None:
+    row = run_kind(kind, Config(duration=120.0, runs=2))
+    assert row.rest_times_bound < 1.6
+    assert 6.0 - 4.0 * np.sqrt(12.0 / 8.0) < row.rest_nees < 6.0 + 4.0 * np.sqrt(12.0 / 8.0)
 
 
 def test_a_hum_that_wanders_is_followed() -> None:
@@ -149,6 +160,28 @@ def test_rest_is_told_from_motion_and_from_an_even_turn() -> None:
     assert found[1][1] == pytest.approx(59.5, abs=0.6)
 
 
+@pytest.mark.slow
+def test_rests_of_a_walk_are_smoothed(tmp_path: Path) -> None:
+    site = far_site(2e4)
+    config = SimulationConfig(
+        box_world=np.array([[-20.0, -20.0, -3.0], [20.0, 20.0, 3.0]]),
+        duration=420.0,
+        rests=Rests(start=100.0, move=15.0, pause=100.0),
+        imu_rate_hz=100.0,
+        magnetometer_rate_hz=RATE_HZ,
+        perturb=False,
+    )
+    made = simulate_log(site, config, np.random.default_rng(4))
+    write_log(made.log, tmp_path / "log")
+    save_site(site, tmp_path / "log" / "site.yaml")
+    run_command("demodulate", tmp_path / "log", "--at-rest", "-o", tmp_path / "rests")
+    run_command("smooth", tmp_path / "rests", "-o", tmp_path / "smooth")
+    told = json.loads((tmp_path / "smooth" / "report.json").read_text())
+    assert told["epochs"] >= 3
+    assert told["ate_m"] < 4.0
+    assert told["nees_mean"] < 6.0 + 4.0 * np.sqrt(12.0 / told["epochs"])
+
+
 def test_what_cannot_be_integrated_is_refused(tmp_path: Path, refuse: Refuse) -> None:
     log, site = noise_log(far_site(), 60.0, 0), far_site()
     moving = log.imu.accel_body + np.random.default_rng(0).standard_normal((len(log.imu), 3))
@@ -163,7 +196,7 @@ def test_what_cannot_be_integrated_is_refused(tmp_path: Path, refuse: Refuse) ->
 
 
 def test_rests_go_through_demodulate_and_fix_and_silence_is_said(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, refuse: Refuse, capfd: pytest.CaptureFixture[str]
 ) -> None:
     loud = in_ground(far_site(moment=2e4), 0.01)
     log = noise_log(loud, 150.0, 1, heard=True)
@@ -174,6 +207,8 @@ def test_rests_go_through_demodulate_and_fix_and_silence_is_said(
     assert len(fields) == 1
     assert fields.window[0] == pytest.approx(150.0, abs=1.0)
     run_command("fix", tmp_path / "rests", "-o", tmp_path / "of_rests")
+    said = refuse("navigate", tmp_path / "rests", "-o", tmp_path / "now")
+    assert "holds whole rests, of up to 150 s" in said
     run_command("fix", tmp_path / "log", "--at-rest", "-o", tmp_path / "fix")
     truth = read_log(tmp_path / "log").truth
     assert truth is not None

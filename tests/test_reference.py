@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Refuse, run_command
-from far_and_weak import errors_in_sigmas, far_site, witnessed_log
+from far_and_weak import FAR_AWAY, STORMS, errors_in_sigmas, far_site, witnessed_log
 
 from magfusion.estimation.at_rest import AtRest, at_rest
 from magfusion.files.log import read_log, write_log
@@ -18,9 +18,7 @@ from magfusion.receiver.reference import NO_LAG, lag_of
 from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
 from magfusion.units import Array
 
-FAR_AWAY = np.array([5e3, 0.0, 0.0])
 DURATION = 150.0  # s
-STORMS = 1e-9  # T/sqrt(Hz) at 1 Hz
 
 
 def sigma(rested: AtRest) -> Array:

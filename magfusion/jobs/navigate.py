@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from magfusion.model.trust import Trust
     from magfusion.results.figures import Figures
 
+LONGEST_EPOCH = 60.0  # s; of a phasor that belongs to a state of now
+
 
 @dataclass(frozen=True, kw_only=True)
 class NavigateSettings(
@@ -226,6 +228,13 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
             f"{job.log_path}: holds only phasors, which know nothing of the Earth field; give the"
             " log with magnetometer.parquet, or leave --earth out"
         )
+    if log.waveform is None and log.fields is not None:
+        longest = float(max(log.fields.window))
+        if longest > LONGEST_EPOCH:
+            raise InputError(
+                f"{job.log_path}: holds whole rests, of up to {longest:.3g} s, which are known when"
+                " they are over; run magfusion fix or smooth, or navigate the raw log"
+            )
     with state_sinks(settings, site, log.epoch_ns, sys.stderr) as sinks:
         made = _make_parent(place)
         run = _open_run(settings, navigator, log, site, place, sinks)

@@ -15,6 +15,8 @@ from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 CHUNK = 64  # pieces at once
 LEAST_SHARE = 0.9  # of the samples of a piece
+STANDS_OUT = 4.5  # times the median size of what a fit leaves; noise does so once in 10^10
+MOST_BANGS, CUT_TWICE = 0.25, 2  # of the samples of a piece; how often they are left out
 NO_PROBES = np.zeros(0)
 HUM_CLEAR = 2.0  # resolutions of a piece between a tone and a harmonic that is fitted beside it
 
@@ -109,8 +111,13 @@ class _Fitted:
         inside = reach < held[:, None]
         taper = np.where(inside, np.cos(np.pi * elapsed / self.length) ** 2, 0.0)
         design = _design(elapsed, time[index], self.frequencies_hz, self.length, self.hum)
-        weighted = np.swapaxes(design * taper[..., None], 1, 2)
-        fitted = np.linalg.solve(weighted @ design, weighted @ field)
+        fitted = _solved(design, taper, field)
+        for _ in range(CUT_TWICE):
+            bang = _bangs(field - design @ fitted, inside)
+            if not np.any(bang):
+                break
+            taper = np.where(bang, 0.0, taper)
+            fitted = _solved(design, taper, field)
         n = len(self.frequencies_hz)
         phasor = fitted[:, 2 : 2 + n] - 1j * fitted[:, 2 + n : 2 + 2 * n]
         turns = np.exp(-2j * np.pi * self.frequencies_hz * centre[:, None])
@@ -121,16 +128,37 @@ class _Fitted:
         return phasor * turns[..., None], np.swapaxes(carrier, 1, 2) @ left
 
 
+def _solved(design: Array, taper: Array, field: Array) -> Array:
+    weighted = np.swapaxes(design * taper[..., None], 1, 2)
+    return np.asarray(np.linalg.solve(weighted @ design, weighted @ field))
+
+
+def _bangs(left: Array, inside: BoolArray) -> BoolArray:
+    """Return samples that stand out of what a fit leaves of a piece, of either sensor, (n, m).
+
+    Where they are many they are no bangs.
+    """
+    found = np.zeros(inside.shape, dtype=bool)
+    for first in range(0, left.shape[2], 3):
+        size = np.linalg.norm(left[..., first : first + 3], axis=2)
+        usual = np.nanmedian(np.where(inside, size, np.nan), axis=1)
+        found |= size > STANDS_OUT * usual[:, None]
+    found &= inside
+    few = np.sum(found, axis=1) < MOST_BANGS * np.sum(inside, axis=1)
+    return np.asarray(found & few[:, None])
+
+
 def _design(
     elapsed: Array, time: Array, frequencies_hz: Array, length: float, hum: Hum | None
 ) -> Array:
-    """Return columns: constant, ramp, cosines and sines of tones, and of the hum with their ramps.
+    """Return columns: constant, ramp, cosines and sines of tones, bends, hum and its ramps.
 
     Shape (n, m, columns).
     """
     ramp = elapsed[..., None] * (2.0 / length)
     angle = 2.0 * np.pi * elapsed[..., None] * frequencies_hz
-    columns = [np.ones_like(ramp), ramp, np.cos(angle), np.sin(angle)]
+    # Steel that passes bends the steady field.
+    columns = [np.ones_like(ramp), ramp, np.cos(angle), np.sin(angle), ramp**2, ramp**3]
     if hum is not None:
         orders = hum.orders[_clear(hum, frequencies_hz, length)]
         angle = hum.angle(time)[..., None] * orders
