@@ -134,16 +134,14 @@ def _solved(design: Array, taper: Array, field: Array) -> Array:
 
 
 def _bangs(left: Array, inside: BoolArray) -> BoolArray:
-    """Return samples that stand out of what a fit leaves of a piece, of either sensor, (n, m).
+    """Return samples of the sensor that stand out of what a fit leaves of a piece, (n, m).
 
-    Where they are many they are no bangs.
+    Where they are many they are no bangs.  Those of a reference are left to the weights of pieces:
+    it is not to change what the sensor tells alone.
     """
-    found = np.zeros(inside.shape, dtype=bool)
-    for first in range(0, left.shape[2], 3):
-        size = np.linalg.norm(left[..., first : first + 3], axis=2)
-        usual = np.nanmedian(np.where(inside, size, np.nan), axis=1)
-        found |= size > STANDS_OUT * usual[:, None]
-    found &= inside
+    size = np.linalg.norm(left[..., :3], axis=2)
+    usual = np.nanmedian(np.where(inside, size, np.nan), axis=1)
+    found = inside & (size > STANDS_OUT * usual[:, None])
     few = np.sum(found, axis=1) < MOST_BANGS * np.sum(inside, axis=1)
     return np.asarray(found & few[:, None])
 
