@@ -80,6 +80,7 @@ def test_a_site_that_is_known_exactly_has_nothing_to_calibrate(
         (("--band", "20,21"), "has room for 1 tones"),
         (("--moment", 1, "--moment-budget", 4), "not both"),
         (("--spacing", "1e-3"), "--spacing"),
+        (("--grid", "1e-3"), "--grid"),
         (("--beacons", 0), "--beacons"),
         (("--apart", 100), "--apart 100 m"),
         (("--hall", "nowhere.yaml", "--box", "0,1,0,1,0,1"), "not both"),

@@ -204,12 +204,15 @@ def _hall(settings: DesignSettings, site: Site) -> tuple[Hall, float]:
         hall = Hall(room, mounts, room, settings.clearance)
     size = hall.room.box_world[1, :2] - hall.room.box_world[0, :2]
     spacing = float(np.max(size)) / 20.0 if settings.spacing is None else settings.spacing
-    for name, step, most in (
-        ("spacing", spacing, MOST_POINTS),
-        ("grid", settings.grid or spacing, MOST_PLACES),
+    grid = settings.grid or spacing
+    used, room = (np.ptp(prism.box_world, axis=0) for prism in (hall.use, hall.room))
+    along = float(np.sum(np.linalg.norm(np.diff(hall.room.edges, axis=1), axis=2)))
+    walls = (along / grid + 1.0) * (float(room[2]) / grid + 1.0)
+    for name, step, points, most in (
+        ("spacing", spacing, float(np.prod(used / spacing + 1.0)), 4 * MOST_POINTS),
+        ("grid", grid, max(walls, float(np.prod(room[:2] / grid + 1.0))), MOST_PLACES),
     ):
-        box = hall.use.box_world if name == "spacing" else hall.room.box_world
-        if float(np.prod((box[1] - box[0])[:2] / step + 1.0)) > most:
+        if points > most:
             raise InputError(
                 f"--{name} {step:g} gives more than {most} points; choose a larger one"
             )
