@@ -95,7 +95,7 @@ def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
         tracker,
     )
     from magfusion.jobs.antenna_trust import judged
-    from magfusion.jobs.inputs import claim, found_in, named, refuse_failed
+    from magfusion.jobs.inputs import claim, found_in, named, refuse_failed, three_axes
     from magfusion.model.antenna import antenna_from_vector, antenna_of
     from magfusion.results.figures import (
         Figure,
@@ -109,7 +109,7 @@ def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
     from magfusion.results.verdict import trust_figures
 
     claimed, site_path = claim(output, JOB), settings.site
-    declared = site = load_site(site_path)
+    declared = site = three_axes(load_site(site_path), site_path)
     with named(site_path):
         beacon = tracker(site, settings.beacon)
         start = antenna_of(beacon, site.platform.magnetometer)

@@ -63,13 +63,14 @@ def run_calibrate_beacon(settings: BeaconSettings, output: Path, report: Report 
     """
     from magfusion.files.site import load_site, save_site
     from magfusion.files.survey import read_survey
-    from magfusion.jobs.inputs import claim, found_in, named, refuse_failed
+    from magfusion.jobs.inputs import claim, found_in, named, refuse_failed, three_axes
     from magfusion.model.trust import Trust
     from magfusion.results.plots.beacon import write_beacon_plot
     from magfusion.results.report import write_report
 
     claimed, survey_path = claim(output, JOB), settings.survey
-    site, survey = load_site(settings.site), read_survey(survey_path)
+    site = three_axes(load_site(settings.site), settings.site)
+    survey = read_survey(survey_path)
     if survey.phasor_sensor is None:
         raise InputError(
             f"{survey_path}: holds amplitudes, and the calibration of a beacon needs phasors;"

@@ -129,6 +129,7 @@ def _survey_path(path: Path) -> Path | None:
 def _from_survey(settings: MapSettings, path: Path) -> tuple[Site, MapPoints, Figures]:
     from magfusion.files.site import load_site
     from magfusion.files.survey import read_survey
+    from magfusion.jobs.inputs import three_axes
     from magfusion.results.figures import Figures
 
     if settings.trajectory is not None:
@@ -137,7 +138,7 @@ def _from_survey(settings: MapSettings, path: Path) -> tuple[Site, MapPoints, Fi
     site_path = beside if settings.site is None else settings.site
     if settings.site is None and not beside.is_file():
         raise InputError(f"{path}: has no site.yaml beside it; name the site with --site SITE.yaml")
-    site = load_site(site_path)
+    site = three_axes(load_site(site_path), site_path)
     return site, points_of(read_survey(path), site, path), Figures()
 
 

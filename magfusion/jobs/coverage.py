@@ -56,7 +56,7 @@ def run_coverage(settings: CoverageSettings, output: Path) -> Figures:
         Where the site cannot be read, the settings do not fit, or ``output`` is in the way.
     """
     from magfusion.files.site import load_site
-    from magfusion.jobs.inputs import claim
+    from magfusion.jobs.inputs import claim, three_axes
     from magfusion.results.coverage import best_extra_beacon, coverage, usual_box, volume
     from magfusion.results.plots.coverage import write_plot
     from magfusion.results.recording_coverage import write_coverage_recording
@@ -64,7 +64,7 @@ def run_coverage(settings: CoverageSettings, output: Path) -> Figures:
 
     claimed, site_path = claim(output, "coverage"), settings.site
     given = box_option(settings.box)
-    site = load_site(site_path)
+    site = three_axes(load_site(site_path), site_path)
     window = _window(site, site_path, settings.window)
     box = usual_box(site) if given is None else given
     spacing = _spacing(box, settings)

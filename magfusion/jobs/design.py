@@ -142,7 +142,7 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
     from magfusion.files.site import load_site, save_site
     from magfusion.jobs.design_figures import design_figures
     from magfusion.jobs.design_motion import run_motion
-    from magfusion.jobs.inputs import claim
+    from magfusion.jobs.inputs import claim, three_axes
     from magfusion.results.coverage import coverage
     from magfusion.results.design.planning import designed
     from magfusion.results.plots.design import Panel, write_plot
@@ -150,7 +150,7 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
     from magfusion.results.report import write_report
 
     begin = time.monotonic()
-    site = load_site(settings.site)
+    site = three_axes(load_site(settings.site), settings.site)
     hall, spacing = _hall(settings, site)
     if settings.motion is not None:
         return run_motion(settings, site, hall, _points(hall, spacing), output)

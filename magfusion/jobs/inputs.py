@@ -329,15 +329,30 @@ def _check_axes(job: Job, log: Log, site: Site, *, fewer: bool, amplitudes: bool
                 " declare the axes that the receiver has"
             )
     if not fewer:
-        raise InputError(
-            f"{key} this job needs all three axes; of a receiver of fewer, check, demodulate, fix,"
-            " smooth and navigate make what can be known"
-        )
+        three_axes(site, job.declared_path)
     if fields is not None and not fields.signed and not amplitudes:
         raise InputError(
             f"{job.log_path}: amplitudes without sign are located by fix alone; run magfusion fix,"
             " or give phasors (re and im)"
         )
+
+
+def three_axes(site: Site, path: Path) -> Site:
+    """Return a site whose receiver has all three axes.
+
+    Raises
+    ------
+    InputError
+        Where it has fewer.
+    """
+    declared = site.platform.magnetometer.axes
+    if len(declared) < len("xyz"):
+        raise InputError(
+            f"{path}: platform.magnetometer.axes: is [{', '.join(declared)}], and this job needs"
+            " all three axes; of a receiver of fewer check, demodulate, fix, navigate and smooth"
+            " (of one log) make what can be known"
+        )
+    return site
 
 
 def require_imu(job: Job, log: Log, what: str) -> None:

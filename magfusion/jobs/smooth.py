@@ -55,11 +55,18 @@ class SmoothSettings(
     tune: bool = option(
         True, "Find noise and model error from the residuals; what is declared is a prior"
     )
+    free: str | None = option(
+        None, "What nobody measured of a receiver of one axis: gain", metavar="gain"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.earth and self.coupling == "loose":
             raise InputError("--earth needs the phasors themselves; leave --coupling loose out")
+        if self.free not in (None, "gain"):
+            raise InputError(f"--free {self.free!r}: smooth frees gain alone; write --free gain")
+        if self.free and self.more:
+            raise InputError("--free gain is found in one log; smooth the logs one by one")
 
     def smoother(self, job: Job) -> SmootherSettings:
         """Return the settings of the estimator."""
@@ -88,7 +95,8 @@ def run(settings: SmoothSettings, output: Path, report: Report = quiet) -> Figur
 
         parts = settings, smoother, output, report
         return run_joint("smooth", *parts, rate=settings.rates, risk=settings.risks)
-    return run_smooth(job, smoother, rate=settings.rates, risk=settings.risks, report=report)
+    gain, rate, risk = settings.free is not None, settings.rates, settings.risks
+    return run_smooth(job, smoother, rate=rate, risk=risk, free_gain=gain, report=report)
 
 
 def run_smooth(
@@ -97,6 +105,7 @@ def run_smooth(
     *,
     rate: Rate = "field",
     risk: Risk | None = None,
+    free_gain: bool = False,
     report: Report = quiet,
 ) -> Figures:
     """Smooth a log: trajectory, refined site, report and recording.
@@ -108,6 +117,8 @@ def run_smooth(
         sample, or so many a second (Hz).
     risk : Risk, optional
         What the protection levels promise.
+    free_gain : bool
+        Whether the gain of a receiver of one axis is begun where single epochs find it.
 
     Raises
     ------
@@ -124,6 +135,8 @@ def run_smooth(
     claimed = claim(job.output, "smooth", "fix")
     log, site = read_job(job, unknown=True, fewer=True, report=report)
     refuse_rate(job.log_path, log, rate)
+    if free_gain:
+        site = _with_gain(job, log, site, settings)
     began = time.perf_counter()
     try:
         with named(job.log_path):
@@ -146,6 +159,21 @@ def run_smooth(
         write_finished(whole, log, done, rate=rate)
     refuse_failed(job.log_path, output=job.output, trust=done.trust)
     return done.figures
+
+
+def _with_gain(job: Job, log: Log, site: Site, settings: SmootherSettings) -> Site:
+    """Return the site with the gain that the epochs of a receiver of one axis tell."""
+    from magfusion.estimation.demodulation import phasors
+    from magfusion.estimation.snapshot.coil_gain import with_found_gain
+    from magfusion.jobs.inputs import named
+
+    if len(site.platform.magnetometer.axes) != 1:
+        raise InputError(
+            "--free gain: is the one gain of a receiver of one axis; of more axes declare how well"
+            " gains are known as platform.magnetometer.sigma.matrix"
+        )
+    with named(job.log_path):
+        return with_found_gain(phasors(log, site, settings.lockin)[0], site)
 
 
 def _give_back_memory() -> None:

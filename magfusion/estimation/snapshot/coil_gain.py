@@ -1,0 +1,61 @@
+"""The gain of a coil that nobody measured, from single epochs: where a smoother begins."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.errors import EstimationError
+from magfusion.estimation.snapshot.coil_fix import UNKNOWNS, Gain, fix_coil
+from magfusion.estimation.snapshot.coil_starts import CoilEpochs
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+
+ASKED = 60  # epochs, spread over a log
+LEAST = 5  # of them, that determine a gain
+LEAST_SIGMA = 0.01  # of the logarithm; model errors are alike in all epochs
+TO_SIGMA = 1.4826  # of the median deviation
+
+
+def with_found_gain(fields: FieldSamples, site: Site) -> Site:
+    """Return a site whose one axis has the gain that its epochs tell, with how they scatter.
+
+    What is declared of it has no part; the smoother estimates it further, from that prior.
+
+    Parameters
+    ----------
+    fields : FieldSamples
+        Channels in the site's order.
+
+    Raises
+    ------
+    EstimationError
+        Where too few epochs determine a gain.
+    """
+    sensor = site.platform.magnetometer
+    epochs = CoilEpochs.of(fields, site)
+    enough = np.flatnonzero(epochs.told >= UNKNOWNS)
+    log_gain = np.zeros(0)
+    if len(enough):
+        kept = np.zeros(len(epochs), dtype=bool)
+        kept[enough[:: max(1, len(enough) // ASKED)]] = True
+        some = epochs.rows(kept)
+        calibration = initial_calibration(site, float(np.mean(some.time)))
+        found = fix_coil(some, calibration, Gain())
+        size = np.linalg.norm(found.axis_world[:, 0], axis=1)
+        log_gain = np.log(size[found.determined[:, 0]])
+    if len(log_gain) < LEAST:
+        raise EstimationError(
+            f"{len(log_gain)} epochs determine the gain of the coil beside its place and direction,"
+            f" and {LEAST} are needed: add beacons, or declare the gain as magnetometer.matrix"
+        )
+    middle = float(np.median(log_gain))
+    scatter = TO_SIGMA * float(np.median(np.abs(log_gain - middle)))
+    row = "xyz".index(sensor.axes)
+    factor = np.exp(middle) / np.linalg.norm(sensor.matrix[row])
+    matrix, sigma = sensor.matrix.copy(), sensor.sigma.matrix.copy()
+    matrix[row] *= factor
+    sigma[row] *= factor
+    sigma[row, row] = max(scatter, LEAST_SIGMA) * np.exp(middle)
+    known = replace(sensor, matrix=matrix, sigma=replace(sensor.sigma, matrix=sigma))
+    return replace(site, platform=replace(site.platform, magnetometer=known))
