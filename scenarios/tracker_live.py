@@ -97,6 +97,8 @@ class Config:
         Whether there is an IMU; else the site has a motion prior.
     rate_hz : float
         Cycles a second.
+    carrier_hz : float
+        Zero of pulses of direct current.
     """
 
     duration: float = 16.0
@@ -111,6 +113,7 @@ class Config:
     hemisphere: bool = True
     inertial: bool = True
     rate_hz: float = 120.0
+    carrier_hz: float = CARRIER_HZ
     seed: int = 0
 
     @property
@@ -249,15 +252,30 @@ class Head:
         return time, gyro, accel + 1e-3 * white * rng.standard_normal(accel.shape)
 
 
-def waveform(config: Config, head: Head, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return stamps and what the converter gives of three axes (T)."""
-    time = np.arange(int(config.duration * RATE_HZ)) / RATE_HZ
+def sample_times(config: Config) -> Array:
+    """Return the stamps of the converter (s)."""
+    return np.arange(int(config.duration * RATE_HZ)) / RATE_HZ
+
+
+def waveform(
+    config: Config, head: Head, rng: np.random.Generator, gates: Array | None = None
+) -> tuple[Array, Array]:
+    """Return stamps and what the converter gives of three axes (T).
+
+    Parameters
+    ----------
+    gates : ndarray, shape (n, 3), optional
+        Share of its current that each coil has at each sample, where no clock tells.
+    """
+    time = sample_times(config)
     knots = np.arange(0.0, config.duration + 2.0 / FIELD_KNOTS_HZ, 1.0 / FIELD_KNOTS_HZ)
     own_clock = (
         time if config.source_ppm is None else (time - UNKNOWN) * (1 + 1e-6 * config.source_ppm)
     )
     slot = np.floor(own_clock / config.cycle * config.slots + 1e-9).astype(int) % config.slots
-    current = np.exp(2j * np.pi * CARRIER_HZ * own_clock)
+    if gates is None:
+        gates = (slot[:, None] == np.arange(3)).astype(float)
+    current = np.exp(2j * np.pi * config.carrier_hz * own_clock)
     current *= 1.0 - config.drive_drift * time / 60.0
     coarse = np.arange(0.0, config.duration + 2.0 / PLATE_KNOTS_HZ, 1.0 / PLATE_KNOTS_HZ)
     metal = plate_fields(head, coarse)[0] if config.plate else None
@@ -265,7 +283,7 @@ def waveform(config: Config, head: Head, rng: np.random.Generator) -> tuple[Arra
     body = CubicSpline(knots, world_from_body.inv().apply(EARTH_WORLD))(time)
     for axis, former in enumerate(FORMERS):
         coil_world = winding_field(former, axis, head.place(knots))
-        driven = np.where(slot == axis, current, 0.0)[:, None]
+        driven = (gates[:, axis] * current)[:, None]
         own = CubicSpline(knots, world_from_body.inv().apply(coil_world))(time)
         body += driven.real * own
         if metal is not None:
@@ -328,7 +346,7 @@ beacons:
   - name: T
     position_m: [0, 0, 0]
     rpy_deg: [0, 0, 0]
-    frequency_hz: {CARRIER_HZ}
+    frequency_hz: {config.carrier_hz}
     slots: {{duration_s: {config.cycle / config.slots!r}, count: {config.slots}}}
     synchronised: {"true" if config.source_ppm is None else "false"}
     coils:{coils}

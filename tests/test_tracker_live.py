@@ -32,6 +32,7 @@ def test_a_plate_that_is_moved_beside_the_head_is_said_and_the_sigmas_hold() -> 
 @pytest.mark.slow
 def test_the_side_of_the_source_is_found_by_motion_or_said_to_be_ambiguous() -> None:
     found = live.run_without_hemisphere(live.Config(duration=live.RESTING + 2.5, seed=1))
+    assert found.first_s < 5.0
     assert found.wrong == 0.0
     assert found.ambiguous < 1.0
     assert found.mm < 1.5

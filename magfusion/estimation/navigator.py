@@ -16,7 +16,8 @@ from magfusion.estimation.drive_reference import drive_findings
 from magfusion.estimation.ekf import ErrorStateFilter
 from magfusion.estimation.epoch_update import EpochUpdate, Estimator
 from magfusion.estimation.fixed_lag import SlidingWindow
-from magfusion.estimation.initialization.online import NoStart, find_online_start
+from magfusion.estimation.initialization.early import first_try, is_clear, next_try, open_start
+from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
 from magfusion.estimation.input_queue import Arrivals
 from magfusion.estimation.integrity.bank import SubsetBank
 from magfusion.estimation.integrity.freeze import imu_remarks
@@ -104,7 +105,7 @@ class Navigator:
         receiver = Receiver.of(site, self.settings.lockin)
         self._arrived = Arrivals(receiver, site.platform.imu.time_offset)
         self._estimator: Estimator | None = None
-        self._next_start = self.settings.start_duration
+        self._next_start = first_try(self.site, self.settings.start_duration)
         imu = site.platform.imu
         self._white = [imu.gyro_noise, imu.accel_noise]  # what states are carried with
         self._judgement, self._made, self._told = Judgement(), [], deque()
@@ -395,12 +396,18 @@ class Navigator:
             arrived.receiver.marks,
         )
         longest = 4.0 * self.settings.start_duration
+        if self._next_start < self.settings.start_duration and not is_clear(start):
+            if isinstance(start, OnlineStart) and start.ambiguous:
+                self.why_no_start = open_start(start)
+            self._next_start = next_try(self._next_start, self.settings.start_duration)
+            return False
         if isinstance(start, NoStart):
             self.why_no_start = start
             self._next_start *= 2.0 if start.trust.findings else 1.5
             arrived.forget_before_start(longest)
             return False
         if start.ambiguous and self._next_start < longest:
+            self.why_no_start = open_start(start)
             self._next_start += 0.5 * self.settings.start_duration
             return False
         imu, _ = measured_noise(arrived.inertial_samples(), self.site.platform.imu)

@@ -223,7 +223,9 @@ def _last(time: Array) -> float:
 def _waiting(navigator: Navigator, time: float) -> dict[str, Any]:
     """Return a sign of life before the first state, with the reason why a start was refused."""
     nothing: dict[str, Any] = {"time": time, "started": False, "lost": False, "verdict": None}
-    return nothing | {"reasons": _said(navigator.why_no_start.trust.reasons), "ambiguous": None}
+    reasons = navigator.why_no_start.trust.reasons
+    open_ = True if any(reason.code == "ambiguous" for reason in reasons) else None
+    return nothing | {"reasons": _said(reasons), "ambiguous": open_}
 
 
 def _said(findings: tuple[Finding, ...]) -> list[dict[str, str]]:

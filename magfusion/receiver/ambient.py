@@ -16,7 +16,7 @@ Removal = Literal["none", "subtract", "interpolate", "state"]
 LEAST_TURNS = (
     1.2  # of an alias of the mains in the span of the state, which distinguishes it from a ramp
 )
-STATE_CYCLES = 8
+HARMONICS = (1, 3, 5)  # of the mains, which are symmetric
 LEAST_TOLD = 0.2  # of a column of ones; a design whose least direction is shorter tells no mains
 FARTHEST, FARTHEST_BURSTS = 1.0, 16.0  # s, or lengths: what is farther off says nothing
 STRETCH = 4  # at most so many times longer a state, where that separates them
@@ -152,7 +152,8 @@ def uneven_weights(
     """Return from which silent bursts, that follow no clock, the ambient field is taken.
 
     The state of `ambient_weights` by the times and lengths of the bursts: a constant, a ramp and,
-    as soon as enough of the nearest tell them from these, the mains.
+    as soon as enough of the nearest tell them from these, the mains with their odd harmonics, or
+    without.
 
     Parameters
     ----------
@@ -172,17 +173,21 @@ def uneven_weights(
     """
     if len(silent) == 0 or len(driven) == 0:
         return ambient_weights(np.arange(len(driven)), np.zeros(0, dtype=np.int64), 1, "state")
-    index, weight = _uneven(driven, driven_length, silent, silent_length, number, 0.0)[:2]
+    index, weight = _uneven(driven, driven_length, silent, silent_length, number, ())[:2]
     left = np.arange(len(driven) if mains_hz else 0)
-    while len(left) and number <= STRETCH * STATE_CYCLES:
-        wider, better, told = _uneven(
-            driven[left], driven_length[left], silent, silent_length, number, mains_hz
-        )
-        spare = wider.shape[1] - index.shape[1]
-        index = np.pad(index, ((0, 0), (0, spare)))
-        weight = np.pad(weight, ((0, 0), (0, spare)))
-        index[left[told]], weight[left[told]] = wider[told], better[told]
-        left, number = left[~told], 2 * number
+    for orders in (HARMONICS, HARMONICS[:1]):
+        lines_hz = tuple(order * mains_hz for order in orders)
+        for wide in (number, 2 * number, STRETCH * number):
+            if len(left) == 0:
+                break
+            own = (driven[left], driven_length[left])
+            wider, better, told = _uneven(*own, silent, silent_length, wide, lines_hz)
+            spare = ((0, 0), (0, max(wider.shape[1] - index.shape[1], 0)))
+            index, weight = np.pad(index, spare), np.pad(weight, spare)
+            rows, width = left[told], wider.shape[1]
+            index[rows], weight[rows] = 0, 0.0
+            index[rows, :width], weight[rows, :width] = wider[told], better[told]
+            left = left[~told]
     return index, weight
 
 
@@ -192,7 +197,7 @@ def _uneven(
     silent: Array,
     silent_length: Array,
     number: int,
-    mains_hz: float,
+    lines_hz: tuple[float, ...],
 ) -> tuple[IntArray, Array, BoolArray]:
     """Return index and weights of one design, and where it tells its columns apart."""
     number = min(number, len(silent))
@@ -204,12 +209,12 @@ def _uneven(
     ramp = np.where(np.sum(near, axis=1, keepdims=True) > 1, elapsed / np.maximum(span, 1e-9), 0.0)
     columns = [np.ones_like(elapsed), ramp]
     wanted = [np.ones(len(driven)), np.zeros(len(driven))]
-    if mains_hz:
+    for line_hz in lines_hz:
         # A burst averages the mains, each by its own length.
-        share = np.sinc(mains_hz * silent_length)[index]
-        angle = 2.0 * np.pi * mains_hz * elapsed
+        share = np.sinc(line_hz * silent_length)[index]
+        angle = 2.0 * np.pi * line_hz * elapsed
         columns += [share * np.cos(angle), share * np.sin(angle)]
-        wanted += [np.sinc(mains_hz * driven_length), np.zeros(len(driven))]
+        wanted += [np.sinc(line_hz * driven_length), np.zeros(len(driven))]
     design = np.stack(columns, axis=-1) * near[..., None]
     inverse = np.linalg.pinv(design, rcond=1e-6)
     weight = np.einsum("nc,nck->nk", np.stack(wanted, axis=1), inverse)

@@ -1,5 +1,7 @@
 """The receiver of coils that a host drives one after the other, and says when: marked bursts."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from magfusion.errors import InputError
@@ -10,6 +12,7 @@ from magfusion.receiver.admission import Grid, Windows, sample_rate_hz
 from magfusion.receiver.cycles import cycles
 from magfusion.receiver.marked_bursts import LATE, LONGEST_BURST, Bursts
 from magfusion.receiver.receiver import LEAST_SHARE_OF_SLOT, SlotReceiver
+from magfusion.receiver.slot_phasors import SlotValues
 from magfusion.receiver.slots import (
     LEAST_CYCLES,
     LEAST_SAMPLES,
@@ -151,6 +154,18 @@ class MarkedReceiver(SlotReceiver):
 
     def _joined(self, found: FieldSamples, number: IntArray, turn: Turn) -> FieldSamples:
         return cycles(found, turn, self.site, self.bursts.epochs(number))
+
+    def _held(self, waveform: Waveform, turn: Turn, windows: Windows, site: Site) -> SlotValues:
+        """Fit bursts from their first sample to the last.
+
+        A taper askew of the samples leaks of the carrier into the noise beside it.
+        """
+        assert self.admission is not None
+        begin = waveform.time[windows.first]
+        last = waveform.time[windows.first + windows.count - 1]
+        length = last - begin + self.admission.magnetometer_step
+        fitted = replace(windows, centre=begin + 0.5 * length, length=length)
+        return super()._held(waveform, turn, fitted, site)
 
     def _driven(self, windows: Windows) -> BoolArray:
         return np.asarray(owners(self.site, places(self.site))[windows.place] >= 0)

@@ -117,7 +117,7 @@ class Bursts:
         return self._epoch[number - self.first]
 
     def last(self, until: float, next_number: int) -> int:
-        """Return the number of the last burst that is complete at a time (s), and its epoch.
+        """Return the number of the last burst whose epoch is complete at a time (s).
 
         Parameters
         ----------
@@ -129,7 +129,10 @@ class Bursts:
         full = len(self._taken) == len(self._slots)
         closed = (self._epoch[own] < self._newest) | full | (self.marks.slot[own] == SILENT)
         waiting = np.flatnonzero(~closed | (self.marks.end[own] > until))
-        return self.first + begin + (int(waiting[0]) if len(waiting) else len(closed)) - 1
+        if len(waiting) == 0:
+            return self.first + len(self) - 1
+        epoch = int(np.searchsorted(self._epoch, self._epoch[begin + waiting[0]]))
+        return self.first + max(epoch, begin) - 1
 
     def since(self, time: float) -> int:
         """Return the number of the first burst that begins at a time (s) or later."""

@@ -121,7 +121,9 @@ def slot_values(
     own_carrier = carrier[windows.place]
     inside = _inside(time, still, own, rate_hz)
     sums = _slot_sums(inside, own_carrier, settings)
-    noise = _noise(inside, own_carrier, windows.length, rate_hz)
+    # Of lengths that happen, the Earth's field leaks into what is beside the carrier.
+    beside = _centred(inside, own.count) if is_marked(site) else inside
+    noise = _noise(beside, own_carrier, windows.length, rate_hz)
     turn = measured_from_still(sums.time)
     return SlotValues(
         windows.number,
@@ -246,6 +248,12 @@ def _inside(time: Array, still: Array, windows: Windows, rate_hz: float) -> _Ins
     elapsed = at - slot_begin[owner]
     hann = 1.0 - np.cos(2.0 * np.pi * (elapsed + 0.5 / rate_hz) / windows.length[owner])
     return _Inside(owner, begins, at, elapsed, still[sample], hann, slot_begin)
+
+
+def _centred(inside: _Inside, count: IntArray) -> _Inside:
+    """Return the samples of each slot without their mean."""
+    mean = np.add.reduceat(inside.still, inside.begins, axis=0) / count[:, None]
+    return replace(inside, still=inside.still - mean[inside.owner])
 
 
 def _slot_sums(inside: _Inside, carrier_hz: Array, settings: SlotSettings) -> _Sums:
