@@ -5,15 +5,57 @@ from dataclasses import replace
 
 import numpy as np
 
+from magfusion.errors import InputError
 from magfusion.model.channel_effects import driven
 from magfusion.model.drive import LEAST_ON, DriveSamples, DriveShares
-from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.samples import FieldSamples, Log, RotorAngles
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.drive import DriveReceiver
 from magfusion.receiver.sampling_clock import sampling_clock
 
 FAR = 3.0  # times the declared current; more is a mistake of its unit
+
+
+def cosines(rotation: RotorAngles) -> DriveSamples:
+    """Return angles of shafts as the currents that stand for them: one ampere at its peak."""
+    own = {name: np.cos(angle) for name, angle in rotation.angle.items()}
+    return DriveSamples(rotation.time, own)
+
+
+def turning_currents(log: Log, site: Site) -> Log:
+    """Return a log in which an encoder's angle is a current: its cosine, of one ampere.
+
+    What is said of currents holds for it: phasors are referred to it, and the speed may drift
+    within the lock-in's width.
+
+    Raises
+    ------
+    InputError
+        Where an angle is of no rotor of the site, or one with harmonics, of which it is no current.
+    """
+    if log.rotation is None:
+        return log
+    rotors = {beacon.name: beacon for beacon in site.beacons if beacon.rotor is not None}
+    for name in log.rotation.angle:
+        if name not in rotors:
+            raise InputError(
+                f"rotor_{name}: the site has no rotor of this name; describe beacon {name} with"
+                " rotor, or leave the column out"
+            )
+        if len(rotors[name].tones) > 1:
+            raise InputError(
+                f"rotor_{name}: the angle of a rotor with harmonics is used by magfusion range"
+                " alone; leave harmonics out of the site"
+            )
+    turned, known = cosines(log.rotation), log.drive
+    if known is not None:
+        if not np.array_equal(known.time, turned.time):
+            raise InputError(
+                "magnetometer: currents and angles are missing at different samples; give both"
+            )
+        turned = DriveSamples(turned.time, dict(known.current) | dict(turned.current))
+    return replace(log, drive=turned, rotation=None)
 
 
 def with_drives(log: Log, site: Site) -> tuple[Log, Site]:

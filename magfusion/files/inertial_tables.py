@@ -10,8 +10,10 @@ from magfusion.errors import InputError
 from magfusion.files.drive_columns import columns_beside
 from magfusion.files.lost_rows import LostRows
 from magfusion.files.plausible import check_field, check_imu
+from magfusion.files.rotor_columns import angles_beside
 from magfusion.files.table import TIME, Layout, Span, Table, read_table, write_table
 from magfusion.model.drive import DriveSamples
+from magfusion.model.rotor import RotorAngles
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
@@ -109,13 +111,18 @@ def _measured(
 
 
 def write_waveform(
-    waveform: Waveform, path: Path, epoch_ns: int, drive: DriveSamples | None = None
+    waveform: Waveform,
+    path: Path,
+    epoch_ns: int,
+    drive: DriveSamples | None = None,
+    rotation: RotorAngles | None = None,
 ) -> None:
-    """Write magnetometer samples, and the currents beside them, as Parquet."""
+    """Write magnetometer samples, and currents and angles beside them, as Parquet."""
     columns: dict[str, object] = {TIME: Span(epoch_ns).stamps(waveform.time)}
     values = dict(zip(_FIELD, waveform.measured_sensor.T, strict=True))
     columns |= {name: value for name, value in values.items() if name[-1] in waveform.axes}
     columns |= {} if drive is None else columns_beside(drive, waveform)
+    columns |= {} if rotation is None else angles_beside(rotation, waveform)
     write_table(columns, path)
 
 

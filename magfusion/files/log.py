@@ -10,6 +10,7 @@ from pydantic import Field
 
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_directory
+from magfusion.files.depth_table import read_depths, write_depths
 from magfusion.files.drive_columns import read_drive
 from magfusion.files.fields import read_fields, write_fields
 from magfusion.files.inertial_tables import (
@@ -20,6 +21,7 @@ from magfusion.files.inertial_tables import (
     write_waveform,
 )
 from magfusion.files.marks_table import read_marks, write_marks
+from magfusion.files.rotor_columns import read_rotation
 from magfusion.files.table import LARGEST_TIME_NS, Span, find_table
 from magfusion.files.temperature_table import read_temperatures, write_temperatures
 from magfusion.files.trajectory_table import read_trajectory, write_trajectory
@@ -30,7 +32,7 @@ from magfusion.model.trust import Finding
 
 HEADER = "log.yaml"
 _NOTHING: tuple[Finding, ...] = ()
-STREAMS = ("imu", "magnetometer", "fields", "truth", "temperature", "marks", "reference")
+STREAMS = ("imu", "magnetometer", "fields", "truth", "temperature", "marks", "reference", "depth")
 
 
 class LogHeader(StrictModel):
@@ -100,6 +102,8 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
         temperatures=read_temperatures(tables["temperature"], header.epoch_ns),
         drive=read_drive(tables["magnetometer"], span),
         reference=read_waveform(tables["reference"], span)[0],
+        rotation=read_rotation(tables["magnetometer"], span),
+        depths=read_depths(tables["depth"], header.epoch_ns),
     )
     if log.waveform is None and log.fields is None:
         raise InputError(f"{path}: holds no field {span}; choose a span that the log covers.")
@@ -127,7 +131,7 @@ def write_log(log: Log, path: Path) -> None:
             write_imu(log.imu, unfinished / "imu.parquet", log.epoch_ns)
         if log.waveform is not None:
             table = unfinished / "magnetometer.parquet"
-            write_waveform(log.waveform, table, log.epoch_ns, log.drive)
+            write_waveform(log.waveform, table, log.epoch_ns, log.drive, log.rotation)
             if log.waveform.marks is not None:
                 write_marks(log.waveform.marks, unfinished / "marks.parquet", log.epoch_ns)
         if log.fields is not None:
@@ -139,6 +143,8 @@ def write_log(log: Log, path: Path) -> None:
         if log.temperatures is not None and log.temperatures.readings:
             known = log.temperatures
             write_temperatures(known, unfinished / "temperature.parquet", log.epoch_ns)
+        if log.depths is not None and log.depths.readings:
+            write_depths(log.depths, unfinished / "depth.parquet", log.epoch_ns)
 
 
 def _keep_others(former: Path, directory: Path) -> None:

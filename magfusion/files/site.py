@@ -11,11 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.field_map import read_field_maps, write_field_maps
+from magfusion.files.site_casing import casing_entry
 from magfusion.files.site_correlation import load_correlation, save_correlation
 from magfusion.files.site_ground import ground_entry, log_sigma
 from magfusion.files.site_motion import MILLION, MotionEntry, imu_entry, prior_entry
 from magfusion.files.site_region import region_entry
 from magfusion.files.site_response import response_entry, response_of
+from magfusion.files.site_rotor import rotor_entry
 from magfusion.files.site_schema import (
     MARKED,
     BeaconEntry,
@@ -45,6 +47,7 @@ from magfusion.model.site import (
     Platform,
     Site,
     Slots,
+    rotor_coils,
 )
 from magfusion.model.without_imu import as_declared
 from magfusion.units import DEGREE, Array
@@ -198,7 +201,7 @@ def _is_reference(field_world: Array, location: Location) -> bool:
 
 
 def _beacon(entry: BeaconEntry) -> Beacon:
-    sigma = entry.sigma
+    sigma, rotor = entry.sigma, None if entry.rotor is None else entry.rotor.rotor()
     return Beacon(
         name=entry.name,
         position_world=np.full(3, np.nan) if entry.position_m is None else entry.position_m,
@@ -207,7 +210,10 @@ def _beacon(entry: BeaconEntry) -> Beacon:
         else _matrix(entry.rpy_deg),
         unknown=entry.unknown,
         frequency_hz=entry.frequency_hz,
-        coils=tuple(coil.coil() for coil in entry.coils),
+        coils=tuple(coil.coil() for coil in entry.coils or [])
+        if rotor is None
+        else rotor_coils(rotor, entry.frequency_hz),
+        rotor=rotor,
         synchronised=entry.synchronised,
         slots=_slots(entry.slots),
         model_error=entry.model_error,
@@ -217,7 +223,7 @@ def _beacon(entry: BeaconEntry) -> Beacon:
         sigma=BeaconSigma(
             position_world=sigma.position_m,
             rotation_beacon=sigma.rotation_deg * DEGREE,
-            log_moment=np.broadcast_to(sigma.log_moment, len(entry.coils)).copy(),
+            log_moment=np.broadcast_to(sigma.log_moment, entry.coil_count).copy(),
         ),
     )
 
@@ -235,6 +241,7 @@ def _magnetometer(entry: MagnetometerEntry) -> Magnetometer:
         coil_kappa=entry.coil_kappa_m2,
         warming=None if entry.warming is None else entry.warming.warming(),
         response=response_of(entry.response),
+        casing=None if entry.casing is None else entry.casing.casing(),
         axes="".join(sorted(set(entry.axes or Magnetometer.axes))),
     )
 
@@ -330,7 +337,7 @@ def _beacon_entry(beacon: Beacon) -> dict[str, Any]:
         "name": beacon.name,
         **place,
         "frequency_hz": float(beacon.frequency_hz),
-        "coils": [_coil_entry(c) for c in beacon.coils],
+        **_source_entry(beacon),
         **_slots_entry(beacon),
         "synchronised": bool(beacon.synchronised),
         **_noise_entry(beacon),
@@ -340,6 +347,14 @@ def _beacon_entry(beacon: Beacon) -> dict[str, Any]:
             "log_moment": _sigma_entry(beacon.sigma.log_moment),
         },
     }
+
+
+def _source_entry(beacon: Beacon) -> dict[str, Any]:
+    if beacon.rotor is None:
+        return {"coils": [_coil_entry(c) for c in beacon.coils]}
+    size = np.linalg.norm(beacon.moments_beacon, axis=1)[:2]
+    declared = np.linalg.norm(beacon.rotor.turning_moments, axis=1)
+    return rotor_entry(beacon.rotor, float(np.mean(np.log(size / declared))))
 
 
 def _noise_entry(beacon: Beacon) -> dict[str, Any]:
@@ -396,6 +411,7 @@ def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
         own
         | warming_entry(magnetometer.warming)
         | response_entry(magnetometer.response)
+        | casing_entry(magnetometer.casing)
         | {
             "body_from_sensor": {
                 "position_m": _plain(magnetometer.position_body),

@@ -13,9 +13,11 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticKnownError
 
+from magfusion.files.site_casing import CasingEntry
 from magfusion.files.site_motion import ImuEntry, MotionEntry, MotionPriorEntry
 from magfusion.files.site_region import RegionEntry
 from magfusion.files.site_response import ResponseEntry, check_response
+from magfusion.files.site_rotor import RotorEntry
 from magfusion.files.site_values import (
     HIGHEST_FREQUENCY,
     LARGEST_ANGLE,
@@ -268,7 +270,8 @@ class BeaconEntry(StrictModel):
     unknown: Literal["pose", "position", "attitude"] | None = None
     slots: Annotated[SlotsEntry | Literal["marked"], PlainValidator(_slots)] | None = None
     frequency_hz: Annotated[float, AfterValidator(_direct_current_only_in_slots)]
-    coils: Annotated[list[CoilEntry], at_least_one("coil")]
+    coils: Annotated[list[CoilEntry], at_least_one("coil")] | None = None
+    rotor: RotorEntry | None = None
     synchronised: bool = True
     model_error: _Share | None = None
     noise_factor: _Positive = Beacon.noise_factor
@@ -289,12 +292,37 @@ class BeaconEntry(StrictModel):
         return self
 
     @model_validator(mode="after")
+    def _coils_or_a_rotor(self) -> Self:
+        if self.coils is None and self.rotor is None:
+            detail = InitErrorDetails(type="missing", loc=("coils",), input=None)
+            raise ValidationError.from_exception_data("site", [detail])
+        if self.rotor is not None and (self.coils is not None or self.slots is not None):
+            key = "slots" if self.coils is None else "coils"
+            raise refusal_at((key,), "given", "remove it or rotor, which is a source of its own")
+        return self
+
+    @property
+    def tones_hz(self) -> list[float]:
+        """Frequencies that it sends."""
+        if self.rotor is not None:
+            orders = [1, *(h.order for h in self.rotor.harmonics)]
+            return [order * self.frequency_hz for order in orders]
+        return [c.frequency_hz or self.frequency_hz for c in self.coils or []]
+
+    @property
+    def coil_count(self) -> int:
+        """Coils of it, or that stand for its rotor."""
+        if self.rotor is not None:
+            return 2 + len(self.rotor.harmonics)
+        return len(self.coils or [])
+
+    @model_validator(mode="after")
     def _coils_fit_the_slots(self) -> Self:
         if self.slots is None:
             return self
         if not isinstance(self.slots, SlotsEntry):
             return self._coils_are_marked()
-        for i, coil in enumerate(self.coils):
+        for i, coil in enumerate(self.coils or []):
             if coil.slot is None or coil.slot >= self.slots.count:
                 remedy = f"give one of the beacon's {self.slots.count} slots, counted from 0"
                 raise refusal_at(("coils", i, "slot"), coil.slot, remedy)
@@ -308,7 +336,7 @@ class BeaconEntry(StrictModel):
 
     def _coils_are_marked(self) -> Self:
         """See that marks name every coil, and that they leave the sign of pulses no doubt."""
-        for i, coil in enumerate(self.coils):
+        for i, coil in enumerate(self.coils or []):
             if coil.slot is None or coil.slot >= MOST_SLOTS:
                 raise refusal_at(("coils", i, "slot"), coil.slot, "give the number in the marks")
             if not self.synchronised and not (coil.frequency_hz or self.frequency_hz):
@@ -319,17 +347,18 @@ class BeaconEntry(StrictModel):
     def _slots_tell(self) -> bool:
         """Return whether a stream can tell when a cycle begins."""
         assert isinstance(self.slots, SlotsEntry)
-        driven = {coil.slot for coil in self.coils}
+        driven = {coil.slot for coil in self.coils or []}
         count = self.slots.count
         turned = (
             {(slot + k) % count for slot in driven if slot is not None} for k in range(1, count)
         )
-        carrier = all((coil.frequency_hz or self.frequency_hz) > 0.0 for coil in self.coils)
+        coils = self.coils or []
+        carrier = all((coil.frequency_hz or self.frequency_hz) > 0.0 for coil in coils)
         return carrier and len(driven) < count and all(other != driven for other in turned)
 
     @model_validator(mode="after")
     def _one_sigma_per_coil(self) -> Self:
-        found, coils = self.sigma.log_moment, len(self.coils)
+        found, coils = self.sigma.log_moment, self.coil_count
         if found.ndim and len(found) != coils:
             remedy = f"give one number or a list of {coils}, one per coil"
             raise refusal_at(("sigma", "log_moment"), found.tolist(), remedy)
@@ -374,6 +403,7 @@ class MagnetometerEntry(StrictModel):
     offset_walk_t: Annotated[_NotNegative, tesla(LARGEST_OFFSET)] = 2e-8  # gained in an hour
     warming: SensorWarmingEntry | None = None
     response: Annotated[list[ResponseEntry], at_least_one("frequency")] | None = None
+    casing: CasingEntry | None = None
     axes: Annotated[list[Literal["x", "y", "z"]], Field(min_length=1, max_length=3)] | None = None
     sigma: MagnetometerSigmaEntry = Field(default_factory=MagnetometerSigmaEntry)
 
@@ -410,7 +440,7 @@ class SiteEntry(StrictModel):
     def _response_to_all_tones(self) -> Self:
         response = self.platform.magnetometer.response
         if response is not None:
-            tones = [c.frequency_hz or b.frequency_hz for b in self.beacons for c in b.coils]
+            tones = [f for b in self.beacons for f in b.tones_hz]
             check_response(response, np.array(tones))
         return self
 

@@ -51,6 +51,10 @@ JOBS = {
         "survey",
         "Make a fingerprint survey of a log: the fields at places with known poses.",
     ),
+    "range": (
+        "range_wells",
+        "Range one well from another by a turning magnet: distance, direction, along the hole.",
+    ),
     "match": (
         "match",
         "Find roll, or roll and pitch, from the Earth's field, by a database or in closed form.",

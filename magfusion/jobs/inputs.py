@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.drive_reference import with_drives
+from magfusion.estimation.drive_reference import turning_currents, with_drives
 from magfusion.estimation.integrity.mending import mended
 from magfusion.estimation.warming import at_reference
 from magfusion.files.atomic import (
@@ -111,6 +111,7 @@ _WRITTEN = {
     "calibrate attitude-database": {"attitudes.parquet", "attitudes.png", "report.json"},
     "allan": _SITE | {"allan.png", "report.json", FAILED},
     "check": {"check.png", "report.json", FAILED},
+    "range": {"range.parquet", "report.json", FAILED},
     "match": {"attitude.parquet", "attitude.png", "report.json"},
     "coverage": {"coverage.parquet", "coverage.png", "run.rrd", "report.json"},
     "design": _SITE
@@ -253,6 +254,7 @@ def read_job(
     fewer: bool = False,
     amplitudes: bool = False,
     reference: bool = False,
+    rotor: bool = False,
     report: Report = quiet,
 ) -> tuple[Log, Site]:
     """Read the log and the site of a job, and see that they belong together.
@@ -269,6 +271,8 @@ def read_job(
         Whether it can do with amplitudes that have no sign.
     reference : bool
         Whether it uses a reference sensor; that it does not is said.
+    rotor : bool
+        Whether it takes the angle of a rotor and a casing itself.
 
     Raises
     ------
@@ -278,6 +282,11 @@ def read_job(
     site = read_site(job, unknown=unknown, without=without)
     log = _open(job, report)
     _check_axes(job, log, site, fewer=fewer, amplitudes=amplitudes)
+    if site.platform.magnetometer.casing is not None and not rotor:
+        raise InputError(
+            f"{job.declared_path}: platform.magnetometer.casing: through steel a sensor is ranged"
+            " by magfusion range alone; leave it out for other commands"
+        )
     log, site = logged(log, site)
     if log.inertial and site.platform.imu == NO_IMU:
         raise InputError(
@@ -293,6 +302,8 @@ def read_job(
         with named(job.log_path):
             log = replace(log, fields=order_channels(log.fields, site))
     with named(job.log_path):
+        if not rotor:
+            log = turning_currents(log, site)
         log, site = with_drives(log, site)
     if log.reference is not None and not reference:
         log = replace(log, reference=None, noticed=(*log.noticed, NOT_USED))

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from magfusion.estimation.navigator import Navigator
     from magfusion.files.long_log import LongLog
     from magfusion.files.stream import Format
+    from magfusion.model.drive import DriveSamples
     from magfusion.model.marks import Marks
     from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
 
@@ -159,6 +160,16 @@ def _of_long(log: LongLog) -> Iterator[tuple[int, Piece]]:
         k, row = k + 1, due
 
 
+def _currents(log: Log | LongLog) -> DriveSamples | None:
+    """Return the currents of coils, or those that stand for the angles of rotors."""
+    from magfusion.estimation.drive_reference import cosines
+    from magfusion.files.long_log import LongLog
+
+    if isinstance(log, LongLog) or log.drive is not None or log.rotation is None:
+        return None if isinstance(log, LongLog) else log.drive
+    return cosines(log.rotation)
+
+
 def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool) -> None:
     """Write a log as the records of a stream, in the order of their arrival."""
     from magfusion.files.long_log import LongLog
@@ -176,7 +187,7 @@ def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool)
     pieces = _of_long(log) if isinstance(log, LongLog) else Replay(log).pieces()
     degrees = log.temperatures or Temperatures()
     readings = deque(sorted(degrees.each()))
-    currents = None if isinstance(log, LongLog) else log.drive
+    currents = _currents(log)
     for _, piece in paced(pieces, realtime):
         while readings and readings[0][0] < piece.arrival:
             write_record(temperature_content(*readings.popleft()), sink, form)

@@ -7,6 +7,8 @@ import numpy as np
 
 from magfusion.model.drive import DriveSamples
 from magfusion.model.marks import Marks
+from magfusion.model.rotor import Depths as Depths
+from magfusion.model.rotor import RotorAngles as RotorAngles
 from magfusion.model.temperature import Temperatures
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
@@ -242,7 +244,8 @@ class Log:
     samples of the IMU are those of a motion prior (`magfusion.model.without_imu`), and measured
     nothing.  ``temperatures`` are those of whatever the samples are not yet freed of,
     ``drive`` is what was recorded of the currents of coils beside the waveform, ``reference`` the
-    samples of a second magnetometer that stands elsewhere, by its own stamps.
+    samples of a second magnetometer that stands elsewhere, by its own stamps,
+    ``rotation`` the angles of rotors.  ``depths`` are those of wells, for ranging.
     """
 
     name: str
@@ -259,6 +262,8 @@ class Log:
     temperatures: Temperatures | None = None
     drive: DriveSamples | None = None
     reference: Waveform | None = None
+    rotation: RotorAngles | None = None
+    depths: Depths | None = None
 
     @property
     def vectors(self) -> Waveform | None:

@@ -10,11 +10,13 @@ import numpy as np
 from magfusion.model.correlation import Correlation
 from magfusion.model.drive import DriveShares
 from magfusion.model.field_map import FieldMap
+from magfusion.model.physics.casing import Casing
 from magfusion.model.platform_motion import A_HAND, MotionPrior, Replaced
 from magfusion.model.platform_motion import ImuModel as ImuModel
 from magfusion.model.platform_motion import MotionModel as MotionModel
 from magfusion.model.region import Bounds, Region, bounds_of
 from magfusion.model.response import FrequencyResponse
+from magfusion.model.rotor import Rotor as Rotor
 from magfusion.model.temperature import SensorWarming, Temperatures, Warming
 from magfusion.units import Array, ComplexArray, IntArray
 
@@ -93,6 +95,19 @@ class MarkedSlots:
     """
 
 
+def rotor_coils(rotor: Rotor, frequency_hz: float) -> tuple[Coil, ...]:
+    """Return the coils that stand for a magnet on a shaft that turns at a frequency.
+
+    Their current is one, of which the cosine of a measured angle is the record.
+    """
+    cosine, sine = rotor.turning_moments
+    turning = (Coil(cosine, current=1.0), Coil(sine, -np.pi / 2.0, current=1.0))
+    return turning + tuple(
+        Coil(one.moment_beacon, one.phase, frequency_hz=one.order * frequency_hz, current=1.0)
+        for one in rotor.harmonics
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class BeaconSigma:
     """Prior standard deviations of a beacon's calibration; zero means known.
@@ -142,6 +157,8 @@ class Beacon:
     conductivity : float
         Of the ground or water that it and the magnetometer are in (S/m), the same in all
         directions and without end; one for all beacons of a site.
+    rotor : Rotor, optional
+        Of which its coils are made, where it is a magnet on a shaft.
     """
 
     name: str
@@ -159,6 +176,7 @@ class Beacon:
     hemisphere_beacon: Array | None = None
     warming: Warming | None = None
     conductivity: float = 0.0
+    rotor: Rotor | None = None
 
     @cached_property
     def tones(self) -> tuple[tuple[float, int | None], ...]:
@@ -283,6 +301,8 @@ class Magnetometer:
         To fields that are not steady; None where they are measured as steady ones are.
     axes : str
         Letters of the axes that it has.
+    casing : Casing, optional
+        Steel tube that it is in.
     """
 
     position_body: Array
@@ -297,6 +317,7 @@ class Magnetometer:
     warming: SensorWarming | None = None
     response: FrequencyResponse | None = None
     axes: str = "xyz"
+    casing: Casing | None = None
 
     @property
     def lacking(self) -> tuple[int, ...]:

@@ -137,28 +137,66 @@ def _on_grid(
     layers: Layers,
 ) -> ComplexArray:
     """Return what the ground adds, shape (x, y, z, 3)."""
-    empymod = _empymod()
     x, y = np.meshgrid(nodes[0], nodes[1], indexing="ij")
+    planes = [
+        _in_plane(x.ravel(), y.ravel(), float(z), centre_world, moment_world, frequency_hz, layers)
+        for z in nodes[2]
+    ]
+    out = np.stack([plane.reshape(*x.shape, 3) for plane in planes], axis=2)
+    grid = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1)
+    return out - dipole_field(grid - centre_world, moment_world)
+
+
+def layered_effect_at(
+    centre_world: Array,
+    moment_world: Array,
+    frequency_hz: float,
+    point_world: Array,
+    layers: Layers,
+) -> ComplexArray:
+    """Return what layered ground adds to a dipole's field at points of one height, shape (n, 3).
+
+    Parameters
+    ----------
+    point_world : ndarray, shape (n, 3)
+        (m); the height is that of the first.
+    """
+    x, y = point_world[:, 0], point_world[:, 1]
+    height = float(point_world[0, 2])
+    point_world = np.column_stack([x, y, np.full(len(x), height)])
+    whole = _in_plane(x, y, height, centre_world, moment_world, frequency_hz, layers)
+    return whole - dipole_field(point_world - centre_world, moment_world)
+
+
+def _in_plane(
+    x: Array,
+    y: Array,
+    height: float,
+    centre_world: Array,
+    moment_world: Array,
+    frequency_hz: float,
+    layers: Layers,
+) -> ComplexArray:
+    """Return the field of a dipole in layers at points of one height, shape (n, 3) (T)."""
+    empymod = _empymod()
     size = float(np.linalg.norm(moment_world))
     azimuth = np.degrees(np.arctan2(moment_world[1], moment_world[0]))
     dip = np.degrees(np.arcsin(moment_world[2] / size))
     to_tesla = 2j * np.pi * frequency_hz * (4.0 * np.pi * MU0_OVER_4PI) ** 2 * size
-    out = np.empty((*x.shape, len(nodes[2]), 3), dtype=np.complex128)
-    for k, z in enumerate(nodes[2]):
-        for axis, angles in enumerate(((0.0, 0.0), (90.0, 0.0), (0.0, 90.0))):
-            out[:, :, k, axis] = to_tesla * empymod.bipole(
-                [*centre_world, azimuth, dip],
-                [x.ravel(), y.ravel(), z, *angles],
-                depth=[*layers.top, -np.inf],  # axes with z up
-                res=[1.0 / AIR, *(1.0 / c for c in layers.conductivity)],
-                freqtime=frequency_hz,
-                epermH=[0.0] * (1 + len(layers.top)),  # no displacement currents
-                msrc=True,
-                mrec=True,
-                verb=0,
-            ).reshape(x.shape)
-    grid = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1)
-    return out - dipole_field(grid - centre_world, moment_world)
+    out = np.empty((len(x), 3), dtype=np.complex128)
+    for axis, angles in enumerate(((0.0, 0.0), (90.0, 0.0), (0.0, 90.0))):
+        out[:, axis] = to_tesla * empymod.bipole(
+            [*centre_world, azimuth, dip],
+            [x, y, height, *angles],
+            depth=[*layers.top, -np.inf],  # axes with z up
+            res=[1.0 / AIR, *(1.0 / c for c in layers.conductivity)],
+            freqtime=frequency_hz,
+            epermH=[0.0] * (1 + len(layers.top)),  # no displacement currents
+            msrc=True,
+            mrec=True,
+            verb=0,
+        )
+    return out
 
 
 def _interpolated(nodes: tuple[Array, ...], values: ComplexArray, point: Array) -> ComplexArray:

@@ -1,0 +1,217 @@
+"""The job that ranges one well from another, by a magnet that turns in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from magfusion.jobs.settings import Command, LogSettings, option
+from magfusion.results.figures import Figure, Figures, Section, heading
+
+if TYPE_CHECKING:
+    from magfusion.estimation.ranging import Ranged
+    from magfusion.estimation.ranging_windows import RangingLog
+    from magfusion.estimation.relative_wells import Wells
+    from magfusion.model.samples import Log
+    from magfusion.model.trust import Trust
+
+LEAST_SNR = 5.0  # of the strongest window
+VAGUE = 0.2  # of the distance
+
+
+@dataclass(frozen=True, kw_only=True)
+class RangeSettings(LogSettings):
+    """What is known of the depths, and how the waveform is cut."""
+
+    window: float = option(10.0, "Length of a window", unit="s", least=0.5, most=600.0)
+    depth_sigma: float = option(
+        0.02, "Of the magnet's depth in a window, 1 sigma", unit="m", least=0.0, most=100.0
+    )
+    depth_scale_sigma: float = option(
+        1e-3, "Of the scale of its depths, by stretch of the string, 1 sigma", least=0.0, most=0.1
+    )
+    mains_hz: float = option(50.0, "Mains frequency", unit="Hz", least=0.0, most=1e3)
+
+
+def run_range(settings: RangeSettings, output: Path) -> Figures:
+    """Find where the well of a turning magnet is from that of a sensor at rest.
+
+    Raises
+    ------
+    InputError
+        Where the site has no rotor, or more than it; or the log lacks what ranging needs.
+    """
+    import numpy as np
+
+    from magfusion.estimation.ranging import find_range
+    from magfusion.estimation.ranging_windows import DepthErrors, ranging_log
+    from magfusion.estimation.relative_wells import Wells
+    from magfusion.files.table import Span, write_table
+    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.results.report import write_report
+    from magfusion.results.verdict import trust_figures
+    from magfusion.units import DEGREE
+
+    job, claimed = settings.job(output), claim(output, "range")
+    log, site = read_job(job, unknown=True, rotor=True)
+    errors = DepthErrors(settings.depth_sigma, settings.depth_scale_sigma)
+    with named(job.log_path):
+        told = ranging_log(log, site, settings.window, settings.mains_hz, errors)
+    found = find_range(site, told.windows)
+    trust, excess = _judged(log, told, found)
+    rotor = site.beacons[0].rotor
+    assert rotor is not None
+    wells = Wells(found, told.windows, rotor.axis_beacon, excess)
+    windows, fields = told.windows, told.windows.fields
+    magnet = windows.magnet[:, 1] + windows.magnet_from
+    sensor = windows.sensor + windows.sensor_from
+    places = wells.places(magnet, sensor)
+    trust |= _vague(wells, float(sensor[-1]))
+    figures = heading("range", log.name) | trust_figures(trust)
+    figures |= _figures(told, found, wells, sensor)
+    last = places.place[-1], np.sqrt(np.diagonal(places.cov[-1]))
+    figures |= Figures(
+        *(
+            Figure(f"last_{word}_m", float(value), "m", label=f"magnet at the end, {word}")
+            for word, value in zip(("ahead", "right", "up"), last[0], strict=True)
+        ),
+        *(
+            Figure(f"last_{word}_sigma_m", float(value), "m", section=Section.REPORT)
+            for word, value in zip(("ahead", "right", "up"), last[1], strict=True)
+        ),
+    )
+    sigma = np.sqrt(np.diagonal(places.cov, axis1=1, axis2=2))
+    columns: dict[str, object] = {
+        "time_ns": Span(log.epoch_ns).stamps(fields.time),
+        "magnet_depth_m": magnet,
+        "sensor_depth_m": sensor,
+        **{f"{w}_m": places.place[:, k] for k, w in enumerate(("ahead", "right", "up"))},
+        **{f"{w}_sigma_m": sigma[:, k] for k, w in enumerate(("ahead", "right", "up"))},
+        "speed_hz": told.speed_hz,
+        "sensor_roll_deg": windows.roll / DEGREE,
+    }
+    with claimed as whole:
+        directory = found_in(whole, trust)
+        write_table(columns, directory / "range.parquet")
+        write_report(whole, figures)
+    refuse_failed(job.log_path, output, trust)
+    return figures
+
+
+def _judged(log: Log, told: RangingLog, found: Ranged) -> tuple[Trust, float]:
+    import numpy as np
+
+    from magfusion.estimation.integrity.priors import trust_of, unexplained
+    from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
+    from magfusion.model.trust import Finding, Trust, Verdict
+
+    fields = told.windows.fields
+    name = fields.channels[0][0]
+    remedy = (
+        "Check casing, depths and axes of the sensor, keep to the way on which both wells are"
+        " straight (--start, --end), or declare a larger model_error."
+    )
+    fitted = unexplained(f"the magnet {name}", found.chi_square, found.freedom, remedy)
+    trust, excess = trust_of(fitted)
+    findings = []
+    if found.rival_chi_square < AMBIGUOUS_CHI_SQUARE * excess:
+        text = (
+            "The wells could lie otherwise as well: the chi square is only"
+            f" {found.rival_chi_square:.2g} larger there. Let the magnet go on, past the sensor."
+        )
+        findings.append(Finding("ambiguous", text))
+    if not found.converged:
+        findings.append(
+            Finding(
+                "not_converged",
+                "The last pass still moved the wells. Let the magnet go by on a longer way.",
+            )
+        )
+    snr = np.abs(fields.phasor_sensor[:, 0]) ** 2
+    noise = np.trace(fields.phasor_cov[:, 0], axis1=1, axis2=2)
+    strongest = float(np.sqrt(np.max(np.sum(snr, axis=1) / np.maximum(noise, 1e-300))))
+    if strongest < LEAST_SNR:
+        text = f"The magnet is not told from noise: {strongest:.2g} times it at most. Come nearer."
+        findings.append(Finding("low_signal", text, Verdict.FAILED))
+    if not told.high_side:
+        why = "holds no inertial samples" if not log.inertial else "is from an upright hole"
+        text = (
+            f"The log {why}, so that directions are from the sensor's third axis, not from the high"
+            " side, and the sensor is taken not to have turned."
+        )
+        findings.append(Finding("assumed", text))
+    if not told.windows.angle_known:
+        text = (
+            "The angle of the shaft was followed through the field, not measured: how the magnet"
+            " is turned about it stays open. Distance and direction do not need it."
+        )
+        findings.append(Finding("geometry", text, Verdict.TRUSTWORTHY))
+    return trust | Trust(tuple(findings)), excess
+
+
+def _vague(wells: Wells, sensor: float) -> Trust:
+    from magfusion.model.trust import Finding, Trust
+
+    one = wells.abreast(sensor)
+    if one.distance_sigma <= VAGUE * one.distance:
+        return Trust()
+    text = (
+        f"The distance, {one.distance:.3g} m, is known to {one.distance_sigma:.2g} m only. Let the"
+        " magnet go by on a way as long as the distance, on both sides of the sensor."
+    )
+    return Trust((Finding("few_data", text),))
+
+
+def _figures(told: RangingLog, found: Ranged, wells: Wells, sensor: object) -> Figures:
+    import numpy as np
+
+    from magfusion.units import DEGREE
+
+    figures = [
+        Figure("windows", len(told.windows.fields)),
+        Figure("windows_dropped", told.dropped, section=Section.REPORT),
+        Figure("angle", "measured" if told.windows.angle_known else "followed"),
+        Figure("speed_mean_hz", float(np.mean(told.speed_hz)), "Hz"),
+        Figure("speed_spread_hz", float(np.std(told.speed_hz)), "Hz"),
+        Figure(
+            "residual_rms",
+            float(np.sqrt(found.chi_square / found.freedom)),
+            label="residual (1 is expected)",
+        ),
+    ]
+    if told.inclination is not None:
+        figures.append(Figure("inclination_deg", told.inclination / DEGREE, "deg"))
+    for k, depth in enumerate(np.unique(np.round(np.asarray(sensor), 2)), start=1):
+        one = wells.abreast(float(depth))
+        rows = (
+            ("sensor_depth_m", float(depth), "m"),
+            ("distance_m", one.distance, "m"),
+            ("distance_sigma_m", one.distance_sigma, "m"),
+            ("high_side_deg", one.direction / DEGREE, "deg"),
+            ("high_side_sigma_deg", one.direction_sigma / DEGREE, "deg"),
+            ("abreast_depth_m", one.depth, "m"),
+            ("abreast_depth_sigma_m", one.depth_sigma, "m"),
+        )
+        figures += [Figure(f"place_{k}_{name}", value, unit) for name, value, unit in rows]
+    apart = wells.divergence()
+    figures += [
+        Figure("leads_right_deg", apart.right / DEGREE, "deg"),
+        Figure("leads_right_sigma_deg", apart.right_sigma / DEGREE, "deg"),
+        Figure("leads_up_deg", apart.up / DEGREE, "deg"),
+        Figure("leads_up_sigma_deg", apart.up_sigma / DEGREE, "deg"),
+    ]
+    for name, value, sigma, prior in zip(
+        found.names,
+        found.values.tolist(),
+        np.sqrt(np.diagonal(found.cov)[6:]).tolist(),
+        found.prior_sigma.tolist(),
+        strict=True,
+    ):
+        figures.append(Figure(f"found_{name}", value, section=Section.REPORT))
+        figures.append(Figure(f"found_{name}_sigma", sigma, section=Section.REPORT))
+        figures.append(Figure(f"found_{name}_prior_sigma", prior, section=Section.REPORT))
+    return Figures(*figures)
+
+
+COMMAND = Command(RangeSettings, run_range, example="magfusion range log -o range")

@@ -1,0 +1,132 @@
+"""Phasors of a turning magnet by its angle, not by the clock: a speed that drifts smears nothing.
+
+A window's design has the cosine and sine of each order of the angle, each with a ramp as the magnet
+passes, a constant with a slope, and mains.  Noise is what the window holds some turns beside.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.model.samples import FieldSamples, Waveform
+from magfusion.model.site import Beacon, Site
+from magfusion.units import AnyArray, Array
+
+LEAST_SAMPLES = 0.8  # of a whole window
+LEAST_TURNS = 4.0  # in a window
+BESIDE = (3.0, 4.0, 5.0, 6.0)  # turns in a window by which a probe is beside its tone
+POOLED = 4  # windows on either side with which noise is averaged
+MAINS = 3  # harmonics of it
+
+
+@dataclass(frozen=True, eq=False)
+class RotorPhasors:
+    """Windows of a rotor.
+
+    Parameters
+    ----------
+    fields : FieldSamples
+        Phasors about the angle; their channels are the rotor's tones.
+    speed_hz : ndarray, shape (n,)
+        Mean of each window.
+    dropped : int
+        Windows that lack samples, or in which the magnet hardly turns.
+    """
+
+    fields: FieldSamples
+    speed_hz: Array
+    dropped: int
+
+
+def demodulate_rotor(
+    waveform: Waveform,
+    angle: Array,
+    beacon: Beacon,
+    site: Site,
+    window: float,
+    mains_hz: float = 50.0,
+) -> RotorPhasors:
+    """Return phasors of contiguous windows.
+
+    Parameters
+    ----------
+    angle : ndarray, shape (n,)
+        Of the shaft at each sample, without jumps (rad); NaN where it is not known.
+    window : float
+        (s)
+    """
+    time, step = waveform.time, float(np.median(np.diff(waveform.time)))
+    edges = np.arange(time[0], time[-1] + step, window)
+    orders = np.rint(beacon.tone_frequencies_hz / beacon.frequency_hz)
+    calm = waveform.measured_sensor - site.platform.magnetometer.offset
+    centres, speeds = list[float](), list[float]()
+    parts: tuple[list[AnyArray], ...] = ([], [], [])
+    for first in edges:
+        rows = slice(*np.searchsorted(time, [first, first + window]))
+        known = np.isfinite(angle[rows])
+        if np.sum(known) < LEAST_SAMPLES * window / step:
+            continue
+        own, turned = time[rows][known], angle[rows][known]
+        if np.max(np.diff(own)) > (1.0 - LEAST_SAMPLES) * window:
+            continue
+        turns = abs(turned[-1] - turned[0]) / (2.0 * np.pi)
+        if turns < LEAST_TURNS or turns > 0.4 * len(own) / max(orders):
+            continue
+        found = _of_window(own - first - 0.5 * window, turned, calm[rows][known], orders, mains_hz)
+        centres.append(first + 0.5 * window)
+        speeds.append(turns / (own[-1] - own[0]))
+        for known_parts, part in zip(parts, found, strict=True):
+            known_parts.append(part)
+    n, tones = len(centres), len(orders)
+    phasors, noises, units = (np.array(part) for part in parts)
+    noise = noises.reshape(n, tones, 3, 3)
+    least = site.platform.magnetometer.noise_density**2 / (2.0 * step)
+    cov = units.reshape(n, tones)[..., None, None] * _pooled(noise, least)
+    fields = FieldSamples(
+        time=np.array(centres),
+        window=np.full(n, window),
+        channels=tuple((beacon.name, k) for k in range(tones)),
+        phasor_sensor=phasors.reshape(n, tones, 3).astype(np.complex128),
+        phasor_cov=cov,
+    )
+    whole = int(np.floor((time[-1] - time[0]) / window + 1e-6))
+    return RotorPhasors(fields, np.array(speeds), max(whole - n, 0))
+
+
+def _of_window(
+    elapsed: Array, angle: Array, field: Array, orders: Array, mains_hz: float
+) -> tuple[AnyArray, Array, Array]:
+    """Return phasors (tones, 3), the variance of a sample (tones, 3, 3), and of units (tones,)."""
+    late = elapsed / np.max(np.abs(elapsed))
+    waves = np.exp(1j * orders[:, None] * angle)
+    nyquist_hz = 0.5 * (len(elapsed) - 1) / (elapsed[-1] - elapsed[0])
+    hum = [k * mains_hz for k in range(1, MAINS + 1) if 0.0 < k * mains_hz < 0.9 * nyquist_hz]
+    others = np.exp(2j * np.pi * np.array(hum)[:, None] * elapsed)
+    parts = np.concatenate([waves, late * waves, others])
+    design = np.concatenate([[np.ones_like(late), late], parts.real, -parts.imag]).T
+    gram = np.linalg.inv(design.T @ design)
+    fitted = gram @ (design.T @ field)
+    count, n = len(parts), len(orders)
+    real, imaginary = fitted[2 : 2 + n], fitted[2 + count : 2 + count + n]
+    unit = np.diagonal(gram)
+    left = field - design @ fitted
+    span = elapsed[-1] - elapsed[0]
+    beside = np.array([sign * k for k in BESIDE for sign in (-1.0, 1.0)])
+    noises = []
+    for order in orders:
+        probe = np.exp(-1j * (order * angle + 2.0 * np.pi * np.outer(beside, elapsed) / span))
+        seen = probe @ left  # (probes, 3)
+        noises.append(np.real(seen.T @ seen.conj()) / (len(beside) * len(elapsed)))
+    variance = 0.5 * (unit[2 : 2 + n] + unit[2 + count : 2 + count + n])
+    return real + 1j * imaginary, np.array(noises), variance
+
+
+def _pooled(noise: Array, least: float) -> Array:
+    """Return the noise of windows averaged with their neighbours', not below the declared."""
+    out = np.empty_like(noise)
+    for i in range(len(noise)):
+        mean = np.mean(noise[max(i - POOLED, 0) : i + POOLED + 1], axis=0)
+        value, vector = np.linalg.eigh(mean)
+        value = np.maximum(value, least)
+        out[i] = (vector * value[..., None, :]) @ np.swapaxes(vector, -1, -2)
+    return out

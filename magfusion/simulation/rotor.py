@@ -1,0 +1,291 @@
+"""A magnet that turns on a shaft in one well, a sensor at rest in another: what it records.
+
+The moment itself is turned, sample by sample, with its stack's length, its tilt and the whirl of
+the shaft; nothing here knows of two coils in quadrature.  What the ground's layers and steel do
+to a field that alternates is added as a phasor that turns with the shaft.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from magfusion.model.physics.dipole import dipole_field
+from magfusion.model.samples import Depths, ImuSamples, Log, RotorAngles, Waveform
+from magfusion.model.site import Rotor, Site
+from magfusion.simulation.layers import Layers, layered_effect_at
+from magfusion.simulation.pipe import Steel
+from magfusion.units import Array, ComplexArray
+
+POINTS, ORDERS = 64, 4  # of a turn, and of its angle, from steady on
+NEGLIGIBLE = 1e-6  # of the moment
+NODES_APART = 0.08  # of the distance, between places where steel and layers are calculated
+
+
+@dataclass(frozen=True, eq=False)
+class Shaft:
+    """How a magnet truly turns, beyond what its site declares.
+
+    Parameters
+    ----------
+    angle_start : float
+        (rad)
+    drift_hz : float
+        Root mean square of the speed about its mean.
+    drift_time : float
+        Of correlation (s).
+    slip : float
+        Amplitude of the angle's error twice a turn, as of a joint that is bent (rad).
+    whirl : float
+        By which the shaft's axis circles against its turning (rad).
+    length : float
+        Of the stack of magnets along the shaft (m).
+    encoder_sigma : float
+        Of an angle as it is recorded (rad).
+    """
+
+    angle_start: float = 0.3
+    drift_hz: float = 0.05
+    drift_time: float = 20.0
+    slip: float = 0.0
+    whirl: float = 0.0
+    length: float = 0.3
+    encoder_sigma: float = 2e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Pass:
+    """A sensor at rest while the magnet goes by.
+
+    Parameters
+    ----------
+    sensor_depth : float
+        Along its own hole (m).
+    sensor_world : ndarray, shape (3,)
+        (m)
+    world_from_body : ndarray, shape (3, 3)
+        Of the sensor; its first axis is down the hole.
+    start_world : ndarray, shape (3,)
+        Of the magnet (m).
+    world_from_rotor : ndarray, shape (3, 3)
+        Its attitude, which stays as it is; it goes along its axis.
+    depth : tuple of float
+        Of the magnet along its hole when the pass begins and ends (m).
+    speed : float
+        Of it along the hole (m/s).
+    """
+
+    sensor_depth: float
+    sensor_world: Array
+    world_from_body: Array
+    start_world: Array
+    world_from_rotor: Array
+    depth: tuple[float, float]
+    speed: float
+
+    @property
+    def duration(self) -> float:
+        """How long it takes (s)."""
+        return abs(self.depth[1] - self.depth[0]) / self.speed
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What is about the wells."""
+
+    layers: Layers | None = None
+    steel: Steel | None = None
+    depth_scale: float = 0.0  # relative error of the magnet's depths
+    depth_sigma: float = 0.0  # m, of each reading of them
+
+
+def turned_moment(rotor: Rotor, shaft: Shaft, angle: Array) -> Array:
+    """Return the moment at angles of the shaft, rotor axes, shape (n, 3) (A m^2)."""
+    axis, zero = rotor.axis_beacon, rotor.zero_beacon
+    across = np.cross(axis, zero)
+    true = (angle + shaft.slip * np.sin(2.0 * angle))[:, None]
+    moment = np.cos(rotor.tilt) * (zero * np.cos(true) + across * np.sin(true))
+    moment = rotor.moment * (moment + np.sin(rotor.tilt) * axis)
+    # Backward whirl: the shaft leans by a small angle about a direction that circles against it.
+    lean = shaft.whirl * (zero * np.cos(angle)[:, None] - across * np.sin(angle)[:, None])
+    size = np.linalg.norm(lean, axis=1, keepdims=True)
+    if not shaft.whirl:
+        return moment
+    unit = lean / size
+    crossed = np.cross(unit, moment)
+    along = np.sum(unit * moment, axis=1, keepdims=True)
+    return np.cos(size) * moment + np.sin(size) * crossed + (1.0 - np.cos(size)) * along * unit
+
+
+def shaft_angle(shaft: Shaft, frequency_hz: float, time: Array, rng: np.random.Generator) -> Array:
+    """Return the angle of a shaft whose speed drifts, without jumps (rad)."""
+    knots = np.arange(time[0], time[-1] + 2.0, 0.25)
+    keep = np.exp(-0.25 / shaft.drift_time)
+    kick = shaft.drift_hz * np.sqrt(1.0 - keep**2) * rng.standard_normal(len(knots))
+    drift = np.empty(len(knots))
+    drift[0] = shaft.drift_hz * rng.standard_normal()
+    for k in range(1, len(knots)):
+        drift[k] = keep * drift[k - 1] + kick[k]
+    turned = CubicSpline(knots, frequency_hz + drift).antiderivative()
+    return shaft.angle_start + 2.0 * np.pi * (turned(time) - turned(time[0]))
+
+
+def simulate_passes(
+    site: Site,
+    shaft: Shaft,
+    passes: tuple[Pass, ...],
+    around: Surroundings,
+    rate_hz: float,
+    rng: np.random.Generator,
+    gap: float = 30.0,
+    encoder: bool = True,
+) -> Log:
+    """Return a log of passes, one after the other.
+
+    Parameters
+    ----------
+    site : Site
+        The true one: its only beacon is a rotor.  Where it is and how it is turned is said by the
+        passes.
+    gap : float
+        Between two passes, in which nothing is recorded (s).
+    encoder : bool
+        Whether the angle of the shaft is recorded.
+    """
+    beacon, begin = site.beacons[0], 0.0
+    waves, angles, forces, depths, places = [], [], [], [], []
+    for own in passes:
+        time = begin + np.arange(int(own.duration * rate_hz)) / rate_hz
+        angle = shaft_angle(shaft, beacon.frequency_hz, time, rng)
+        forward = 1.0 if own.depth[1] > own.depth[0] else -1.0
+        at = own.depth[0] + forward * own.speed * (time - begin)
+        waves.append(Waveform(time, _measured(site, shaft, own, around, angle, at, rate_hz, rng)))
+        angles.append(angle + shaft.encoder_sigma * rng.standard_normal(len(angle)))
+        felt = time[:: max(int(rate_hz / 10.0), 1)]
+        forces.append((felt, own.world_from_body.T @ np.array([0.0, 0.0, site.gravity])))
+        told = np.linspace(time[0], time[-1], max(int(own.duration), 2))
+        true = np.interp(told, time, at)
+        error = around.depth_sigma * rng.standard_normal(len(told))
+        depths.append(np.stack([told, (1.0 + around.depth_scale) * true + error]))
+        places.append(np.array([[time[0], time[-1]], [own.sensor_depth] * 2]))
+        begin = float(time[-1]) + gap
+    wave = Waveform(
+        np.concatenate([w.time for w in waves]), np.concatenate([w.measured_sensor for w in waves])
+    )
+    imu = site.platform.imu
+    felt = np.concatenate([t for t, _ in forces])
+    force = np.concatenate([np.broadcast_to(f, (len(t), 3)) for t, f in forces])
+    rest = ImuSamples(
+        felt,
+        imu.gyro_noise * np.sqrt(5.0) * rng.standard_normal(force.shape),
+        force + imu.accel_noise * np.sqrt(5.0) * rng.standard_normal(force.shape),
+    )
+    turned = RotorAngles(wave.time, {beacon.name: np.mod(np.concatenate(angles), 2.0 * np.pi)})
+    return Log(
+        name="passes",
+        epoch_ns=1_700_000_000_000_000_000,
+        source="simulation",
+        imu=rest,
+        waveform=wave,
+        rotation=turned if encoder else None,
+        depths=Depths(
+            {beacon.name: np.concatenate(depths, 1), "magnetometer": np.concatenate(places, 1)}
+        ),
+    )
+
+
+def _measured(
+    site: Site,
+    shaft: Shaft,
+    own: Pass,
+    around: Surroundings,
+    angle: Array,
+    depth: Array,
+    rate_hz: float,
+    rng: np.random.Generator,
+) -> Array:
+    rotor = site.beacons[0].rotor
+    assert rotor is not None
+    axis_world = own.world_from_rotor @ rotor.axis_beacon
+    magnet_world = own.start_world + (depth - own.depth[0])[:, None] * axis_world
+    moment_world = turned_moment(rotor, shaft, angle) @ own.world_from_rotor.T
+    field_world = np.zeros_like(magnet_world)
+    stack = shaft.length * (np.arange(4) - 1.5) / 4.0
+    for along in stack:
+        offset = own.sensor_world - magnet_world - along * axis_world
+        field_world += dipole_field(offset, moment_world / len(stack))
+    for order, share in _parts(rotor, shaft).items():
+        added = _added(site.beacons[0].frequency_hz * order, share, rotor, own, around, depth)
+        if added is not None:
+            field_world += np.real(added * np.exp(1j * order * angle)[:, None])
+    if site.earth_field_world is not None:
+        field_world += site.earth_field_world
+    sensor = site.platform.magnetometer
+    in_body = field_world @ own.world_from_body @ sensor.body_from_sensor
+    measured = in_body @ sensor.matrix.T + sensor.offset
+    noise = sensor.noise_density * np.sqrt(rate_hz / 2.0)
+    return np.asarray(measured + noise * rng.standard_normal(measured.shape))
+
+
+def _parts(rotor: Rotor, shaft: Shaft) -> dict[int, ComplexArray]:
+    """Return the moment's phasor in each order of the angle, rotor axes, (3,) (A m^2)."""
+    angle = 2.0 * np.pi * np.arange(POINTS) / POINTS
+    moment = turned_moment(rotor, shaft, angle)
+    out = {}
+    for order in range(ORDERS):
+        twice = 1.0 if order == 0 else 2.0
+        part = twice * np.mean(moment * np.exp(-1j * order * angle)[:, None], axis=0)
+        if np.linalg.norm(part) > NEGLIGIBLE * rotor.moment:
+            out[order] = part
+    return out
+
+
+def _added(
+    frequency_hz: float,
+    share: ComplexArray,
+    rotor: Rotor,
+    own: Pass,
+    around: Surroundings,
+    depth: Array,
+) -> ComplexArray | None:
+    """Return the phasor that layers and steel add at each sample, shape (n, 3) (T).
+
+    Parameters
+    ----------
+    share : complex ndarray, shape (3,)
+        Moment that alternates at the frequency, rotor axes (A m^2).
+    """
+    if around.layers is None and around.steel is None:
+        return None
+    axis_world = own.world_from_rotor @ rotor.axis_beacon
+    travel = (own.sensor_world - own.start_world) @ axis_world
+    nearest = float(np.linalg.norm(own.sensor_world - own.start_world - travel * axis_world))
+    low, high = float(np.min(depth)), float(np.max(depth))
+    count = int(np.ceil((high - low) / (NODES_APART * max(nearest, 1.0)))) + 8
+    nodes = np.linspace(low, high, count)
+    at_world = own.start_world + (nodes - own.depth[0])[:, None] * axis_world
+    moments = own.world_from_rotor.T  # of one along each of the rotor's axes
+    plain = dipole_field((own.sensor_world - at_world)[:, None], moments)
+    seen = plain.astype(np.complex128)
+    if around.layers is not None and frequency_hz:
+        seen += _ground(frequency_hz, moments, at_world, own, around.layers)
+    if around.steel is not None:
+        points = around.steel.points_world()
+        driven = dipole_field((points[:, None] - at_world)[:, :, None], moments)
+        flat = driven.reshape(len(points), -1, 3), seen.reshape(-1, 3)
+        seen = around.steel.seen_world(*flat, own.sensor_world, frequency_hz)
+        seen = seen.reshape(plain.shape)
+    out = np.einsum("k,nka->na", share, seen - plain)
+    return np.asarray(CubicSpline(nodes, out)(depth))
+
+
+def _ground(
+    frequency_hz: float, moments: Array, at_world: Array, own: Pass, layers: Layers
+) -> ComplexArray:
+    """Return what layers add of a magnet at places, shape (n, 3, 3): they are level."""
+    middle = at_world[len(at_world) // 2]
+    seen_from = own.sensor_world + middle - at_world
+    seen_from[:, 2] = own.sensor_world[2]  # layers are level; how it climbs changes little of it
+    return np.stack(
+        [layered_effect_at(middle, m, frequency_hz, seen_from, layers) for m in moments], axis=1
+    )
