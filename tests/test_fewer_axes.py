@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import fewer_axes as scenario
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -229,3 +230,8 @@ def test_what_one_axis_cannot_do_is_refused(
     )
     assert "is the one gain of a receiver of one axis" in said
     assert "smooth frees gain alone" in refuse("smooth", log, "--free", "phase", "-o", log)
+
+
+@pytest.mark.slow
+def test_errors_of_fewer_axes_are_consistent() -> None:
+    assert not scenario.faults_of(scenario.rows_of(0, 12.0))
