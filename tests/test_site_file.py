@@ -391,16 +391,18 @@ def test_what_is_left_out_takes_the_stated_defaults(tmp_path: Path) -> None:
     assert beacon.tones == ((25.0, None),)
     assert (imu.time_offset, imu.time_offset_sigma) == (0.0, 0.01)
     assert (imu.clock_rate, imu.clock_rate_sigma) == (0.0, 5e-5)
+    of_sensor = list(vars(magnetometer.sigma).values())
     zeros: list[Array] = [
         beacon.coils[0].centre_beacon,
         *vars(beacon.sigma).values(),
         magnetometer.position_body,
         magnetometer.offset,
-        *vars(magnetometer.sigma).values(),
+        *of_sensor[:4],
     ]
     assert not any(array.any() for array in zeros)
+    assert of_sensor[4] == magnetometer.clock_offset == 0.0
     assert [a.shape for a in vars(beacon.sigma).values()] == [(3,), (3,), (2,)]
-    assert [a.shape for a in vars(magnetometer.sigma).values()] == [(3, 3), (3,), (3,), (3,)]
+    assert [a.shape for a in of_sensor[:4]] == [(3, 3), (3,), (3,), (3,)]
     np.testing.assert_array_equal(magnetometer.matrix, np.eye(3))
     np.testing.assert_array_equal(magnetometer.body_from_sensor, np.eye(3))
 

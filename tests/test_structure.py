@@ -165,6 +165,7 @@ SIMULATOR_SEES = {
     "correlation",
     "marks",
     "physics",
+    "response",
     "samples",
     "site",
     "trajectory",

@@ -140,7 +140,7 @@ def detected_along(
     return DetectedFields(
         alone=alone,
         poses=poses,
-        sensor_world=sensor_positions(alone.site, poses),
+        sensor_world=sensor_positions(alone.site, poses)[:, 0],
         measured=stacked(phasor),
         phasor_world=phasor @ np.swapaxes(world_from_measured, 1, 2),
         sqrt_information=paired_whitening(cov, np.ones(cov.shape[:2], dtype=bool)),

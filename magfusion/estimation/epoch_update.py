@@ -13,6 +13,7 @@ from magfusion.estimation.input_queue import Arrivals, Measured
 from magfusion.estimation.integrity.bank import SubsetBank
 from magfusion.estimation.integrity.gate import Gate
 from magfusion.estimation.integrity.judgement import Judgement
+from magfusion.estimation.integrity.magnetometer_watch import MagnetometerWatch
 from magfusion.estimation.integrity.near_metal import NearMetal
 from magfusion.estimation.integrity.online import Heard, OnlineWitness
 from magfusion.estimation.integrity.place_witness import of_place
@@ -82,7 +83,7 @@ class EpochUpdate:
         bank: SubsetBank | None = None,
     ) -> None:
         self.site, self.blocks, self.bank = site, blocks, bank
-        self.gate = Gate(site.channels, blocks)
+        self.gate = Gate(site.channels, blocks, MagnetometerWatch(site))
         self.of_currents: tuple[Finding, ...] = ()
         self.metal, self._reckoned = NearMetal(site, blocks), Reckoned(blocks)
         self.witness = OnlineWitness(site, estimated)
@@ -234,7 +235,10 @@ class EpochUpdate:
         held = self.score.said_of(state)
         said = self.witness.judgement(state, self.gate, since, held)
         said = said.beside(
-            *self.metal.said().findings, *self.of_currents, *_of_place(self.site, state)
+            *self.metal.said().findings,
+            *self.of_currents,
+            *self.gate.watch.findings(),
+            *_of_place(self.site, state),
         )
         return said if self.bank is None else self.bank.heard(said, state)
 

@@ -33,6 +33,7 @@ from magfusion.units import Array, IntArray
 
 LONGEST_WAIT = 5.0  # s; the fields go on without an IMU that is silent for longer
 OFFSET_STALE = 1e-4  # s; at a radian a second, six thousandths of a degree
+SHORTEST_STEP = 1e-6  # s; of epochs of one magnetometer
 MARGIN = 0.1  # s; of inertial samples about a window
 
 
@@ -108,6 +109,7 @@ class Arrivals:
     others: list[tuple[float, Measurement]]
     windows: deque[int]
     usual: float | None
+    _heard_by: dict[str, float]  # when each of several magnetometers was last heard (s)
     last_epoch: float
     unseen: int
     frozen: int
@@ -135,6 +137,7 @@ class Arrivals:
         self.unseen, self.stand_in = 0, StandIn()
         self.frozen, self._gyro, self._accel = 0, Freeze(), Freeze()
         self._noise, self._noise_unseen = [], False
+        self._heard_by = {}
 
     # What goes in
 
@@ -411,13 +414,14 @@ class Arrivals:
             if wave is None:
                 return None  # only the clock went on
             samples, steady, by_offset = wave.fields, wave.steady, wave.by_time_offset
-        samples = self._detection.of(samples, step)
+        own = step if not samples.magnetometers else self._own_step(samples)
+        samples = self._detection.of(samples, own)
         if not np.any(samples.valid) and not (earth and steady is not None):
             return None
         self.last_epoch = time
         now, offset = np.zeros(1, dtype=np.int64), np.full(1, self.applied_offset)
         rate_body = (self._rate_body(time) - predicted.gyro_bias_body)[None]
-        repeats = max(1.0, float(samples.window[0]) / step)
+        repeats = max(1.0, float(samples.window[0]) / own)
         speed = float(np.linalg.norm(predicted.velocity_world))
         phasors = field_phasors(
             predicted.calibration.site,
@@ -436,6 +440,15 @@ class Arrivals:
             site = predicted.calibration.site
             field = earth_measurement(site, steady, now, rate_body, offset, step)
         return Measured(samples, phasors, field, steady, repeats)
+
+    def _own_step(self, samples: FieldSamples) -> float:
+        """Return since when the magnetometers of an epoch did not measure, the shortest (s)."""
+        time, valid = float(samples.time[0]), samples.valid[0]
+        named = zip(samples.magnetometers, valid.tolist(), strict=True)
+        names = dict.fromkeys(name for name, there in named if there)
+        steps = [time - self._heard_by.get(name, -np.inf) for name in names]
+        self._heard_by |= dict.fromkeys(names, time)
+        return max(min(steps, default=np.inf), SHORTEST_STEP)
 
     def _demodulated(self, before: State, predicted: State) -> MotionCompensated | None:
         """Return the window at a prediction; None where there is none."""

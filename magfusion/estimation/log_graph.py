@@ -206,6 +206,7 @@ def _fields(
         overlap(samples),
         by_offset,
         standing=None if standing is None else standing[log.epoch],
+        beside=False,  # its modes are considered
     )
     out: list[Measurement] = [replace(phasors, robust=log.loss)]
     if log.steady is not None:
@@ -218,6 +219,10 @@ def _fields(
 
 def overlap(samples: FieldSamples) -> float:
     """Return how many windows hold each sample: their information must not be counted twice."""
+    if samples.magnetometers:
+        names = dict.fromkeys(samples.magnetometers)
+        each = [samples.of_magnetometer(name) for name in names]
+        return max((overlap(own) for own in each if len(own) > 1), default=1.0)
     return max(1.0, float(np.median(samples.window)) / _step(samples))
 
 

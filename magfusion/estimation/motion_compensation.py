@@ -184,7 +184,7 @@ def noisier(
     cov = samples.phasor_cov.copy()
     missed = 0.5 * channels * np.einsum("nckxi,nckyi->ncxy", by, by)
     # What is found of the noise of a beacon is not of this.
-    beacons = calibration.site.beacons
-    factor = np.concatenate([np.full(len(b.tones), b.noise_factor) for b in beacons])
+    site = calibration.site
+    factor = np.array([beacon.noise_factor for beacon in site.beacons])[site.owner]
     cov[rows] += missed / factor[:, None, None] ** 2
     return replace(samples, phasor_cov=cov)

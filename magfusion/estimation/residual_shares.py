@@ -89,10 +89,11 @@ class Leavings:
         if self._measured.loss is not None:
             weight, _ = self._measured.loss.weighed(np.sum(error**2, axis=2), 6)
         self._weight = np.sqrt(weight)[..., None]
-        self._world_from_sensor = np.asarray(
-            poses.world_from_body @ site.platform.magnetometer.body_from_sensor
+        self._world_from_sensor = np.stack(
+            [poses.world_from_body @ s.body_from_sensor for s in site.platform.magnetometers],
+            axis=1,
         )
-        self._owner = np.array([i for i, b in enumerate(site.beacons) for _ in b.tones])
+        self._owner, self._sensor = site.owner, site.sensor
         self._size = _sizes(site)
         self._error = error
         rows = self._measured.linearize(
@@ -127,8 +128,11 @@ class Leavings:
         noise, model = np.array(self._size)[:, self._owner]
         drawn = noise[:, None] * _draw_noise(rng, samples, windows, root)
         length = max(site.model_error_length, 1e-3)
-        world = _waves(rng, sensor_world / length, samples.valid.shape)
-        sensor = np.einsum("nji,ncpj->ncpi", self._world_from_sensor, world)
+        sensors = sensor_world.shape[1]
+        shape = len(samples), samples.valid.shape[1] // sensors
+        world = _waves(rng, sensor_world / length, shape)
+        turn = self._world_from_sensor
+        sensor = np.einsum("nsji,nscpj->nscpi", turn, world).reshape(*samples.valid.shape, 2, 3)
         size = np.sqrt(np.trace(unit, axis1=2, axis2=3) / 3.0)[..., None, None]
         false = model[:, None] * _six(np.einsum("ncij,ncpj->ncpi", root, size * sensor))
         imu = rng.standard_normal((len(self._inertial), ROWS))
@@ -181,7 +185,7 @@ class Leavings:
         out = []
         for channel in np.flatnonzero(self._owner == beacon).tolist():
             rows = np.flatnonzero(self._samples.valid[:, channel])
-            turn = self._world_from_sensor[rows]
+            turn = self._world_from_sensor[rows, self._sensor[channel]]
             seen, noise, model, inertial = (
                 np.einsum("nij,npj->npi", turn, e[rows, channel].reshape(-1, 2, 3)).reshape(-1, 6)
                 for e in self._apart
@@ -260,19 +264,21 @@ def _draw_noise(
 
 
 def _waves(rng: np.random.Generator, place: Array, shape: tuple[int, ...]) -> Array:
-    """Return random fields of correlation exp(-distance), shape (n, channels, 2, 3).
+    """Return random fields of correlation exp(-distance), (n, magnetometers, channels, 2, 3).
 
     By waves of random vectors (random Fourier features), which are Cauchy's for that correlation.
 
     Parameters
     ----------
-    place : ndarray, shape (n, 3)
+    place : ndarray, shape (n, magnetometers, 3)
+    shape : tuple of int
+        Epochs, and channels of each magnetometer.
     """
     wave = rng.standard_normal((WAVES, 3)) / np.abs(rng.standard_normal((WAVES, 1)))
     amplitude = rng.standard_normal((2, WAVES, shape[1] * 6)) / np.sqrt(WAVES)
     angle = place @ wave.T
     field = np.cos(angle) @ amplitude[0] + np.sin(angle) @ amplitude[1]
-    return np.asarray(field).reshape(*shape, 2, 3)
+    return np.asarray(field).reshape(*place.shape[:2], shape[1], 2, 3)
 
 
 def _six(parts: Array) -> Array:

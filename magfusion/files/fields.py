@@ -9,6 +9,7 @@ import pyarrow as pa
 from magfusion.errors import InputError
 from magfusion.files.plausible import check_field
 from magfusion.files.table import TIME, Layout, Span, Table, read_table, write_table
+from magfusion.model.channel_effects import tone_frequencies
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.units import Array, IntArray
@@ -17,14 +18,16 @@ _REAL = ("re_x", "re_y", "re_z")
 _IMAGINARY = ("im_x", "im_y", "im_z")
 _UPPER = np.triu_indices(3)
 _COV = tuple(f"cov_{'xyz'[i]}{'xyz'[j]}" for i, j in zip(*_UPPER, strict=True))
+SAME_TIME = 1e-7  # s; less is rounding of stamps
 LEAST_ROWS = 8  # fewer may be zero in a component by their pose
-_AMPLITUDE = "amplitude"
+_AMPLITUDE, _MAGNETOMETER = "amplitude", "magnetometer"
 _PARTS = {axis: (f"re_{axis}", f"im_{axis}") for axis in "xyz"}
 _LAYOUT = Layout(
     numbers=("sigma", "window"),
     integers=(TIME, "tone"),
     texts=("beacon",),
     optional=(*_PARTS.values(), (_AMPLITUDE,), _COV),
+    optional_texts=(_MAGNETOMETER,),
     repeats=True,
 )
 
@@ -37,6 +40,9 @@ def write_fields(fields: FieldSamples, path: Path, epoch_ns: int) -> None:
     names = pa.array([beacon for beacon, _ in fields.channels], pa.string())
     columns["beacon"] = names.take(pa.array(channel))
     columns["tone"] = np.array([tone for _, tone in fields.channels], dtype=np.int64)[channel]
+    if fields.magnetometers:
+        sensors = pa.array(fields.magnetometers, pa.string())
+        columns[_MAGNETOMETER] = sensors.take(pa.array(channel))
     kept = [name for axis in fields.axes for name in _PARTS[axis]]
     if not fields.signed:
         columns[_AMPLITUDE] = phasor[:, "xyz".index(fields.axes)].real
@@ -55,7 +61,8 @@ def write_fields(fields: FieldSamples, path: Path, epoch_ns: int) -> None:
 def read_fields(path: Path, span: Span) -> FieldSamples:
     """Read and check phasors in Parquet or CSV, within a span of time.
 
-    Channels are in the order in which the file first names them; the covariance is
+    Channels are in the order in which the file first names them, and of several magnetometers each
+    has its own; the covariance is
     ``sigma**2`` times the identity where the file does not hold one.  A receiver of fewer axes
     leaves columns out, which are NaN; one that tells no sign gives amplitudes, here along x.
 
@@ -68,8 +75,8 @@ def read_fields(path: Path, span: Span) -> FieldSamples:
     """
     table = read_table(path, _LAYOUT, span)
     axes, signed = _measured(table, path)
-    channels, column = _channels(table)
-    time_ns, first, row = np.unique(table.time_ns, return_index=True, return_inverse=True)
+    channels, magnetometers, column = _channels(table)
+    time_ns, first, row = _epochs(table, magnetometers, column)
     cell = row * len(channels) + column
     repeated = np.ones(len(cell), dtype=bool)
     repeated[np.unique(cell, return_index=True)[1]] = False
@@ -93,17 +100,87 @@ def read_fields(path: Path, span: Span) -> FieldSamples:
     cov = np.full((*phasor.shape, 3), np.nan)
     cov[row, column] = _covariance(table)
     at = table.time[first], window[first]
-    return FieldSamples(*at, channels, phasor, cov, axes=axes, signed=signed)
+    found = FieldSamples(*at, channels, phasor, cov, axes=axes, signed=signed)
+    return replace(found, magnetometers=magnetometers)
 
 
 def order_channels(fields: FieldSamples, site: Site) -> FieldSamples:
     """Arrange the channels as the site names them; those never measured are NaN.
 
+    What several magnetometers measured is stamped, and its phases are referred, by the log's clock.
+
     Raises
     ------
     InputError
-        Where a channel is unknown to the site.
+        Where a channel, or a magnetometer, is unknown to the site, or the fields do not say which
+        of several measured them.
     """
+    sensors = site.platform.magnetometers
+    names = tuple(dict.fromkeys(fields.magnetometers))
+    known = tuple(sensor.name for sensor in sensors)
+    strange = [name for name in names if name not in known]
+    # A site of one takes what is of it, and a log that names one needs no site that does.
+    if strange and (len(sensors) > 1 or (len(names) > 1 and known[0] not in names)):
+        raise InputError(
+            f"The fields are of magnetometer {', '.join(strange)}, which the site does not know (it"
+            f" has {', '.join(known)}); give the site in which the log was recorded."
+        )
+    if len(sensors) == 1:
+        alone = fields if len(names) < 2 else fields.of_magnetometer(known[0])
+        return on_log_clock(_ordered(replace(alone, magnetometers=()), site), site)
+    if not names:
+        raise InputError(
+            f"The fields do not say which of the site's magnetometers measured them"
+            f" ({', '.join(known)}); add a column magnetometer with its name."
+        )
+    parts = []
+    for sensor in sensors:
+        one = replace(site, platform=site.platform.carrying((sensor,)))
+        own = _ordered(fields.of_magnetometer(sensor.name), one)
+        parts.append(on_log_clock(own, one))
+    return side_by_side(parts, site)
+
+
+def on_log_clock(fields: FieldSamples, site: Site) -> FieldSamples:
+    """Return the phasors of a magnetometer by the log's clock, which is not its own."""
+    late = site.platform.magnetometer.clock_offset
+    if not late:
+        return fields
+    turn = np.exp(-2j * np.pi * tone_frequencies(site) * late)
+    return replace(
+        fields, time=fields.time + late, phasor_sensor=fields.phasor_sensor * turn[:, None]
+    )
+
+
+def side_by_side(parts: list[FieldSamples], site: Site) -> FieldSamples:
+    """Return the phasors of each of a site's magnetometers as one; times as one are one epoch."""
+    every = np.concatenate([part.time for part in parts])
+    order = np.argsort(every, kind="stable")
+    begins = np.diff(every[order], prepend=-np.inf) > SAME_TIME
+    row = np.empty(len(every), dtype=np.int64)
+    row[order] = np.cumsum(begins) - 1
+    time, window = every[order][begins], np.zeros(np.count_nonzero(begins))
+    count = len(parts[0].channels)
+    phasor = np.full((len(time), len(site.channels), 3), np.nan, dtype=np.complex128)
+    cov = np.full((*phasor.shape, 3), np.nan)
+    start = 0
+    for sensor, part in enumerate(parts):
+        own, mine = row[start : start + len(part)], site.of_sensor(sensor)
+        start += len(part)
+        window[own] = np.maximum(window[own], part.window)
+        phasor[own, mine], cov[own, mine] = part.phasor_sensor, part.phasor_cov
+    sensors = [sensor.name for sensor in site.platform.magnetometers]
+    return FieldSamples(
+        time=time,
+        window=window,
+        channels=site.channels,
+        phasor_sensor=phasor,
+        phasor_cov=cov,
+        magnetometers=tuple(name for name in sensors for _ in range(count)),
+    )
+
+
+def _ordered(fields: FieldSamples, site: Site) -> FieldSamples:
     unknown = [channel for channel in fields.channels if channel not in site.channels]
     if unknown:
         known = _listed(site.channels)
@@ -160,17 +237,38 @@ def _refuse_blind(table: Table, path: Path, axes: str) -> None:
     )
 
 
-def _channels(table: Table) -> tuple[tuple[tuple[str, int], ...], IntArray]:
+def _epochs(
+    table: Table, magnetometers: tuple[str, ...], column: IntArray
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the time and the first row of each epoch, and the epoch of each row.
+
+    Stamps of several magnetometers are of clocks of their own: what is of one is one epoch.
+    """
+    if not magnetometers:
+        return np.unique(table.time_ns, return_index=True, return_inverse=True)
+    sensor = np.array([magnetometers.index(name) for name in magnetometers])[column]
+    pairs, first, row = np.unique(
+        np.stack([table.time_ns, sensor], axis=1), axis=0, return_index=True, return_inverse=True
+    )
+    return pairs[:, 0], first, row.ravel()
+
+
+def _channels(table: Table) -> tuple[tuple[tuple[str, int], ...], tuple[str, ...], IntArray]:
+    """Return channels, the magnetometer of each, and which is that of each row."""
     names, beacon = table.texts("beacon")
     tone = table.integers("tone")
     table.refuse(tone < 0, "tone", tone, "write an integer from 0")
+    several = table.has((_MAGNETOMETER,))
+    sensors, sensor = table.texts(_MAGNETOMETER) if several else ([""], np.zeros_like(beacon))
     pairs, first, row = np.unique(
-        np.stack([beacon, tone], axis=1), axis=0, return_index=True, return_inverse=True
+        np.stack([beacon, tone, sensor], axis=1), axis=0, return_index=True, return_inverse=True
     )
     order = np.argsort(first)
     place = np.empty(len(order), dtype=np.int64)
     place[order] = np.arange(len(order))
-    return tuple((names[b], int(t)) for b, t in pairs[order]), place[row.ravel()]
+    channels = tuple((names[b], int(t)) for b, t, _ in pairs[order])
+    magnetometers = tuple(sensors[s] for _, _, s in pairs[order]) if several else ()
+    return channels, magnetometers, place[row.ravel()]
 
 
 def _covariance(table: Table) -> Array:

@@ -1,29 +1,34 @@
 """A site as one YAML file: `load_site` believes nothing unchecked, `save_site` loses nothing."""
 
 import datetime
-from collections.abc import Mapping
-from dataclasses import MISSING, fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.field_map import read_field_maps, write_field_maps
-from magfusion.files.site_casing import casing_entry
 from magfusion.files.site_correlation import load_correlation, save_correlation
 from magfusion.files.site_ground import ground_entry, log_sigma
-from magfusion.files.site_motion import MILLION, MotionEntry, imu_entry, prior_entry
+from magfusion.files.site_magnetometer import magnetometer_entries, magnetometer_of
+from magfusion.files.site_motion import MotionEntry, imu_entry, prior_entry
+from magfusion.files.site_plain import (
+    degree_sigma_entry,
+    degrees,
+    model_of,
+    plain,
+    rotation_of,
+    rpy_deg,
+    sigma_entry,
+)
 from magfusion.files.site_region import region_entry
-from magfusion.files.site_response import response_entry, response_of
 from magfusion.files.site_rotor import rotor_entry
 from magfusion.files.site_schema import (
     MARKED,
     BeaconEntry,
     ClockEntry,
     EarthEntry,
-    MagnetometerEntry,
     SiteEntry,
     SlotsEntry,
 )
@@ -40,8 +45,6 @@ from magfusion.model.site import (
     EarthModel,
     ImuModel,
     Location,
-    Magnetometer,
-    MagnetometerSigma,
     MarkedSlots,
     MotionModel,
     Platform,
@@ -59,7 +62,9 @@ SAME_FIELD = 1e-12  # T; less is rounding
 Model = TypeVar("Model", bound="DataclassInstance")
 
 
-def load_site(path: Path | str, *, unknown: bool = False, without: bool = False) -> Site:
+def load_site(
+    path: Path | str, *, unknown: bool = False, without: bool = False, several: bool = False
+) -> Site:
     """Read a site from its YAML file.
 
     Parameters
@@ -68,6 +73,8 @@ def load_site(path: Path | str, *, unknown: bool = False, without: bool = False)
         Whether beacons that were never surveyed are accepted; few jobs can do with them.
     without : bool
         Whether a site without any beacon is accepted.
+    several : bool
+        Whether several magnetometers are accepted.
 
     Returns
     -------
@@ -87,14 +94,20 @@ def load_site(path: Path | str, *, unknown: bool = False, without: bool = False)
         raise InputError(f"{path}: beacons: found []; describe at least one beacon.")
     if not unknown:
         _refuse_unknown(entry, path)
+    if not several and len(entry.platform.every) > 1:
+        raise InputError(
+            f"{path}: platform.magnetometers: this job takes one magnetometer; give a site that has"
+            f" but one of {', '.join(str(m.name) for m in entry.platform.every)}."
+        )
     location, field_world = None, entry.world.earth_field_t
     if entry.world.location is not None:
-        location = _model(Location, entry.world.location)
+        location = model_of(Location, entry.world.location)
         try:
             field_world = _reference_field(location)
         except InputError as error:
             raise InputError(f"{path}: world.{error}") from error
     maps, ground = _field_maps(entry, path), entry.world.conductivity_s_m
+    sensors = tuple(map(magnetometer_of, entry.platform.every))
     site = Site(
         gravity=entry.world.gravity_m_s2,
         model_error=entry.world.model_error,
@@ -105,16 +118,17 @@ def load_site(path: Path | str, *, unknown: bool = False, without: bool = False)
         ),
         log_conductivity_sigma=log_sigma(ground, entry.world.sigma.conductivity_s_m),
         platform=Platform(
-            NO_IMU if entry.platform.imu is None else _model(ImuModel, entry.platform.imu),
-            _magnetometer(entry.platform.magnetometer),
-            _model(MotionModel, entry.platform.motion),
+            NO_IMU if entry.platform.imu is None else model_of(ImuModel, entry.platform.imu),
+            sensors[0],
+            model_of(MotionModel, entry.platform.motion),
             None if entry.platform.motion_prior is None else entry.platform.motion_prior.prior(),
+            further=sensors[1:],
         ),
         earth_field_world=field_world,
         location=location,
         calibration=entry.calibration,
-        clock=_model(ClockModel, entry.clock),
-        earth=_model(EarthModel, entry.world.earth),
+        clock=model_of(ClockModel, entry.clock),
+        earth=model_of(EarthModel, entry.world.earth),
         region=None if entry.region is None else entry.region.region(),
         reference_world=None if entry.reference is None else entry.reference.position_m,
     )
@@ -151,7 +165,7 @@ def save_site(site: Site, path: Path | str) -> None:
         "beacons": [_beacon_entry(b) for b in site.beacons],
         "platform": {
             **imu_entry(site.platform.imu),
-            "magnetometer": _magnetometer_entry(site.platform.magnetometer),
+            **magnetometer_entries(site.platform.magnetometers),
             **_model_entry("motion", site.platform.motion, MotionEntry),
             **prior_entry(site.platform.motion_prior),
         },
@@ -161,7 +175,7 @@ def save_site(site: Site, path: Path | str) -> None:
     if site.reference_world is not None:
         content["reference"] = {"position_m": site.reference_world.tolist()}
     if site.calibration is not None:
-        content["calibration"] = _plain(site.calibration)
+        content["calibration"] = plain(site.calibration)
     if maps:
         write_field_maps(maps, beside)
     if site.correlation is not None:
@@ -186,10 +200,6 @@ def _field_maps(entry: SiteEntry, path: Path) -> dict[str, FieldMap]:
     return maps
 
 
-def _matrix(rpy_deg: Array) -> Array:
-    return Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix()
-
-
 def _reference_field(location: Location) -> Array:
     day = datetime.date.fromisoformat(location.date)
     return earth_field_world(location.latitude_deg, location.longitude_deg, location.height_m, day)
@@ -207,7 +217,7 @@ def _beacon(entry: BeaconEntry) -> Beacon:
         position_world=np.full(3, np.nan) if entry.position_m is None else entry.position_m,
         world_from_beacon=np.full((3, 3), np.nan)
         if entry.rpy_deg is None
-        else _matrix(entry.rpy_deg),
+        else rotation_of(entry.rpy_deg),
         unknown=entry.unknown,
         frequency_hz=entry.frequency_hz,
         coils=tuple(coil.coil() for coil in entry.coils or [])
@@ -228,41 +238,6 @@ def _beacon(entry: BeaconEntry) -> Beacon:
     )
 
 
-def _magnetometer(entry: MagnetometerEntry) -> Magnetometer:
-    return Magnetometer(
-        position_body=entry.body_from_sensor.position_m,
-        body_from_sensor=_matrix(entry.body_from_sensor.rpy_deg),
-        noise_density=entry.noise_density_t_rthz,
-        matrix=entry.matrix,
-        offset=entry.offset_t,
-        sigma=_model(MagnetometerSigma, entry.sigma),
-        coil_centres_sensor=entry.coil_centres_m,
-        offset_walk=entry.offset_walk_t,
-        coil_kappa=entry.coil_kappa_m2,
-        warming=None if entry.warming is None else entry.warming.warming(),
-        response=response_of(entry.response),
-        casing=None if entry.casing is None else entry.casing.casing(),
-        axes="".join(sorted(set(entry.axes or Magnetometer.axes))),
-    )
-
-
-def _model(model: type[Model], entry: StrictModel) -> Model:
-    """Return a model from its entry, whose keys are the model's fields in order, with units."""
-    given = {
-        field.name: _si(key, value) if key != field.name else value
-        for field, (key, value) in zip(fields(model), entry, strict=True)
-        if key in entry.model_fields_set or field.default is MISSING
-    }
-    return model(**given)
-
-
-def _si(key: str, value: float) -> float:
-    """Return a value in the model's unit: the key's name ends with its own."""
-    if key.endswith("_ppm"):
-        return value / MILLION
-    return value * DEGREE if key.endswith("_deg") else value
-
-
 def _model_entry(key: str, model: object, entry: type[StrictModel]) -> dict[str, Any]:
     """Return what of a model is not as usual, as an entry under a key; nothing where all is."""
     values = zip(
@@ -276,38 +251,6 @@ def _model_entry(key: str, model: object, entry: type[StrictModel]) -> dict[str,
     return {key: changed} if changed else {}
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    return value
-
-
-def _degrees(angle: Array | float) -> Any:
-    # 1e-12 deg is what arithmetic leaves of an angle: 2.0000000000000004 is written as 2.0.
-    return _plain(np.round(np.asarray(angle) / DEGREE, 12) + 0.0)
-
-
-def _rpy_deg(matrix: Array) -> Any:
-    """Return roll, pitch, yaw; Rotation.as_euler loses 1e-7 rad where the pitch is near 90 deg."""
-    yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
-    pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[0, 0], matrix[1, 0]))
-    rest = Rotation.from_euler("ZY", [yaw, pitch]).inv() * Rotation.from_matrix(matrix)
-    return _degrees(np.array([rest.as_rotvec()[0], pitch, yaw]))
-
-
-def _sigma_entry(sigma: Array) -> Any:
-    return _plain(sigma.flat[0] if np.all(sigma == sigma.flat[0]) else sigma)
-
-
-def _degree_sigma_entry(sigma: Array) -> Any:
-    # Relative here, where _degrees rounds absolutely: a sigma may be small.
-    return _sigma_entry(np.vectorize(lambda s: float(f"{s / DEGREE:.15g}"))(sigma))
-
-
 def _world_entry(site: Site) -> dict[str, Any]:
     entry: dict[str, Any] = {
         "gravity_m_s2": float(site.gravity),
@@ -319,9 +262,9 @@ def _world_entry(site: Site) -> dict[str, Any]:
     field = site.earth_field_world
     if site.location is not None and (field is None or _is_reference(field, site.location)):
         day = datetime.date.fromisoformat(site.location.date)
-        entry["location"] = _plain(vars(site.location) | {"date": day})
+        entry["location"] = plain(vars(site.location) | {"date": day})
     elif field is not None:
-        entry["earth_field_t"] = _plain(field)
+        entry["earth_field_t"] = plain(field)
     return entry | _model_entry("earth", site.earth, EarthEntry)
 
 
@@ -330,9 +273,9 @@ def _beacon_entry(beacon: Beacon) -> dict[str, Any]:
     if beacon.unknown is not None:
         place["unknown"] = beacon.unknown
     if beacon.unknown in (None, "attitude"):
-        place["position_m"] = _plain(beacon.position_world)
+        place["position_m"] = plain(beacon.position_world)
     if beacon.unknown in (None, "position"):
-        place["rpy_deg"] = _rpy_deg(beacon.world_from_beacon)
+        place["rpy_deg"] = rpy_deg(beacon.world_from_beacon)
     return {
         "name": beacon.name,
         **place,
@@ -342,9 +285,9 @@ def _beacon_entry(beacon: Beacon) -> dict[str, Any]:
         "synchronised": bool(beacon.synchronised),
         **_noise_entry(beacon),
         "sigma": {
-            "position_m": _sigma_entry(beacon.sigma.position_world),
-            "rotation_deg": _degree_sigma_entry(beacon.sigma.rotation_beacon),
-            "log_moment": _sigma_entry(beacon.sigma.log_moment),
+            "position_m": sigma_entry(beacon.sigma.position_world),
+            "rotation_deg": degree_sigma_entry(beacon.sigma.rotation_beacon),
+            "log_moment": sigma_entry(beacon.sigma.log_moment),
         },
     }
 
@@ -362,14 +305,14 @@ def _noise_entry(beacon: Beacon) -> dict[str, Any]:
     if beacon.noise_factor != Beacon.noise_factor:
         entry["noise_factor"] = float(beacon.noise_factor)
     if beacon.hemisphere_beacon is not None:
-        entry["hemisphere"] = _plain(beacon.hemisphere_beacon)
+        entry["hemisphere"] = plain(beacon.hemisphere_beacon)
     return entry | warming_entry(beacon.warming)
 
 
 def _slots(entry: SlotsEntry | str | None) -> Slots | MarkedSlots | None:
     if isinstance(entry, str):
         return MarkedSlots()
-    return None if entry is None else _model(Slots, entry)
+    return None if entry is None else model_of(Slots, entry)
 
 
 def _slots_entry(beacon: Beacon) -> dict[str, Any]:
@@ -384,11 +327,11 @@ def _slots_entry(beacon: Beacon) -> dict[str, Any]:
 
 def _coil_entry(coil: Coil) -> dict[str, Any]:
     entry: dict[str, Any] = {
-        "moment_a_m2": _plain(coil.moment_beacon),
-        "phase_deg": _degrees(coil.phase),
+        "moment_a_m2": plain(coil.moment_beacon),
+        "phase_deg": degrees(coil.phase),
     }
     if coil.centre_beacon.any():
-        entry["centre_m"] = _plain(coil.centre_beacon)
+        entry["centre_m"] = plain(coil.centre_beacon)
     options = {
         "radius_m": coil.radius,
         "length_m": coil.length,
@@ -396,35 +339,4 @@ def _coil_entry(coil: Coil) -> dict[str, Any]:
         "slot": coil.slot,
         "current_a": coil.current,
     }
-    return entry | {k: _plain(v) for k, v in options.items() if v is not None}
-
-
-def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
-    sigma, centres = magnetometer.sigma, magnetometer.coil_centres_sensor
-    own = {} if centres is None else {"coil_centres_m": _plain(centres)}
-    if magnetometer.coil_kappa != Magnetometer.coil_kappa:
-        own["coil_kappa_m2"] = float(magnetometer.coil_kappa)
-    if magnetometer.offset_walk != Magnetometer.offset_walk:
-        own["offset_walk_t"] = float(magnetometer.offset_walk)
-    own |= {} if magnetometer.axes == Magnetometer.axes else {"axes": list(magnetometer.axes)}
-    return (
-        own
-        | warming_entry(magnetometer.warming)
-        | response_entry(magnetometer.response)
-        | casing_entry(magnetometer.casing)
-        | {
-            "body_from_sensor": {
-                "position_m": _plain(magnetometer.position_body),
-                "rpy_deg": _rpy_deg(magnetometer.body_from_sensor),
-            },
-            "noise_density_t_rthz": float(magnetometer.noise_density),
-            "matrix": _plain(magnetometer.matrix),
-            "offset_t": _plain(magnetometer.offset),
-            "sigma": {
-                "matrix": _sigma_entry(sigma.matrix),
-                "offset_t": _sigma_entry(sigma.offset),
-                "rotation_deg": _degree_sigma_entry(sigma.rotation_sensor),
-                "position_m": _sigma_entry(sigma.position_body),
-            },
-        }
-    )
+    return entry | {k: plain(v) for k, v in options.items() if v is not None}

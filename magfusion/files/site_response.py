@@ -9,11 +9,12 @@ from magfusion.files.site_values import (
     HIGHEST_FREQUENCY,
     LARGEST_ANGLE,
     LOWEST_FREQUENCY,
+    at_least_one,
     between,
     refusal_at,
 )
 from magfusion.files.yaml_files import StrictModel
-from magfusion.model.response import FrequencyResponse
+from magfusion.model.response import AxisResponses, FrequencyResponse
 from magfusion.units import DEGREE, Array
 
 
@@ -25,37 +26,71 @@ class ResponseEntry(StrictModel):
     phase_deg: Annotated[float, between(-LARGEST_ANGLE, LARGEST_ANGLE)] = 0.0
 
 
-def response_of(entries: list[ResponseEntry] | None) -> FrequencyResponse | None:
+Listed = Annotated[list[ResponseEntry], at_least_one("frequency")]
+
+
+class AxisResponsesEntry(StrictModel):
+    """The response of each axis where they differ."""
+
+    x: Listed
+    y: Listed
+    z: Listed
+
+    @property
+    def axes(self) -> dict[str, list[ResponseEntry]]:
+        """Each by its letter."""
+        return {"x": self.x, "y": self.y, "z": self.z}
+
+
+def responses_of(
+    alike: list[ResponseEntry] | None, apart: AxisResponsesEntry | None
+) -> FrequencyResponse | AxisResponses | None:
+    """Return what entries say of all axes, or of each."""
+    if apart is not None:
+        return AxisResponses(*(_response(entries) for entries in apart.axes.values()))
+    return _response(alike) if alike else None
+
+
+def _response(entries: list[ResponseEntry]) -> FrequencyResponse:
     """Return what entries say, in order of frequency."""
-    if not entries:
-        return None
     rows = sorted((e.frequency_hz, e.gain, e.phase_deg * DEGREE) for e in entries)
     return FrequencyResponse(*np.array(rows).T)
 
 
-def check_response(entries: list[ResponseEntry], tones_hz: Array) -> None:
-    """Refuse a frequency that stands twice, and tones beyond those that are given."""
+def check_response(
+    entries: list[ResponseEntry], tones_hz: Array, at: tuple[str | int, ...]
+) -> None:
+    """Refuse a frequency that stands twice, and tones beyond those that are given.
+
+    Parameters
+    ----------
+    at : tuple
+        Where they stand in the site's file.
+    """
     given = [entry.frequency_hz for entry in entries]
     for k, frequency in enumerate(given):
         if frequency in given[:k]:
             remedy = "give each frequency once"
-            raise refusal_at(
-                ("platform", "magnetometer", "response", k, "frequency_hz"), frequency, remedy
-            )
+            raise refusal_at((*at, k, "frequency_hz"), frequency, remedy)
     beyond = [f for f in tones_hz if f > 0.0 and not min(given) <= f <= max(given)]
     if beyond:
         remedy = f"give it as far as the tone at {beyond[0]:g} Hz, too"
-        raise refusal_at(("platform", "magnetometer", "response"), given, remedy)
+        raise refusal_at(at, given, remedy)
 
 
-def response_entry(response: FrequencyResponse | None) -> dict[str, Any]:
+def response_entry(response: FrequencyResponse | AxisResponses | None) -> dict[str, Any]:
     """Return what a site's file says of it."""
     if response is None:
         return {}
+    if isinstance(response, AxisResponses):
+        axes = zip("xyz", response.axes, strict=True)
+        return {"axis_responses": {axis: _rows(own) for axis, own in axes}}
+    return {"response": _rows(response)}
+
+
+def _rows(response: FrequencyResponse) -> list[dict[str, float]]:
     rows = zip(response.frequency_hz, response.gain, response.phase / DEGREE, strict=True)
-    return {
-        "response": [
-            {"frequency_hz": float(f), "gain": float(g), "phase_deg": round(float(p), 12)}
-            for f, g, p in rows
-        ]
-    }
+    return [
+        {"frequency_hz": float(f), "gain": float(g), "phase_deg": round(float(p), 12)}
+        for f, g, p in rows
+    ]

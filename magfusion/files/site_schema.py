@@ -13,10 +13,13 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticKnownError
 
-from magfusion.files.site_casing import CasingEntry
+from magfusion.files.site_magnetometer import (
+    MagnetometerEntry,
+    check_magnetometers,
+    check_tones,
+)
 from magfusion.files.site_motion import ImuEntry, MotionEntry, MotionPriorEntry
 from magfusion.files.site_region import RegionEntry
-from magfusion.files.site_response import ResponseEntry, check_response
 from magfusion.files.site_rotor import RotorEntry
 from magfusion.files.site_values import (
     HIGHEST_FREQUENCY,
@@ -25,11 +28,14 @@ from magfusion.files.site_values import (
     LARGEST_DISTANCE,
     LARGEST_EARTH_FIELD,
     LARGEST_MOMENT,
-    LARGEST_NOISE_DENSITY,
-    LARGEST_OFFSET,
-    LARGEST_SCALE,
     LOWEST_FREQUENCY,
     SMALLEST_MOMENT,
+    AboveZero,
+    FromZero,
+    NotNegative,
+    Position,
+    PositionSigma,
+    RotationSigma,
     a_conductivity,
     a_direction,
     a_moment,
@@ -39,13 +45,12 @@ from magfusion.files.site_values import (
     coil_sigma,
     first_version,
     iso_date,
-    not_singular,
     refusal,
     refusal_at,
-    sigma_array,
     tesla,
+    zeros,
 )
-from magfusion.files.site_warming import SensorWarmingEntry, WarmingEntry
+from magfusion.files.site_warming import WarmingEntry
 from magfusion.files.yaml_files import StrictModel
 from magfusion.model.physics.winding import Winding, WoundCoil, wound_coil
 from magfusion.model.site import (
@@ -53,29 +58,16 @@ from magfusion.model.site import (
     ClockModel,
     Coil,
     EarthModel,
-    Magnetometer,
     Site,
 )
 from magfusion.units import DEGREE, Array
 
-
-def _zeros() -> Array:
-    return np.zeros(3)
-
-
-_AboveZero = Annotated[float, Field(gt=0.0)]
-_FromZero = Annotated[float, Field(ge=0.0)]
 _Share = Annotated[float, Field(ge=0.0, le=1.0)]
-_Positive = Annotated[_AboveZero, between(1e-12, 1e6)]
-_NotNegative = Annotated[_FromZero, between(0.0, 1e6)]
-_Length = Annotated[_AboveZero, between(1e-5, 1e3)]
+_Positive = Annotated[AboveZero, between(1e-12, 1e6)]
+_Length = Annotated[AboveZero, between(1e-5, 1e3)]
 _Count = Annotated[int, Field(ge=1, le=100_000)]
-_Frequency = Annotated[_AboveZero, between(LOWEST_FREQUENCY, HIGHEST_FREQUENCY)]
+_Frequency = Annotated[AboveZero, between(LOWEST_FREQUENCY, HIGHEST_FREQUENCY)]
 _Angle = Annotated[float, between(-LARGEST_ANGLE, LARGEST_ANGLE)]
-_Position = Annotated[Array, array(3, largest=LARGEST_DISTANCE, unit="m")]
-_Angles = Annotated[Array, array(3, largest=LARGEST_ANGLE, unit="degrees")]
-_PositionSigma = Annotated[Array, sigma_array(3, largest=1e4)]
-_RotationSigma = Annotated[Array, sigma_array(3, largest=360.0)]
 
 
 _CLOCK, _EARTH = ClockModel(), EarthModel()
@@ -95,9 +87,9 @@ class ClockEntry(StrictModel):
 
     drift_sigma: _Positive = _CLOCK.drift_sigma
     drift_largest: _Positive = _CLOCK.drift_largest
-    phase_walk_deg: _NotNegative = _CLOCK.phase_walk / DEGREE
-    drift_walk: _NotNegative = _CLOCK.drift_walk
-    log_moment_walk: _NotNegative = _CLOCK.log_moment_walk
+    phase_walk_deg: NotNegative = _CLOCK.phase_walk / DEGREE
+    drift_walk: NotNegative = _CLOCK.drift_walk
+    log_moment_walk: NotNegative = _CLOCK.log_moment_walk
 
 
 class EarthEntry(StrictModel):
@@ -105,27 +97,27 @@ class EarthEntry(StrictModel):
 
     declination_sigma_deg: _Positive = _EARTH.declination_sigma / DEGREE
     strength_sigma: _Positive = _EARTH.strength_sigma
-    declination_walk_deg: _NotNegative = _EARTH.declination_walk / DEGREE
-    strength_walk_t: Annotated[_NotNegative, tesla(LARGEST_EARTH_FIELD)] = _EARTH.strength_walk
+    declination_walk_deg: NotNegative = _EARTH.declination_walk / DEGREE
+    strength_walk_t: Annotated[NotNegative, tesla(LARGEST_EARTH_FIELD)] = _EARTH.strength_walk
 
 
 class WorldSigmaEntry(StrictModel):
     """Priors of the world's calibration; an absent one is zero, which means known."""
 
-    conductivity_s_m: Annotated[_FromZero, between(0.0, LARGEST_CONDUCTIVITY)] = 0.0
+    conductivity_s_m: Annotated[FromZero, between(0.0, LARGEST_CONDUCTIVITY)] = 0.0
 
 
 class WorldEntry(StrictModel):
     """Gravity, the Earth's field and the trust in the field model."""
 
-    gravity_m_s2: Annotated[_AboveZero, between(0.1, 100.0)] = 9.80665
+    gravity_m_s2: Annotated[AboveZero, between(0.1, 100.0)] = 9.80665
     model_error: _Share = 0.005
-    model_error_correlation_m: _NotNegative = Site.model_error_length
+    model_error_correlation_m: NotNegative = Site.model_error_length
     field_map: Annotated[str, Field(min_length=1)] | None = None
     earth_field_t: Annotated[Array, array(3), tesla(LARGEST_EARTH_FIELD)] | None = None
     location: LocationEntry | None = None
     earth: EarthEntry = EarthEntry()
-    conductivity_s_m: Annotated[_FromZero, AfterValidator(a_conductivity)] = 0.0
+    conductivity_s_m: Annotated[FromZero, AfterValidator(a_conductivity)] = 0.0
     sigma: WorldSigmaEntry = WorldSigmaEntry()
 
     @model_validator(mode="after")
@@ -147,7 +139,7 @@ class WindingEntry(StrictModel):
     """`magfusion.model.physics.winding.Winding`, and the direction of its axis."""
 
     axis: Annotated[Array, array(3), AfterValidator(a_direction)]
-    current_a: Annotated[_AboveZero, between(1e-12, 1e6)]
+    current_a: Annotated[AboveZero, between(1e-12, 1e6)]
     layers: _Count
     rows: _Count
     inner_radius_m: _Length
@@ -174,12 +166,12 @@ class CoilEntry(StrictModel):
     moment_a_m2: Annotated[Array, array(3), AfterValidator(a_moment)] | None = None
     winding: WindingEntry | None = None
     phase_deg: _Angle = 0.0
-    centre_m: _Position = Field(default_factory=_zeros)
+    centre_m: Position = Field(default_factory=zeros)
     radius_m: _Length | None = None
     length_m: _Length | None = None
     frequency_hz: _Frequency | None = None
     slot: Annotated[int, Field(ge=0)] | None = None
-    current_a: Annotated[_AboveZero, between(1e-12, 1e6)] | None = None
+    current_a: Annotated[AboveZero, between(1e-12, 1e6)] | None = None
 
     @model_validator(mode="after")
     def _moment_or_winding(self) -> Self:
@@ -229,7 +221,7 @@ MOST_SLOTS = 1000
 class SlotsEntry(StrictModel):
     """When the coils of a beacon are driven, one after the other."""
 
-    duration_s: Annotated[_AboveZero, between(1e-4, 3600.0)]
+    duration_s: Annotated[AboveZero, between(1e-4, 3600.0)]
     count: Annotated[int, Field(ge=1, le=MOST_SLOTS)]
     start_s: Annotated[float, between(-1e10, 1e10)] = 0.0
 
@@ -237,8 +229,8 @@ class SlotsEntry(StrictModel):
 class BeaconSigmaEntry(StrictModel):
     """Priors of a beacon's calibration; an absent one is zero, which means known."""
 
-    position_m: _PositionSigma = Field(default_factory=_zeros)
-    rotation_deg: _RotationSigma = Field(default_factory=_zeros)
+    position_m: PositionSigma = Field(default_factory=zeros)
+    rotation_deg: RotationSigma = Field(default_factory=zeros)
     log_moment: Annotated[Array, PlainValidator(coil_sigma)] = Field(
         default_factory=lambda: np.zeros(())
     )
@@ -365,62 +357,32 @@ class BeaconEntry(StrictModel):
         return self
 
 
-class MagnetometerSigmaEntry(StrictModel):
-    """Priors of the magnetometer's calibration; an absent one is zero."""
-
-    matrix: Annotated[Array, sigma_array(3, 3, largest=10.0)] = Field(
-        default_factory=lambda: np.zeros((3, 3))
-    )
-    offset_t: Annotated[Array, sigma_array(3, largest=1e9), tesla(LARGEST_OFFSET)] = Field(
-        default_factory=_zeros
-    )
-    rotation_deg: _RotationSigma = Field(default_factory=_zeros)
-    position_m: _PositionSigma = Field(default_factory=_zeros)
-
-
-class MountingEntry(StrictModel):
-    """Lever arm and attitude of the sensor on the body; absent ones are zero."""
-
-    position_m: _Position = Field(default_factory=_zeros)
-    rpy_deg: _Angles = Field(default_factory=_zeros)
-
-
-class MagnetometerEntry(StrictModel):
-    """``measured = matrix @ field_sensor + offset_t``, and its noise."""
-
-    body_from_sensor: MountingEntry = Field(default_factory=MountingEntry)
-    noise_density_t_rthz: Annotated[
-        _AboveZero,
-        tesla(LARGEST_NOISE_DENSITY, "T/sqrt(Hz)"),
-        between(1e-18, LARGEST_NOISE_DENSITY),
-    ]
-    matrix: Annotated[Array, array(3, 3, largest=LARGEST_SCALE), AfterValidator(not_singular)] = (
-        Field(default_factory=lambda: np.eye(3))
-    )
-    offset_t: Annotated[Array, array(3), tesla(LARGEST_OFFSET)] = Field(default_factory=_zeros)
-    coil_centres_m: Annotated[Array, array(3, 3, largest=10.0, unit="m")] | None = None
-    coil_kappa_m2: Annotated[float, between(-1.0, 1.0)] = Magnetometer.coil_kappa
-    offset_walk_t: Annotated[_NotNegative, tesla(LARGEST_OFFSET)] = 2e-8  # gained in an hour
-    warming: SensorWarmingEntry | None = None
-    response: Annotated[list[ResponseEntry], at_least_one("frequency")] | None = None
-    casing: CasingEntry | None = None
-    axes: Annotated[list[Literal["x", "y", "z"]], Field(min_length=1, max_length=3)] | None = None
-    sigma: MagnetometerSigmaEntry = Field(default_factory=MagnetometerSigmaEntry)
-
-
 class PlatformEntry(StrictModel):
     """What moves."""
 
     imu: ImuEntry | None = None
-    magnetometer: MagnetometerEntry
+    magnetometer: MagnetometerEntry | None = None
+    magnetometers: Annotated[list[MagnetometerEntry], at_least_one("magnetometer")] | None = None
     motion: MotionEntry = MotionEntry()
     motion_prior: MotionPriorEntry | None = None
+
+    @model_validator(mode="after")
+    def _one_or_several(self) -> Self:
+        check_magnetometers(self.magnetometer, self.magnetometers)
+        return self
+
+    @property
+    def every(self) -> list[MagnetometerEntry]:
+        """All magnetometers."""
+        if self.magnetometers is not None:
+            return self.magnetometers
+        return [] if self.magnetometer is None else [self.magnetometer]
 
 
 class ReferenceEntry(StrictModel):
     """A second magnetometer, which witnesses the noise."""
 
-    position_m: _Position
+    position_m: Position
 
 
 class SiteEntry(StrictModel):
@@ -437,11 +399,17 @@ class SiteEntry(StrictModel):
     correlation: Annotated[str, Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
-    def _response_to_all_tones(self) -> Self:
-        response = self.platform.magnetometer.response
-        if response is not None:
-            tones = [f for b in self.beacons for f in b.tones_hz]
-            check_response(response, np.array(tones))
+    def _magnetometers_fit_the_beacons(self) -> Self:
+        tones = [f for b in self.beacons for f in b.tones_hz]
+        several = self.platform.magnetometers is not None
+        for i, sensor in enumerate(self.platform.every):
+            key = ("magnetometers", i) if several else ("magnetometer",)
+            check_tones(sensor, np.array(tones), ("platform", *key))
+        taken = [sensor.name for sensor in self.platform.every] if several else []
+        for i, beacon in enumerate(self.beacons):
+            if beacon.name in taken:
+                place = ("platform", "magnetometers", taken.index(beacon.name), "name")
+                raise refusal_at(place, beacon.name, f"give it another name than beacons[{i}]")
         return self
 
     @model_validator(mode="after")

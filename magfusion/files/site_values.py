@@ -3,10 +3,10 @@
 import datetime
 import math
 import sys
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, PlainValidator, ValidationError
+from pydantic import AfterValidator, Field, PlainValidator, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from magfusion.units import Array
@@ -173,3 +173,17 @@ def between(least: float, most: float) -> AfterValidator:
         return value
 
     return AfterValidator(check)
+
+
+def zeros() -> Array:
+    """Return what an absent vector is."""
+    return np.zeros(3)
+
+
+AboveZero = Annotated[float, Field(gt=0.0)]
+FromZero = Annotated[float, Field(ge=0.0)]
+NotNegative = Annotated[FromZero, between(0.0, 1e6)]
+Position = Annotated[Array, array(3, largest=LARGEST_DISTANCE, unit="m")]
+Angles = Annotated[Array, array(3, largest=LARGEST_ANGLE, unit="degrees")]
+PositionSigma = Annotated[Array, sigma_array(3, largest=1e4)]
+RotationSigma = Annotated[Array, sigma_array(3, largest=360.0)]

@@ -86,6 +86,8 @@ class Layout:
         Whether several rows may have the same time.
     some : tuple of str
         Columns with numbers, of which one at least must be there.
+    optional_texts : tuple of str
+        Columns of text that may be there.
     """
 
     numbers: tuple[str, ...]
@@ -94,11 +96,13 @@ class Layout:
     optional: tuple[tuple[str, ...], ...] = ()
     repeats: bool = False
     some: tuple[str, ...] = ()
+    optional_texts: tuple[str, ...] = ()
 
     def chosen(self, found: Sequence[str], path: Path) -> list[str]:
         """Return the columns to read of those found; refuse a table that lacks one."""
         groups = [g for g in self.optional if set(g) & set(found)]
-        wanted = [*self.integers, *self.texts, *self.numbers, *(name for g in groups for name in g)]
+        texts = [*self.texts, *(name for name in self.optional_texts if name in found)]
+        wanted = [*self.integers, *texts, *self.numbers, *(name for g in groups for name in g)]
         wanted += [name for name in self.some if name in found] or self.some
         missing = [name for name in wanted if name not in found]
         if missing:
@@ -115,7 +119,7 @@ class Layout:
         """Return the type that a CSV's text must have."""
         if name in self.integers:
             return pa.int64()
-        return pa.string() if name in self.texts else pa.float64()
+        return pa.string() if name in (*self.texts, *self.optional_texts) else pa.float64()
 
 
 @dataclass(frozen=True, eq=False)

@@ -294,9 +294,9 @@ def _band(settings: DesignSettings, site: Site) -> Band:
             " --band 10,100"
         )
     response = site.platform.magnetometer.response
-    if response is not None:
-        low = max(low, float(response.frequency_hz[0]))
-        high = min(high, float(response.frequency_hz[-1]))
+    for axis in () if response is None else response.axes:
+        low = max(low, float(axis.frequency_hz[0]))
+        high = min(high, float(axis.frequency_hz[-1]))
     return Band(low, high, settings.window, settings.mains_hz)
 
 

@@ -141,7 +141,9 @@ def run_fix(
 
     claimed = claim(job.output, "smooth", "fix")
     used = rest is not None and rest.at_rest
-    log, site = read_job(job, fewer=True, amplitudes=True, reference=used, report=report)
+    log, site = read_job(
+        job, fewer=True, amplitudes=True, several=True, reference=used, report=report
+    )
     began = time.perf_counter()
     report("demodulating", 0, 3)
     if used and site.platform.magnetometer.lacking:

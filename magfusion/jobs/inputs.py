@@ -10,6 +10,7 @@ from pathlib import Path
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.drive_reference import turning_currents, with_drives
+from magfusion.estimation.integrity.magnetometers import without_silent
 from magfusion.estimation.integrity.mending import mended
 from magfusion.estimation.warming import at_reference
 from magfusion.files.atomic import (
@@ -223,7 +224,9 @@ def topics_option(text: str | None) -> Topics | None:
     return Topics(**{role: name for role, _, name in roles})
 
 
-def read_site(job: Job, *, unknown: bool = False, without: bool = False) -> Site:
+def read_site(
+    job: Job, *, unknown: bool = False, without: bool = False, several: bool = False
+) -> Site:
     """Read the site of a job.
 
     Parameters
@@ -232,6 +235,8 @@ def read_site(job: Job, *, unknown: bool = False, without: bool = False) -> Site
         Whether the job can do with beacons that were never surveyed.
     without : bool
         Whether it can do without any.
+    several : bool
+        Whether it can do with several magnetometers.
 
     Raises
     ------
@@ -243,7 +248,8 @@ def read_site(job: Job, *, unknown: bool = False, without: bool = False) -> Site
         raise InputError(
             f"{job.log_path}: holds no site.yaml; name the site's file with --site SITE.yaml"
         )
-    return job.where.bounded(load_site(job.declared_path, unknown=unknown, without=without))
+    site = load_site(job.declared_path, unknown=unknown, without=without, several=several)
+    return job.where.bounded(site)
 
 
 def read_job(
@@ -255,6 +261,7 @@ def read_job(
     amplitudes: bool = False,
     reference: bool = False,
     rotor: bool = False,
+    several: bool = False,
     report: Report = quiet,
 ) -> tuple[Log, Site]:
     """Read the log and the site of a job, and see that they belong together.
@@ -273,14 +280,23 @@ def read_job(
         Whether it uses a reference sensor; that it does not is said.
     rotor : bool
         Whether it takes the angle of a rotor and a casing itself.
+    several : bool
+        Whether it can do with several magnetometers.
 
     Raises
     ------
     InputError
         For anything in either file that a user must correct.
     """
-    site = read_site(job, unknown=unknown, without=without)
+    site = read_site(job, unknown=unknown, without=without, several=several)
     log = _open(job, report)
+    if site.platform.further and log.fields is None:
+        raise InputError(
+            f"{job.log_path}: the samples of several magnetometers are not demodulated; demodulate"
+            " each by its own site, and give all in one fields.parquet with a column magnetometer"
+        )
+    if site.platform.further:
+        log = replace(log, waveform=None)
     _check_axes(job, log, site, fewer=fewer, amplitudes=amplitudes)
     if site.platform.magnetometer.casing is not None and not rotor:
         raise InputError(
@@ -301,6 +317,7 @@ def read_job(
     if log.fields is not None:
         with named(job.log_path):
             log = replace(log, fields=order_channels(log.fields, site))
+        log, site = without_silent(log, site)
     with named(job.log_path):
         if not rotor:
             log = turning_currents(log, site)

@@ -44,7 +44,7 @@ def without_beacons(job: Job) -> bool:
     """Tell whether a job's site has no beacon, so that only the orientation can be found."""
     if not job.declared_path.is_file():
         return False
-    return not load_site(job.declared_path, unknown=True, without=True).beacons
+    return not load_site(job.declared_path, unknown=True, without=True, several=True).beacons
 
 
 def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Report) -> Figures:

@@ -283,7 +283,7 @@ class WindowSettings(Settings):
         from magfusion.receiver.receiver import usual_lockin
         from magfusion.receiver.windows import LockinSettings
 
-        site = read_site(job, unknown=True)
+        site = read_site(job, unknown=True, several=True)
         usual = usual_lockin(site, self.mains_hz)
         least = usual.window / 2.0
         length = usual.window if self.window is None else self.window

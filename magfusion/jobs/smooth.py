@@ -23,11 +23,11 @@ from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figure, Figures, Section, heading
 
 if TYPE_CHECKING:
-    from magfusion.estimation.batch import SmootherSettings
+    from magfusion.estimation.batch import Smoothed, SmootherSettings
     from magfusion.jobs.inputs import Job
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
-    from magfusion.model.trust import Risk
+    from magfusion.model.trust import Finding, Risk
     from magfusion.units import Rate
 
 
@@ -133,25 +133,31 @@ def run_smooth(
     from magfusion.results.report import FAILED
 
     claimed = claim(job.output, "smooth", "fix")
-    log, site = read_job(job, unknown=True, fewer=True, report=report)
+    log, site = read_job(job, unknown=True, fewer=True, several=True, report=report)
     refuse_rate(job.log_path, log, rate)
     if free_gain:
         site = _with_gain(job, log, site, settings)
+    if site.platform.further and any(beacon.unknown is not None for beacon in site.beacons):
+        raise InputError(
+            f"{job.declared_path}: beacons that were never surveyed are placed by one magnetometer;"
+            " give a site that has one"
+        )
     began = time.perf_counter()
     try:
         with named(job.log_path):
             result, placed = smooth_and_place(log, site, settings, report)
+            log, site, result, said = _agreed(log, site, settings, result, risk)
     except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
         reason = reason_of(error)
         if any(beacon.unknown is not None for beacon in site.beacons):
             raise EstimationError(f"{job.log_path}: {reason}") from error
         with claimed as whole:
-            said = _save_fixes_instead(whole, settings, log, site, reason)
+            told = _save_fixes_instead(whole, settings, log, site, reason)
         raise EstimationError(
-            f"{job.log_path}: {said}; the single-epoch fixes were saved in {job.output / FAILED}"
+            f"{job.log_path}: {told}; the single-epoch fixes were saved in {job.output / FAILED}"
         ) from error
     _give_back_memory()
-    done = finished(log, site, settings, result, risk)
+    done = finished(log, site, settings, result, risk, said=said)
     elapsed = Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     done = replace(done, figures=done.figures | elapsed)
     done = with_errors(done, log, placed, (site, settings))
@@ -174,6 +180,27 @@ def _with_gain(job: Job, log: Log, site: Site, settings: SmootherSettings) -> Si
         )
     with named(job.log_path):
         return with_found_gain(phasors(log, site, settings.lockin)[0], site)
+
+
+def _agreed(
+    log: Log, site: Site, settings: SmootherSettings, result: Smoothed, risk: Risk | None
+) -> tuple[Log, Site, Smoothed, tuple[Finding, ...]]:
+    """Return all without a magnetometer that contradicts the others, and what is said of it."""
+    if not site.platform.further:
+        return log, site, result, ()
+    from magfusion.estimation.batch import smooth
+    from magfusion.estimation.integrity.magnetometer_exclusion import agreed
+
+    plain = replace(settings, tune=False)
+    found = agreed(
+        result,
+        log,
+        site,
+        lambda log, site: smooth(log, site, settings),
+        lambda log, site: smooth(log, site, plain),
+        risk,
+    )
+    return found.log, found.site, found.result, found.findings
 
 
 def _give_back_memory() -> None:

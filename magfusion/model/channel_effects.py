@@ -6,8 +6,9 @@ phasor.
 
 import numpy as np
 
+from magfusion.model.response import AxisResponses, FrequencyResponse
 from magfusion.model.site import Site
-from magfusion.units import Array
+from magfusion.units import Array, ComplexArray
 
 
 def are_driven(site: Site) -> bool:
@@ -39,14 +40,51 @@ def driven(site: Site, time: Array) -> tuple[Array, Array] | None:
 
 
 def responded(site: Site) -> tuple[Array, Array] | None:
-    """Return how the magnetometer answers to each channel's frequency: log-gain and phase (rad).
+    """Return how the magnetometers answer to each channel's frequency: log-gain and phase (rad).
 
-    Each of shape (channels,); None where all are measured as they are.
+    Each of shape (channels,); None where all are measured as they are.  Of axes that answer each in
+    its own way, see `axis_factors`.
     """
-    response = site.platform.magnetometer.response
-    if response is None or not site.beacons:
+    sensors = site.platform.magnetometers
+    alike = [s.response if isinstance(s.response, FrequencyResponse) else None for s in sensors]
+    if all(response is None for response in alike) or not site.beacons:
         return None
-    return response.at(np.concatenate([b.tone_frequencies_hz for b in site.beacons]))
+    frequencies_hz = tone_frequencies(site)
+    none = np.zeros_like(frequencies_hz)
+    parts = [(none, none) if r is None else r.at(frequencies_hz) for r in alike]
+    if len(parts) == 1:
+        return parts[0]
+    sizes, phases = zip(*parts, strict=True)
+    return np.concatenate(sizes), np.concatenate(phases)
+
+
+def axis_factors(site: Site) -> ComplexArray | None:
+    """Return what each axis measures of a channel's field beyond `responded`, (channels, 3).
+
+    None where no magnetometer has axes that answer each in its own way.
+    """
+    sensors = site.platform.magnetometers
+    if not site.beacons or not any(isinstance(s.response, AxisResponses) for s in sensors):
+        return None
+    frequencies_hz = tone_frequencies(site)
+    alike = np.ones((len(frequencies_hz), 3), dtype=np.complex128)
+    return np.concatenate(
+        [
+            s.response.factor(frequencies_hz) if isinstance(s.response, AxisResponses) else alike
+            for s in sensors
+        ]
+    )
+
+
+def tone_frequencies(site: Site) -> Array:
+    """Return the frequency of each channel of a magnetometer (Hz)."""
+    return np.concatenate([beacon.tone_frequencies_hz for beacon in site.beacons])
+
+
+def of_all_sensors(site: Site, by_tone: Array) -> Array:
+    """Return what is of the channels (...) of any magnetometer for all of them."""
+    count = len(site.platform.magnetometers)
+    return by_tone if count == 1 else np.concatenate([by_tone] * count, axis=-1)
 
 
 def warmed(site: Site, time: Array) -> Array | None:
@@ -72,4 +110,4 @@ def warmed(site: Site, time: Array) -> Array | None:
         if beacon.warming is not None and degc is not None:
             own = beacon.warming.log_moment_per_k * (degc - beacon.warming.reference_degc)
         parts += [own] * len(beacon.tones)
-    return np.stack(parts, axis=-1)
+    return of_all_sensors(site, np.stack(parts, axis=-1))

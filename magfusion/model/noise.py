@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from magfusion.model.channel_effects import tone_frequencies
 from magfusion.model.field import power_error_cov, predict
 from magfusion.model.field_map import block_diagonal
 from magfusion.model.ground import conductivity_of, ground_error
-from magfusion.model.parameters import BeaconParameter, candidates
+from magfusion.model.parameters import BeaconParameter, MagnetometerParameter, candidates
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -16,13 +17,15 @@ from magfusion.units import MU0_OVER_4PI, Array, BoolArray, ComplexArray
 ROUNDING = 1e-12  # of a covariance's mean eigenvalue
 
 
-def calibration_error(site: Site, distance: Array) -> Array:
+def calibration_error(site: Site, distance: Array, sensor: int = 0) -> Array:
     """Return the relative error of each beacon's field that its survey's sigmas cause.
 
     Parameters
     ----------
     distance : ndarray, shape (n, beacons)
         (m)
+    sensor : int
+        Which of the magnetometers measures it.
 
     Returns
     -------
@@ -32,6 +35,8 @@ def calibration_error(site: Site, distance: Array) -> Array:
     variance = np.zeros_like(distance)
     names = [beacon.name for beacon in site.beacons]
     for parameter, owner in candidates(site):
+        if isinstance(parameter, MagnetometerParameter) and parameter.sensor(site, owner) != sensor:
+            continue
         if parameter.field_error:
             rows = names.index(owner) if isinstance(parameter, BeaconParameter) else slice(None)
             share = parameter.field_error * np.mean(parameter.sigma(site, owner) ** 2)
@@ -62,8 +67,8 @@ def squares(site: Site, samples: FieldSamples, sensor_world: Array | None = None
 
     Parameters
     ----------
-    sensor_world : ndarray, shape (n, 3), optional
-        Where the magnetometer is (m).
+    sensor_world : ndarray, shape (n, magnetometers, 3), optional
+        Where they are (m).  Of several each has all three components.
     """
     square, partial = np.abs(samples.phasor_sensor) ** 2, samples.partial
     if not np.any(partial):
@@ -80,7 +85,7 @@ def squares(site: Site, samples: FieldSamples, sensor_world: Array | None = None
         )
         point = replace(point, coil_centres_sensor=None)
         turn = np.broadcast_to(along, (len(rows), 3, 3))
-        fields = [predict(beacon, point, turn, sensor_world[rows]) for beacon in site.beacons]
+        fields = [predict(beacon, point, turn, sensor_world[rows, 0]) for beacon in site.beacons]
         gain = np.sum(sensor.matrix**2) / 3.0
         mean = gain * np.sum(np.abs(np.concatenate(fields, axis=1)) ** 2, axis=-1) / 3.0
     square[rows] = np.where(partial[rows, :, None], mean[..., None], square[rows])
@@ -92,27 +97,57 @@ def model_error(site: Site, sensor_world: Array | None = None) -> Array:
 
     Parameters
     ----------
-    sensor_world : ndarray, shape (n, 3), optional
-        Where the magnetometer is (m): a field map is not equally well known everywhere.
+    sensor_world : ndarray, shape (n, magnetometers, 3), optional
+        Where they are (m): a field map is not equally well known everywhere.
 
     Returns
     -------
     ndarray, shape (channels,) or (n, channels)
     """
+    if site.platform.further:
+        places = [None] if sensor_world is None else np.swapaxes(sensor_world, 0, 1)
+        alone = replace(site, platform=replace(site.platform, further=()))
+        seen = [model_error(alone, None if at is None else at[:, None]) for at in places]
+        return np.concatenate(seen * (len(site.platform.magnetometers) // len(seen)), axis=-1)
+    at = None if sensor_world is None else sensor_world[:, 0]
     parts = [
         np.asarray((site.model_error if beacon.model_error is None else beacon.model_error) ** 2)
         if beacon.field_map is None
-        else beacon.field_map.relative_variance(sensor_world)
+        else beacon.field_map.relative_variance(at)
         for beacon in site.beacons
     ]
-    owner = [i for i, b in enumerate(site.beacons) for _ in b.tones]
-    return np.sqrt(np.stack(np.broadcast_arrays(*parts), axis=-1))[..., owner]
+    return np.sqrt(np.stack(np.broadcast_arrays(*parts), axis=-1))[..., site.owner]
 
 
 def sensor_positions(site: Site, poses: Trajectory) -> Array:
-    """Return where the magnetometer is at each pose of the body, shape (n, 3), world (m)."""
-    lever_body = site.platform.magnetometer.position_body
-    return poses.position_world + poses.world_from_body @ lever_body
+    """Return where the magnetometers are at each pose, (n, magnetometers, 3), world (m)."""
+    return sensors_at(site, poses.world_from_body, poses.position_world)
+
+
+def sensors_at(site: Site, world_from_body: Array, position_world: Array) -> Array:
+    """Return the same at poses of any number (n, ...)."""
+    sensors = site.platform.magnetometers
+    return np.stack([position_world + world_from_body @ s.position_body for s in sensors], axis=1)
+
+
+def alike_beside(site: Site, valid: BoolArray) -> Array:
+    """Return how many magnetometers of an epoch have the error of a field model, (n, channels).
+
+    It is that of iron, and much the same at places that lie closer than its length: what two of
+    them tell does not average it.
+
+    Parameters
+    ----------
+    valid : bool ndarray, shape (n, channels)
+        What the epochs hold.
+    """
+    places = np.array([sensor.position_body for sensor in site.platform.magnetometers])
+    if len(places) == 1 or site.model_error_length <= 0.0:
+        return np.ones(valid.shape)
+    apart = np.linalg.norm(places[:, None] - places, axis=2)
+    beside = np.exp(-apart / site.model_error_length) - np.eye(len(places))
+    there = np.stack([np.any(valid[:, site.of_sensor(k)], axis=1) for k in range(len(places))], 1)
+    return np.asarray(1.0 + (there @ beside)[:, site.sensor])
 
 
 def measurement_cov(
@@ -123,6 +158,7 @@ def measurement_cov(
     sensor_world: Array | None = None,
     windows: float = 1.0,
     alike: Array | float = 1.0,
+    beside: bool = True,
 ) -> Array:
     """Return the covariance of each phasor component: noise and model error.
 
@@ -132,12 +168,15 @@ def measurement_cov(
     ----------
     survey_error : bool
         Add what the sigmas of the site's calibration cause, for a solver that does not estimate it.
-    sensor_world : ndarray, shape (n, 3), optional
-        Where the magnetometer is (m), as far as it is known: how well a field map is known there.
+    sensor_world : ndarray, shape (n, magnetometers, 3), optional
+        Where they are (m), as far as it is known: how well a field map is known there.
     windows : float
         How many windows hold each sample, and with it its noise.
     alike : ndarray, shape (n,), or float
         How many epochs have the same model error.
+    beside : bool
+        Whether magnetometers beside each other count as one for what they share of it; not where
+        the estimate considers what is shared.
 
     Returns
     -------
@@ -145,16 +184,32 @@ def measurement_cov(
         (T^2), measured axes.
     """
     error = model_error(site, sensor_world) * np.sqrt(np.asarray(alike))[..., None]
-    owner = [i for i, b in enumerate(site.beacons) for _ in b.tones]
+    if beside and site.platform.further:
+        error = error * np.sqrt(alike_beside(site, samples.valid))
+    owner = site.owner
     factor = windows * np.array([b.noise_factor for b in site.beacons])[owner] ** 2
     total = factor[:, None, None] * samples.phasor_cov
     square = squares(site, samples, sensor_world)
     power = 0.5 * np.sum(square, axis=-1)
     total = total + power_error_cov(power, error)
     if survey_error:
-        relative = calibration_error(site, _distances(site, square))[:, owner]
+        relative = _relative_error(site, square)
         total = total + (relative**2 * power / 3.0)[..., None, None] * np.eye(3)
     return total
+
+
+def _relative_error(site: Site, square: Array) -> Array:
+    """Return the relative error that the survey's sigmas cause, shape (n, channels)."""
+    parts = []
+    for sensor in range(len(site.platform.magnetometers)):
+        mine = site.of_sensor(sensor)
+        distance = _distances(site, square[:, mine])
+        relative = calibration_error(site, distance, sensor)[:, site.owner[mine]]
+        late = site.platform.magnetometers[sensor].sigma.clock_offset
+        if late:
+            relative = np.hypot(relative, 2.0 * np.pi * late * tone_frequencies(site))
+        parts.append(relative)
+    return np.concatenate(parts, axis=1)
 
 
 def cholesky(cov: Array) -> Array:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.units import Array
+from magfusion.units import Array, ComplexArray
 
 
 @dataclass(frozen=True, eq=False)
 class FrequencyResponse:
-    """Of all three axes.
+    """Of all three axes, or of one.
 
     Parameters
     ----------
@@ -29,6 +29,11 @@ class FrequencyResponse:
     gain: Array
     phase: Array
 
+    @property
+    def axes(self) -> tuple["FrequencyResponse", ...]:
+        """What each axis has: all the same."""
+        return self, self, self
+
     def at(self, frequency_hz: Array) -> tuple[Array, Array]:
         """Return logarithm of the gain, and phase (rad), at some frequencies (Hz).
 
@@ -41,3 +46,27 @@ class FrequencyResponse:
         return np.where(steady, 0.0, size), np.where(
             steady, 0.0, np.interp(where, known, self.phase)
         )
+
+
+@dataclass(frozen=True, eq=False)
+class AxisResponses:
+    """Of axes that answer each in its own way.
+
+    Parameters
+    ----------
+    x, y, z : FrequencyResponse
+    """
+
+    x: FrequencyResponse
+    y: FrequencyResponse
+    z: FrequencyResponse
+
+    @property
+    def axes(self) -> tuple[FrequencyResponse, FrequencyResponse, FrequencyResponse]:
+        """All three."""
+        return self.x, self.y, self.z
+
+    def factor(self, frequency_hz: Array) -> ComplexArray:
+        """Return what is measured as a share of the field, shape (n, 3), at frequencies (n,)."""
+        parts = [axis.at(frequency_hz) for axis in self.axes]
+        return np.stack([np.exp(size + 1j * phase) for size, phase in parts], axis=-1)

@@ -1,7 +1,7 @@
 """The streams of a log as arrays, time first."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -94,6 +94,8 @@ class FieldSamples:
         Components that the receiver has; the others are NaN.
     signed : bool
         False of amplitudes without sign and phase: real, of the one axis.
+    magnetometers : tuple of str
+        Name of the one that measures each channel; empty where there are not several.
     """
 
     time: Array
@@ -104,6 +106,7 @@ class FieldSamples:
     ahead: Array | None = None
     axes: str = "xyz"
     signed: bool = True
+    magnetometers: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n, c = len(self.time), len(self.channels)
@@ -140,6 +143,7 @@ class FieldSamples:
             else np.concatenate([p.ahead_or_zero for p in parts]),
             axes=parts[0].axes,
             signed=parts[0].signed,
+            magnetometers=parts[0].magnetometers,
         )
 
     def epochs(self) -> list["FieldSamples"]:
@@ -157,7 +161,24 @@ class FieldSamples:
             None if self.ahead is None else self.ahead[kept],
             self.axes,
             self.signed,
+            self.magnetometers,
         )
+
+    def of_magnetometer(self, name: str) -> "FieldSamples":
+        """Return the channels of one magnetometer at the epochs that hold any of them."""
+        own = np.array([magnetometer == name for magnetometer in self.magnetometers], dtype=bool)
+        channels = tuple(c for c, mine in zip(self.channels, own, strict=True) if mine)
+        phasor, cov = self.phasor_sensor[:, own], self.phasor_cov[:, own]
+        ahead = None if self.ahead is None else self.ahead[:, own]
+        alone = replace(
+            self,
+            channels=channels,
+            phasor_sensor=phasor,
+            phasor_cov=cov,
+            ahead=ahead,
+            magnetometers=(),
+        )
+        return alone.rows(np.any(alone.valid, axis=1))
 
     @property
     def ahead_or_zero(self) -> Array:

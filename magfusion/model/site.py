@@ -1,7 +1,7 @@
 """The installation: beacons, the platform that moves among them, and how well each is known."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -10,14 +10,14 @@ import numpy as np
 from magfusion.model.correlation import Correlation
 from magfusion.model.drive import DriveShares
 from magfusion.model.field_map import FieldMap
-from magfusion.model.physics.casing import Casing
+from magfusion.model.magnetometer import Magnetometer as Magnetometer
+from magfusion.model.magnetometer import MagnetometerSigma as MagnetometerSigma
 from magfusion.model.platform_motion import A_HAND, MotionPrior, Replaced
 from magfusion.model.platform_motion import ImuModel as ImuModel
 from magfusion.model.platform_motion import MotionModel as MotionModel
 from magfusion.model.region import Bounds, Region, bounds_of
-from magfusion.model.response import FrequencyResponse
 from magfusion.model.rotor import Rotor as Rotor
-from magfusion.model.temperature import SensorWarming, Temperatures, Warming
+from magfusion.model.temperature import Temperatures, Warming
 from magfusion.units import Array, ComplexArray, IntArray
 
 Unknown = Literal["pose", "position", "attitude"]
@@ -252,85 +252,16 @@ class EarthModel:
     strength_walk: float = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class MagnetometerSigma:
-    """Prior standard deviations of the magnetometer's calibration; zero means known.
-
-    Parameters
-    ----------
-    matrix : ndarray, shape (3, 3)
-    offset : ndarray, shape (3,)
-        (T)
-    rotation_sensor : ndarray, shape (3,)
-        Of the mounting, sensor axes (rad).
-    position_body : ndarray, shape (3,)
-        Of the lever arm, body axes (m).
-    """
-
-    matrix: Array
-    offset: Array
-    rotation_sensor: Array
-    position_body: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Magnetometer:
-    """``measured = matrix @ field_sensor + offset`` at ``position_body`` on the platform.
-
-    Parameters
-    ----------
-    position_body : ndarray, shape (3,)
-        Lever arm (m).
-    body_from_sensor : ndarray, shape (3, 3)
-        Mounting rotation.
-    noise_density : float
-        One-sided white noise (T/sqrt(Hz)).
-    matrix : ndarray, shape (3, 3)
-    offset : ndarray, shape (3,)
-        (T)
-    coil_centres_sensor : ndarray, shape (3, 3), optional
-        Magnetic centre of each axis's own coil (m), row by row; None where all three are at
-        ``position_body``.
-    offset_walk : float
-        Standard deviation that the offset gains in an hour (T).
-    coil_kappa : float
-        Finite size of each axis's coil (m^2, `magfusion.model.receive_coils`); zero for a point.
-    warming : SensorWarming, optional
-        How matrix and offset change with temperature.
-    response : FrequencyResponse, optional
-        To fields that are not steady; None where they are measured as steady ones are.
-    axes : str
-        Letters of the axes that it has.
-    casing : Casing, optional
-        Steel tube that it is in.
-    """
-
-    position_body: Array
-    body_from_sensor: Array
-    noise_density: float
-    matrix: Array
-    offset: Array
-    sigma: MagnetometerSigma
-    coil_centres_sensor: Array | None = None
-    offset_walk: float = 2e-8
-    coil_kappa: float = 0.0
-    warming: SensorWarming | None = None
-    response: FrequencyResponse | None = None
-    axes: str = "xyz"
-    casing: Casing | None = None
-
-    @property
-    def lacking(self) -> tuple[int, ...]:
-        """Numbers of the axes that it has not."""
-        return tuple(k for k, axis in enumerate("xyz") if axis not in self.axes)
-
-
 @dataclass(frozen=True)
 class Platform:
-    """What moves: an IMU and a magnetometer rigidly mounted beside it.
+    """What moves: an IMU and one magnetometer or several, rigidly mounted beside it.
 
     Parameters
     ----------
+    magnetometer : Magnetometer
+        The only one, or the first.
+    further : tuple of Magnetometer
+        Those beside it.
     motion_prior : MotionPrior, optional
         What is assumed of the motion where a log has no inertial samples.
     replaced : Replaced, optional
@@ -343,11 +274,21 @@ class Platform:
     motion: MotionModel = A_HAND
     motion_prior: MotionPrior | None = None
     replaced: Replaced | None = None
+    further: tuple[Magnetometer, ...] = ()
 
     @property
     def inertial(self) -> bool:
         """Whether an IMU measures the motion."""
         return self.replaced is None
+
+    @property
+    def magnetometers(self) -> tuple[Magnetometer, ...]:
+        """Every magnetometer."""
+        return (self.magnetometer, *self.further)
+
+    def carrying(self, magnetometers: tuple[Magnetometer, ...]) -> "Platform":
+        """Return the platform with other magnetometers."""
+        return replace(self, magnetometer=magnetometers[0], further=magnetometers[1:])
 
 
 @dataclass(frozen=True)
@@ -415,5 +356,26 @@ class Site:
 
     @cached_property
     def channels(self) -> tuple[tuple[str, int], ...]:
-        """(beacon, tone) of each phasor, in site order: the channel axis of `FieldSamples`."""
-        return tuple((b.name, k) for b in self.beacons for k in range(len(b.tones)))
+        """(beacon, tone) of each phasor, in site order: the channel axis of `FieldSamples`.
+
+        Of several magnetometers those of the first, then those of the next.
+        """
+        own = tuple((b.name, k) for b in self.beacons for k in range(len(b.tones)))
+        return own * len(self.platform.magnetometers)
+
+    @cached_property
+    def owner(self) -> IntArray:
+        """Which beacon each channel is of, shape (channels,)."""
+        own = [i for i, beacon in enumerate(self.beacons) for _ in beacon.tones]
+        return np.array(own * len(self.platform.magnetometers), dtype=np.int64)
+
+    @cached_property
+    def sensor(self) -> IntArray:
+        """Which magnetometer each channel is measured by, shape (channels,)."""
+        count = len(self.platform.magnetometers)
+        return np.repeat(np.arange(count), len(self.channels) // count)
+
+    def of_sensor(self, sensor: int) -> slice:
+        """Return the channels of one magnetometer."""
+        count = len(self.channels) // len(self.platform.magnetometers)
+        return slice(sensor * count, (sensor + 1) * count)

@@ -63,7 +63,7 @@ def motion_coverage(
     imu : ImuSamples
         Its rests are counted.
     """
-    sensor_world = sensor_positions(calibration.site, states)
+    sensor_world = sensor_positions(calibration.site, states)[:, 0]
     nearest, spread = {}, {}
     for beacon in calibration.site.beacons:
         offset = sensor_world - beacon.position_world

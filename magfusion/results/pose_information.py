@@ -12,7 +12,7 @@ import numpy as np
 
 from magfusion.estimation.integrity.separation import Separation, protection_levels
 from magfusion.model.field import model_error_cov
-from magfusion.model.noise import model_error, paired_whitening
+from magfusion.model.noise import alike_beside, model_error, paired_whitening, sensors_at
 from magfusion.model.parameters import PHASE, Block, Calibration, linearize_channels
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.site import Site
@@ -96,11 +96,14 @@ def whitened(
     )
     phasor = value[..., :3] + 1j * value[..., 3:]
     noise = variance[:, None, None] * np.eye(3)
-    sensor_world = position_world + attitude @ site.platform.magnetometer.position_body
-    cov = noise + model_error_cov(phasor, model_error(site, sensor_world))
+    sensor_world = sensors_at(site, rotation, position_world)
+    error = model_error(site, sensor_world)
+    if site.platform.further:
+        error = error * np.sqrt(alike_beside(site, np.ones(phasor.shape[:2], dtype=bool)))
+    cov = noise + model_error_cov(phasor, error)
     sqrt_information = paired_whitening(cov, np.ones(cov.shape[:2], dtype=bool))
     strong = np.linalg.norm(value, axis=2) > DETECTION_CHI_SQUARE * np.sqrt(variance)
-    owner = np.array([i for i, b in enumerate(site.beacons) for _ in b.tones])
+    owner = site.owner
     owners = owner == np.arange(len(site.beacons))[:, None]
     detected = np.sum((strong[:, None] & owners).any(axis=2), axis=1)
     rows = (count, 6 * value.shape[1])

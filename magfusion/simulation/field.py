@@ -18,8 +18,8 @@ class Drives:
 
     Parameters
     ----------
-    phase : ndarray, shape (channels,)
-        At the log's epoch (rad).
+    phase : ndarray, shape (tones,)
+        Of all beacons' tones, one after the other, at the log's epoch (rad).
     drift : ndarray, shape (beacons,)
         Relative frequency error.
     """
@@ -30,7 +30,8 @@ class Drives:
 
 def synchronised_drives(site: Site) -> Drives:
     """Return drives that run exactly as the site declares."""
-    return Drives(np.zeros(len(site.channels)), np.zeros(len(site.beacons)))
+    tones = sum(len(beacon.tones) for beacon in site.beacons)
+    return Drives(np.zeros(tones), np.zeros(len(site.beacons)))
 
 
 def coil_field(offset: Array, coil: Coil) -> Array:

@@ -19,6 +19,7 @@ from magfusion.simulation.disturbance import Ambient, Spheres, draw_bending, dra
 from magfusion.simulation.field import Drives, phasors_world, synchronised_drives
 from magfusion.simulation.inertial import BiasInstability, simulate_imu
 from magfusion.simulation.layers import Layers
+from magfusion.simulation.magnetometers import answered, names_by_channel
 from magfusion.simulation.motion import (
     Motion,
     Rests,
@@ -277,27 +278,31 @@ def simulate_fields(
     """
     drives = drives or synchronised_drives(site)
     time = trajectory.time
-    magnetometer = site.platform.magnetometer
-    point_world = (
-        trajectory.position_world + trajectory.world_from_body @ magnetometer.position_body
-    )
-    world_from_sensor = trajectory.world_from_body @ magnetometer.body_from_sensor
     drifts = np.repeat(drives.drift, [len(b.tones) for b in site.beacons])
     frequencies_hz = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
     phase = drives.phase + 2.0 * np.pi * drifts * frequencies_hz * time[:, None]
-    fields_world = [phasors_world(b, point_world, spheres, layers) for b in site.beacons]
-    world = np.concatenate(fields_world, axis=1)
-    turned = world * np.exp(1j * phase)[..., None]
-    phasor = turned @ world_from_sensor @ magnetometer.matrix.T
+    parts = []
+    for magnetometer in site.platform.magnetometers:
+        lever_world = trajectory.world_from_body @ magnetometer.position_body
+        point_world = trajectory.position_world + lever_world
+        world_from_sensor = trajectory.world_from_body @ magnetometer.body_from_sensor
+        fields_world = [phasors_world(b, point_world, spheres, layers) for b in site.beacons]
+        world = np.concatenate(fields_world, axis=1)
+        turned = world * np.exp(1j * phase)[..., None]
+        seen = turned @ world_from_sensor @ magnetometer.matrix.T
+        seen = answered(seen, magnetometer.response, frequencies_hz)
+        seen[..., magnetometer.lacking] = np.nan
+        parts.append(seen)
+    phasor = np.concatenate(parts, axis=1)
     noise = rng.normal(0.0, sigma, (2, *phasor.shape))
-    phasor[..., magnetometer.lacking] = np.nan
     return FieldSamples(
         time=time,
         window=np.full(len(time), window),
         channels=site.channels,
         phasor_sensor=phasor + noise[0] + 1j * noise[1],
         phasor_cov=np.broadcast_to(sigma**2 * np.eye(3), (*phasor.shape, 3)).copy(),
-        axes=magnetometer.axes,
+        axes=site.platform.magnetometer.axes,
+        magnetometers=names_by_channel(site),
     )
 
 
@@ -311,8 +316,10 @@ def perturb_site(site: Site, rng: np.random.Generator) -> Site:
     """
     draw = _draws(site.correlation, rng)
     beacons = tuple(_perturb_beacon(beacon, draw) for beacon in site.beacons)
-    magnetometer = _perturb_magnetometer(site.platform.magnetometer, draw)
-    platform = replace(site.platform, magnetometer=magnetometer)
+    sensors = site.platform.magnetometers
+    alone = len(sensors) == 1
+    drawn = tuple(_perturb_magnetometer(s, draw, None if alone else s.name) for s in sensors)
+    platform = site.platform.carrying(drawn)
     if site.log_conductivity_sigma:
         error = draw("ground", "ground", "conductivity", np.array([site.log_conductivity_sigma]))
         beacons = tuple(replace(b, conductivity=b.conductivity * np.exp(error[0])) for b in beacons)
@@ -361,12 +368,15 @@ def _perturb_beacon(beacon: Beacon, draw: Draw) -> Beacon:
     )
 
 
-def _perturb_magnetometer(magnetometer: Magnetometer, draw: Draw) -> Magnetometer:
-    sigma = magnetometer.sigma
-    turn = Rotation.from_rotvec(draw("extrinsics", "sensor", "rotation", sigma.rotation_sensor))
-    matrix = draw("magnetometer", "magnetometer", "matrix", sigma.matrix)
-    offset = draw("magnetometer", "magnetometer", "offset", sigma.offset)
-    lever = draw("extrinsics", "sensor", "position", sigma.position_body)
+def _perturb_magnetometer(magnetometer: Magnetometer, draw: Draw, name: str | None) -> Magnetometer:
+    sigma, sensor, own = magnetometer.sigma, name or "sensor", name or "magnetometer"
+    turn = Rotation.from_rotvec(draw("extrinsics", sensor, "rotation", sigma.rotation_sensor))
+    matrix = draw("magnetometer", own, "matrix", sigma.matrix)
+    offset = draw("magnetometer", own, "offset", sigma.offset)
+    lever = draw("extrinsics", sensor, "position", sigma.position_body)
+    if sigma.clock_offset:
+        late = draw("time-offset", own, "clock_offset", np.array([sigma.clock_offset]))
+        magnetometer = replace(magnetometer, clock_offset=magnetometer.clock_offset + late[0])
     return replace(
         magnetometer,
         matrix=magnetometer.matrix + matrix,
@@ -386,7 +396,7 @@ def _with_earth_field(site: Site) -> Site:
 
 
 def _with_instruments(site: Site, config: SimulationConfig) -> Site:
-    imu, magnetometer = site.platform.imu, site.platform.magnetometer
+    imu = site.platform.imu
     declared, scale = imu.time_offset, config.noise_scale
     imu = replace(
         imu,
@@ -395,8 +405,10 @@ def _with_instruments(site: Site, config: SimulationConfig) -> Site:
         time_offset=declared if config.time_offset is None else config.time_offset,
         clock_rate=imu.clock_rate if config.clock_rate is None else config.clock_rate,
     )
-    magnetometer = replace(magnetometer, noise_density=scale * magnetometer.noise_density)
-    return replace(site, platform=replace(site.platform, imu=imu, magnetometer=magnetometer))
+    sensors = tuple(
+        replace(m, noise_density=scale * m.noise_density) for m in site.platform.magnetometers
+    )
+    return replace(site, platform=replace(site.platform, imu=imu).carrying(sensors))
 
 
 def _with_iron(site: Site, config: SimulationConfig, rng: np.random.Generator) -> Ambient | None:

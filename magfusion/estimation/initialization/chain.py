@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.channel_effects import of_all_sensors
 from magfusion.model.parameters import Calibration
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
@@ -172,7 +173,8 @@ def start_phases(calibration: Calibration, time: Array, phase: Array) -> Calibra
         rate = 2.0 * np.pi * beacon.tone_frequencies_hz * (drift[i] - calibration.drift[i])
         left = np.exp(1j * (phase[:, rows] - elapsed[:, None] * rate))
         new_phase[rows] += np.angle(np.sum(left, axis=0))
-    return replace(calibration, phase=new_phase, drift=drift)
+    one = new_phase[: start or None]
+    return replace(calibration, phase=of_all_sensors(calibration.site, one), drift=drift)
 
 
 def _dominant_drift(elapsed: Array, phase: Array, frequency_hz: float, largest: float) -> float:

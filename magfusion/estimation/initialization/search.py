@@ -22,6 +22,7 @@ from magfusion.estimation.initialization.tracks import (
 )
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.channel_effects import of_all_sensors
 from magfusion.model.parameters import Calibration
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site
@@ -173,14 +174,15 @@ def _seeds(asked: _Search, k: int) -> Tracks:
     clock = asked.site.clock.drift_sigma * 2.0 * np.pi * _frequencies(asked.site)[hearing.free]
     phases = [np.full(free, FIRST_PHASE), np.maximum(clock, 1e-9)]
     sigma = np.concatenate([_motion_sigma(asked.site), *phases])
-    own = hearing.calibration.drive_phase(hearing.time[k])
+    mine = asked.site.of_sensor(0)
+    own = hearing.calibration.drive_phase(hearing.time[k])[mine]
     tracks = Tracks(
         rotation=fixes.world_from_body[0, good],
         position=fixes.position_world[0, good],
         velocity=none,
         accel_bias=none,
         gyro_bias=none,
-        phase=own + fixes.phase[0, good],
+        phase=own + fixes.phase[0, good][:, mine],
         rate=np.zeros((len(good), len(hearing.free))),
         cov=np.tile(np.diag(sigma**2), (len(good), 1, 1)),
         cost=fixes.cost[0, good] - fixes.cost[0, 0],
@@ -271,7 +273,7 @@ def _anew(asked: _Search, tracks: Tracks, best: int, k: int) -> Tracks:
         calibration = replace(
             hearing.calibration,
             site=replace(site, beacons=known),
-            phase=tracks.phase[best],
+            phase=of_all_sensors(site, tracks.phase[best]),
             drift=np.zeros(len(known)),
             reference_time=float(hearing.time[k]),
         )
@@ -376,11 +378,12 @@ def _read(asked: _Search, followed: _Followed, path: list[tuple[int, int]], cost
         return np.array([getattr(tracks, name)[row] for tracks, row in rows])
 
     time = asked.samples.time
-    own = asked.hearing.calibration.drive_phase(time)
+    own = asked.hearing.calibration.drive_phase(time)[:, asked.site.of_sensor(0)]
     states = Trajectory(
         time=time,
         world_from_body=values("rotation"),
         position_world=values("position"),
         velocity_world=values("velocity"),
     )
-    return Found(states, np.where(asked.hearing.free, values("phase") - own, 0.0), cost)
+    phase = np.where(asked.hearing.free, values("phase") - own, 0.0)
+    return Found(states, of_all_sensors(asked.site, phase), cost)

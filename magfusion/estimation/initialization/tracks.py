@@ -13,6 +13,7 @@ from magfusion.estimation.initialization.strides import Strides
 from magfusion.estimation.preintegration import BRIDGE_ACCEL_NOISE, BRIDGE_GYRO_NOISE
 from magfusion.estimation.snapshot.problem import nuisance_blocks
 from magfusion.estimation.snapshot.survey_error import whitened
+from magfusion.model.channel_effects import of_all_sensors
 from magfusion.model.field import skew
 from magfusion.model.noise import measurement_cov, stacked, whitening
 from magfusion.model.parameters import Block, Calibration, linearize_channels
@@ -40,7 +41,7 @@ class Tracks:
         World (m, m/s).
     accel_bias, gyro_bias : ndarray, shape (h, 3)
         Body (m/s^2, rad/s).
-    phase, rate : ndarray, shape (h, channels)
+    phase, rate : ndarray, shape (h, channels of a magnetometer)
         Drive phase at this epoch (rad), and what it gains in a second beyond the nominal.
     cov : ndarray, shape (h, 15 + 2 free, 15 + 2 free)
     cost : ndarray, shape (h,)
@@ -84,7 +85,7 @@ class Heard:
         Whitening, the survey's error in it.
     components : ndarray, shape (n,)
         How many are there.
-    free : bool ndarray, shape (channels,)
+    free : bool ndarray, shape (channels of a magnetometer,)
         Whose drive phase is not known.
     blocks : tuple of Block
         Of those phases.
@@ -115,7 +116,9 @@ def heard(samples: FieldSamples, calibration: Calibration) -> Heard:
         measured=stacked(samples.phasor_sensor),
         sqrt_information=whitening(cov, samples.there),
         components=np.sum(samples.numbers, axis=1).astype(np.float64),
-        free=np.array([not synchronised[name] for name, _ in samples.channels], dtype=bool),
+        free=np.array(
+            [not synchronised[name] for name, _ in samples.channels[site.of_sensor(0)]], dtype=bool
+        ),
         blocks=nuisance_blocks(site),
     )
 
@@ -214,7 +217,7 @@ def rows_at(tracks: Tracks, hearing: Heard, k: int) -> tuple[Array, Array]:
     time, free = hearing.time[k], hearing.free
     known = replace(
         hearing.calibration,
-        phase=tracks.phase,
+        phase=of_all_sensors(hearing.site, tracks.phase),
         drift=np.zeros_like(hearing.calibration.drift),
         reference_time=float(time),
     )

@@ -21,6 +21,7 @@ from magfusion.estimation.integrity.beacon_causes import (
 from magfusion.estimation.integrity.explanation import Explanation, clearly_best
 from magfusion.estimation.integrity.field_causes import global_causes
 from magfusion.estimation.integrity.field_snapshots import Snapshots, snapshots_of
+from magfusion.estimation.integrity.magnetometers import first_magnetometer
 from magfusion.estimation.integrity.motion_causes import (
     EYE,
     gyro_unit_causes,
@@ -101,7 +102,7 @@ def seen_in_streams(trust: Trust) -> bool:
 
 def with_cause(trust: Trust, log: Log, site: Site, settings: LockinSettings | None = None) -> Trust:
     """Return what is to be said of a result, the cause first where it is known; see `diagnosed`."""
-    cause = diagnosed(log, site, trust, settings)
+    cause = diagnosed(*first_magnetometer(log, site), trust, settings)
     diverged = any(finding.code == "diverged" for finding in trust.findings)
 
     def placed(finding: Finding) -> Finding:

@@ -195,7 +195,7 @@ def _leave_out(
 def _likely_by_fixes(how: _How, rows: IntArray, prior: Array) -> Array:
     """Return the probability of each beacon to be the false one, by the fixes without it."""
     cost = np.full(prior.shape, np.inf)
-    own = np.array([len(beacon.tones) for beacon in how.calibration.site.beacons])
+    own = np.bincount(how.calibration.site.owner, minlength=prior.shape[1])
     for beacon in range(prior.shape[1]):
         heard = np.flatnonzero(prior[:, beacon] > 0.0)
         if len(heard):

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from magfusion.estimation.integrity.magnetometer_watch import MagnetometerWatch
 from magfusion.estimation.measurements.measurement import group_distances
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.state import State, states_of
@@ -38,8 +39,13 @@ class Gate:
     taken: dict[str, float]
     refused: dict[str, float]
 
-    def __init__(self, channels: tuple[tuple[str, int], ...], blocks: Sequence[Block]) -> None:
-        self.blocks = tuple(blocks)
+    def __init__(
+        self,
+        channels: tuple[tuple[str, int], ...],
+        blocks: Sequence[Block],
+        watch: MagnetometerWatch,
+    ) -> None:
+        self.blocks, self.watch = tuple(blocks), watch
         self.owner = np.array([name for name, _ in channels], dtype=object)
         self.counts = Counter()
         self.distortion = {}
@@ -65,13 +71,14 @@ class Gate:
         """
         rows = measurements.alone().linearize(states_of([state]), state.calibration, self.blocks)
         distance = group_distances(rows, state.cov)[0]
-        rejected: BoolArray = np.asarray((distance > GATE) | refused) & valid
+        false = self.watch.heard(distance > GATE, valid)
+        rejected: BoolArray = np.asarray((distance > GATE) | refused | false) & valid
         self._note(distance, valid)
         self.taken = self._by_beacon(distance, valid & ~rejected)
         self.refused = self._by_beacon(distance, rejected)
         for name in self.owner[rejected]:
             self.counts[f"outlier of {name}"] += 1
-        most = np.sum(rejected) > 0.5 * np.sum(valid)
+        most = np.sum(rejected & ~false) > 0.5 * np.sum(valid & ~false)
         self.refused_in_a_row = self.refused_in_a_row + 1 if most else 0
         return measurements.without(rejected) if np.any(rejected) else measurements
 

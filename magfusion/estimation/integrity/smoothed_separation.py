@@ -145,19 +145,24 @@ def _size(piece: _Piece) -> int:
     return piece.by_state.nbytes + piece.by_calibration.nbytes + piece.right.nbytes
 
 
-def separate_smoothed(result: Smoothed) -> Separation | None:
+def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Separation | None:
     """Return the separation at every state, in body axes; None where there is none to be had.
 
     That is with fixes in the graph (loose coupling), and of a log so long that its calibration
     drifts.
+
+    Parameters
+    ----------
+    by_magnetometer : bool
+        Whether it is of solutions without each magnetometer, rather than without each beacon.
     """
     graph = result.graph
     fields = [f.measurement for f in graph.factors if isinstance(f.measurement, FieldPhasors)]
     if len(fields) != 1 or len(graph.segments) > 1 or graph.declared is None:
         return None
-    names = [beacon.name for beacon in result.declared.site.beacons]
-    owner = np.array([names.index(name) for name, _ in result.fields.channels])
-    every = range(len(names))
+    site = result.declared.site
+    owner = site.sensor if by_magnetometer else site.owner
+    every = range(len(site.platform.magnetometers if by_magnetometer else site.beacons))
     rest, rows = _linear(graph, result.estimate, result.uncertain)
     kept = np.array([owner >= 0, *(owner != j for j in every)])
     heard, square, count = np.zeros(len(owner), dtype=bool), np.zeros(len(owner)), 0
@@ -174,7 +179,7 @@ def separate_smoothed(result: Smoothed) -> Separation | None:
     determined = np.isfinite(shift).all(axis=2) & (variance > 0.0).all(axis=2)
     determined &= np.sum(variance[..., :3], axis=2) < OPEN_ROTATION**2
     determined &= others[:, None]
-    shape = (graph.epochs, len(names))
+    shape = (graph.epochs, len(every))
     return Separation(
         np.swapaxes(shift, 0, 1),
         cov[0],

@@ -14,6 +14,7 @@ from magfusion.model.ground import conductivity_of
 from magfusion.model.parameters import (
     BEACON_POSITION,
     BEACON_ROTATION,
+    CLOCK_OFFSET,
     CLOCK_RATE,
     CONDUCTIVITY,
     DECLINATION,
@@ -31,6 +32,7 @@ from magfusion.model.parameters import (
     TIME_OFFSET,
     BeaconParameter,
     Block,
+    MagnetometerParameter,
     Parameter,
     candidates,
     placed,
@@ -132,6 +134,7 @@ TYPICAL: dict[Parameter, float] = {
     ACCEL_SCALE: 0.01,
     GYRO_ALIGNMENT: DEGREE,
     GRAVITY: 0.01,
+    CLOCK_OFFSET: 1e-4,
     CLOCK_RATE: 1e-5,
     CONDUCTIVITY: 0.1,
 }
@@ -167,6 +170,7 @@ CODE: dict[Parameter, str] = {
     ACCEL_SCALE: "accel_scale",
     GYRO_ALIGNMENT: "imu_axes",
     GRAVITY: "gravity",
+    CLOCK_OFFSET: "magnetometer_clock",
     CLOCK_RATE: "imu_clock",
     CONDUCTIVITY: "ground",
 }
@@ -207,6 +211,8 @@ def held_blocks(site: Site, estimated: tuple[Block, ...], *, steady: bool) -> tu
         every = tuple(p for p in PARAMETERS if p not in of_imu)
     if not conductivity_of(site):
         every = tuple(p for p in every if p != CONDUCTIVITY)
+    if not site.platform.further:  # the log's clock is that of the only one
+        every = tuple(p for p in every if p != CLOCK_OFFSET)
     kinds = [p for p in every if steady or not p.steady_only]
     return placed(
         Block(kind, owner, slice(0), np.full(len(kind.sigma(site, owner)), TYPICAL[kind]))
@@ -226,12 +232,15 @@ def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
     yield from (together(spoken_name(block), [block]) for block in held)
     poses = {b.name: f"the pose of beacon {b.name}" for b in site.beacons}
     sets = {
-        "the mounting and the lever arm of the magnetometer": (SENSOR_ROTATION, SENSOR_POSITION),
         f"the positions of {_beacons(site)}": (BEACON_POSITION,),
         f"the attitudes of {_beacons(site)}": (BEACON_ROTATION,),
         f"the moments of {_beacons(site)}": (LOG_MOMENT,),
     }
     several = [(name, [b for b in held if b.parameter in kinds]) for name, kinds in sets.items()]
+    mounted = [b for b in held if b.parameter in (SENSOR_ROTATION, SENSOR_POSITION)]
+    for owner in dict.fromkeys(block.owner for block in mounted):
+        own = [block for block in mounted if block.owner == owner]
+        several.insert(0, (f"the mounting and the lever arm of {_sensor(owner)}", own))
     surveyed = [b for b in held if b.parameter in (BEACON_ROTATION, BEACON_POSITION)]
     several += [(text, [b for b in surveyed if b.owner == name]) for name, text in poses.items()]
     yield from (together(name, blocks) for name, blocks in several if len(blocks) > 1)
@@ -245,6 +254,11 @@ def suspects(site: Site, held: tuple[Block, ...]) -> Iterator[Suspect]:
 
 def _beacons(site: Site) -> str:
     return "beacons " + ", ".join(beacon.name for beacon in site.beacons)
+
+
+def _sensor(owner: str) -> str:
+    """Return what a magnetometer is called: by its name where there are several."""
+    return "the magnetometer" if owner in ("sensor", "magnetometer") else f"magnetometer {owner}"
 
 
 def spoken_name(block: Block) -> str:
@@ -261,6 +275,7 @@ def spoken_name(block: Block) -> str:
         ACCEL_SCALE: "the scale of the accelerometer",
         GYRO_ALIGNMENT: "the axes of the gyro",
         GRAVITY: "the size of gravity",
+        CLOCK_OFFSET: "the clock of the magnetometer",
         CLOCK_RATE: "the rate of the IMU's clock",
         BEACON_POSITION: "the position of beacon {owner}",
         BEACON_ROTATION: "the attitude of beacon {owner}",
@@ -270,4 +285,7 @@ def spoken_name(block: Block) -> str:
         CONDUCTIVITY: "the conductivity of the ground",
     }
     own = block.owner if isinstance(block.parameter, BeaconParameter) else ""
-    return names.get(block.parameter, block.name).format(owner=own)
+    spoken = names.get(block.parameter, block.name).format(owner=own)
+    if isinstance(block.parameter, MagnetometerParameter):
+        return spoken.replace("the magnetometer", _sensor(block.owner))
+    return spoken

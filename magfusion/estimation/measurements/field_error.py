@@ -31,11 +31,11 @@ class FieldError(BeaconParameter):
     ----------
     time : ndarray, shape (n,)
         Of the epochs that have it (s).
-    modes : ndarray, shape (n, m)
+    modes : ndarray, shape (n, magnetometers, m)
         With unit variance in all.
-    relative : ndarray, shape (n, tones)
+    relative : ndarray, shape (n, magnetometers, tones)
         Size of the error, as a share of the field.
-    sensor_from_world : ndarray, shape (n, 3, 3)
+    sensor_from_world : ndarray, shape (n, magnetometers, 3, 3)
     """
 
     group = kind = "field_error"
@@ -44,22 +44,22 @@ class FieldError(BeaconParameter):
         self, time: Array, modes: Array, relative: Array, sensor_from_world: Array
     ) -> None:
         self._time, self._relative = time, relative
-        every = np.einsum("nm,nai->nami", modes, sensor_from_world)
-        both = np.stack([every, 1j * every], axis=3)
-        self._shapes = both.reshape(len(time), 3, -1)
+        every = np.einsum("nsm,nsai->nsami", modes, sensor_from_world)
+        both = np.stack([every, 1j * every], axis=4)
+        self._shapes = both.reshape(*both.shape[:3], -1)
 
     @property
     def columns(self) -> int:
         """How many amplitudes there are."""
-        return int(self._relative.shape[1] * self._shapes.shape[2])
+        return int(self._relative.shape[2] * self._shapes.shape[3])
 
     def own_jacobian(self, view: PhasorView) -> ComplexArray:
         """Return the columns of the owner's phasors."""
         time = view.calibration.reference_time + view.elapsed
         rows = np.searchsorted(self._time, time - SAME_TIME)
         power = 0.5 * np.sum(np.abs(view.phasor) ** 2, axis=-1) / 3.0
-        size = self._relative[rows] * np.sqrt(power)
-        shapes, (count, tones) = self._shapes[rows], size.shape
+        size = self._relative[rows, view.sensor] * np.sqrt(power)
+        shapes, (count, tones) = self._shapes[rows, view.sensor], size.shape
         out = np.zeros((count, tones, 3, tones, shapes.shape[2]), dtype=complex)
         for tone in range(tones):
             out[:, tone, :, tone] = size[:, tone, None, None] * shapes
@@ -80,14 +80,19 @@ def field_errors(site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...
     if length <= 0.0 or not len(time):
         return ()
     place = sensor_positions(site, poses)
+    sensors = site.platform.magnetometers
     relative = model_error(site, place) + np.zeros((len(time), channels))
-    most = min(COLUMNS, int(AT_ONCE / (48.0 * channels * len(time)))) // (6 * channels)
-    modes = modes_in_place(place, length, max(most, 1))
-    body_from_sensor = site.platform.magnetometer.body_from_sensor
-    sensor_from_world = np.swapaxes(poses.world_from_body @ body_from_sensor, 1, 2)
+    relative = relative.reshape(len(time), len(sensors), -1)
+    count = channels // len(sensors)
+    most = min(COLUMNS, int(AT_ONCE / (48.0 * channels * len(time)))) // (6 * count)
+    modes = modes_in_place(place.reshape(-1, 3), length, max(most, 1))
+    modes = modes.reshape(len(time), len(sensors), -1)
+    sensor_from_world = np.stack(
+        [np.swapaxes(poses.world_from_body @ s.body_from_sensor, 1, 2) for s in sensors], axis=1
+    )
     out, start = [], 0
     for beacon in site.beacons:
-        own = relative[:, start : start + len(beacon.tones)]
+        own = relative[..., start : start + len(beacon.tones)]
         start += len(beacon.tones)
         if np.any(own > 0.0):
             error = FieldError(time, modes, own, sensor_from_world)

@@ -91,7 +91,7 @@ class FieldPhasors(Measurement):
 
     def error(self, states: States, calibration: Calibration) -> Array:
         """Return the whitened error, shape (n, channels, 6), without a derivative."""
-        if self.ahead is not None:
+        if self.ahead is not None or np.any(calibration.clock_offsets):
             value, _, _, _ = self.unwhitened(states, calibration, ())
             return (self.sqrt_information @ (value - self.measured)[..., None])[..., 0]
         lag, world_from_body, position_world = self._at_field(states, calibration)
@@ -133,6 +133,9 @@ class FieldPhasors(Measurement):
                 calibration, blocks, self.time, *place
             )
         value += lag[:, None, None] * self.by_time_offset
+        if np.any(calibration.clock_offsets):
+            later = calibration.clock_offsets[calibration.site.sensor]
+            value += later[:, None] * (by_pose @ twist_body[:, None, :, None])[..., 0]
         by_lag = np.where(self.moving[:, None, None], self.by_time_offset, 0.0)
         for block in blocks:
             if block.parameter == TIME_OFFSET:
@@ -153,11 +156,12 @@ class FieldPhasors(Measurement):
     ) -> tuple[Array, Array, Array, Array]:
         """Return prediction and derivatives with the sensor where each channel was measured."""
         count, channels = ahead.shape
-        lever_body = calibration.site.platform.magnetometer.position_body
-        swing_body = np.cross(twist_body[:, :3], lever_body)
-        velocity_body = twist_body[:, 3:] + swing_body
-        velocity_world = (world_from_body @ velocity_body[..., None])[..., 0]
-        shift_world = ahead[..., None] * velocity_world[:, None]
+        site = calibration.site
+        levers = np.array([sensor.position_body for sensor in site.platform.magnetometers])
+        swing_body = np.cross(twist_body[:, None, :3], levers)[:, site.sensor]
+        velocity_body = twist_body[:, None, 3:] + swing_body
+        velocity_world = (world_from_body[:, None] @ velocity_body[..., None])[..., 0]
+        shift_world = ahead[..., None] * velocity_world
         found = linearize_channels(
             calibration,
             blocks,
@@ -172,7 +176,7 @@ class FieldPhasors(Measurement):
         )
         by_place = ahead[..., None, None] * by_pose[..., 3:]
         by_velocity = by_place @ np.swapaxes(world_from_body, 1, 2)[:, None]
-        by_pose[..., :3] -= by_place @ skew(swing_body)[:, None]
+        by_pose[..., :3] -= by_place @ skew(swing_body)
         return value, by_pose, by_velocity, by_calibration
 
     def without(self, rejected: BoolArray) -> "FieldPhasors":
@@ -252,6 +256,7 @@ def field_phasors(
     by_time_offset: ComplexArray | None = None,
     alike: Array | float = 1.0,
     standing: BoolArray | None = None,
+    beside: bool = True,
 ) -> FieldPhasors:
     """Return phasors as a measurement, weighed at poses that are about right.
 
@@ -273,11 +278,15 @@ def field_phasors(
         How many epochs have the same model error; no fewer than windows hold a sample.
     standing : bool ndarray, shape (n,), optional
         Where the platform is known to stand.
+    beside : bool
+        As of `magfusion.model.noise.measurement_cov`.
     """
     place = sensor_positions(site, poses)
     together = np.maximum(alike, repeats)
-    cov = measurement_cov(site, samples, sensor_world=place, windows=repeats, alike=together)
-    single = repeats * measurement_cov(site, samples, sensor_world=place)
+    cov = measurement_cov(
+        site, samples, sensor_world=place, windows=repeats, alike=together, beside=beside
+    )
+    single = repeats * measurement_cov(site, samples, sensor_world=place, beside=beside)
     more, own = (np.trace(c, axis1=2, axis2=3) for c in (cov, single))
     excess = np.divide(more, own, out=np.ones_like(own), where=samples.valid)
     phasor = samples.phasor_sensor

@@ -287,9 +287,8 @@ class _Problem:
     def _error(self, place: Array) -> Array:
         """Return the relative error of each channel that model and survey leave, (k, channels)."""
         site = self.calibration.site
-        owner = [i for i, b in enumerate(site.beacons) for _ in b.tones]
-        survey = calibration_error(site, _distances(site, place))[:, owner]
-        return np.hypot(model_error(site, place), survey)
+        survey = calibration_error(site, _distances(site, place))[:, site.owner]
+        return np.hypot(model_error(site, place[:, None]), survey)
 
 
 def _ranked(found: _Refined, middle: Array) -> CoilFixes:

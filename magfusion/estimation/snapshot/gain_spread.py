@@ -92,8 +92,9 @@ class _Asked:
         cov = measurement_cov(site, samples, survey_error=survey_error)
         white = whitening(cov, samples.there) @ np.nan_to_num(samples.phasor_sensor)[..., None]
         by_channel = np.sum(np.abs(white) ** 2, axis=(-1, -2))
-        first = np.cumsum([0, *(len(beacon.tones) for beacon in site.beacons)])[:-1]
-        self.known = np.add.reduceat(by_channel, first, axis=1)
+        first = np.flatnonzero(np.diff(site.owner, prepend=-1))
+        each = np.add.reduceat(by_channel, first, axis=1)
+        self.known = np.sum(each.reshape(len(each), -1, len(site.beacons)), axis=1)
 
     def evidence(self, spread: float, gravity: Gravity | None) -> tuple[Array, BoolArray]:
         """Return minus twice the log evidence of each epoch, and which are determined."""

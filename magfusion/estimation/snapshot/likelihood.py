@@ -15,8 +15,9 @@ from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.place import outside
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA, Epochs, Problem, State, epochs_of
 from magfusion.estimation.snapshot.refine import Solved, as_fixes, cost, joined, solved_from
+from magfusion.model.channel_effects import of_all_sensors
 from magfusion.model.coil_field import is_sized
-from magfusion.model.parameters import Calibration
+from magfusion.model.parameters import Calibration, seen_by, without_response
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
@@ -142,26 +143,13 @@ def _softened(problem: Problem) -> Problem:
 
 
 def _starts(problem: Problem) -> tuple[State, int]:
-    """Return the most likely candidates, so many rows an epoch."""
+    """Return the most likely candidates, so many rows an epoch: by any of the magnetometers."""
     site = problem.calibration.site
-    sensor = site.platform.magnetometer
-    raw = problem.measured[..., :3] + 1j * problem.measured[..., 3:]
-    raw = raw / problem.calibration.gain_at(problem.time)[..., None]
-    phasor = raw @ np.linalg.inv(sensor.matrix).T
-    weight = np.sum(problem.sqrt_information**2, axis=(-1, -2)) / 3.0
-    beacons = {b.name: b.synchronised for b in site.beacons}
-    free = np.array([not beacons[name] for name, _ in site.channels])
-    up = up_weight = None
-    if problem.gravity is not None:
-        up = problem.gravity.up_body @ sensor.body_from_sensor
-        up_weight = 1.0 / problem.gravity.sigma**2
-    spots = positions(problem.calibration, phasor, weight, CANDIDATES)
-    world_from_sensor, phase = attitudes(
-        problem.calibration, spots, phasor, weight, free, up, up_weight
+    found = [_candidates(problem, k) for k in range(len(site.platform.magnetometers))]
+    rotation, position, phase = (
+        np.concatenate(parts, axis=1) for parts in zip(*found, strict=True)
     )
-    rotation = world_from_sensor @ sensor.body_from_sensor.T
-    position = spots - rotation @ sensor.position_body
-    phase = phase - problem.calibration.drive_phase(problem.time)[:, None] * free
+    phase = of_all_sensors(site, phase)
     if problem.prior is not None:
         rotation = np.concatenate([problem.prior.rotation[:, None], rotation], axis=1)
         position = np.concatenate([problem.prior.position[:, None], position], axis=1)
@@ -174,6 +162,32 @@ def _starts(problem: Problem) -> tuple[State, int]:
     order = np.argsort(cost(problem.rows(epoch), every).reshape(n, count), axis=1)[:, :REFINED]
     best = (order + count * np.arange(n)[:, None]).ravel()
     return every.rows(best), order.shape[1]
+
+
+def _candidates(problem: Problem, which: int) -> tuple[Array, Array, Array]:
+    """Return poses (n, candidates) and drive phases that what one magnetometer measures allows."""
+    calibration, mine = (
+        seen_by(problem.calibration, which),
+        problem.calibration.site.of_sensor(which),
+    )
+    measured = problem.measured[:, mine]
+    raw = measured[..., :3] + 1j * measured[..., 3:]
+    raw, calibration = without_response(raw, calibration)
+    site, sensor = calibration.site, calibration.site.platform.magnetometer
+    raw = raw / calibration.gain_at(problem.time)[..., None]
+    phasor = raw @ np.linalg.inv(sensor.matrix).T
+    weight = np.sum(problem.sqrt_information[:, mine] ** 2, axis=(-1, -2)) / 3.0
+    beacons = {b.name: b.synchronised for b in site.beacons}
+    free = np.array([not beacons[name] for name, _ in site.channels])
+    up = up_weight = None
+    if problem.gravity is not None:
+        up = problem.gravity.up_body @ sensor.body_from_sensor
+        up_weight = 1.0 / problem.gravity.sigma**2
+    spots = positions(calibration, phasor, weight, CANDIDATES)
+    world_from_sensor, phase = attitudes(calibration, spots, phasor, weight, free, up, up_weight)
+    rotation = world_from_sensor @ sensor.body_from_sensor.T
+    position = spots - rotation @ sensor.position_body
+    return rotation, position, phase - calibration.drive_phase(problem.time)[:, None] * free
 
 
 def _ranked(rotation: Array, position: Array, cost: Array) -> tuple[IntArray, Array]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError
 from magfusion.estimation.snapshot.fix import Gravity
-from magfusion.model.noise import measurement_cov, stacked, whitening
+from magfusion.model.noise import measurement_cov, sensors_at, stacked, whitening
 from magfusion.model.parameters import GAIN, PHASE, Block, Calibration, placed
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
@@ -140,7 +140,7 @@ class Epochs:
         mapped = any(beacon.field_map is not None for beacon in site.beacons)
         if not mapped and not np.any(self.samples.partial):
             return None
-        sensor_world = position + rotation @ site.platform.magnetometer.position_body
+        sensor_world = sensors_at(site, rotation, position)
         sqrt_information, noise = _weights(site, self.samples, self.survey_error, sensor_world)
         return replace(self.problem, sqrt_information=sqrt_information, noise=noise)
 

@@ -233,7 +233,8 @@ def _spread(problem: Problem, kind: Parameter) -> Array:
     for block in problem.blocks:
         if block.parameter == kind:
             columns = np.arange(block.columns.start, block.columns.stop)
-            out[columns, np.flatnonzero(names == block.owner)] = 1.0
+            mine = np.flatnonzero(names == block.owner)
+            out[columns if len(columns) == 1 else np.resize(columns, len(mine)), mine] = 1.0
     return out
 
 

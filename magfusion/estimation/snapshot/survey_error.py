@@ -3,6 +3,7 @@
 import numpy as np
 
 from magfusion.model.parameters import (
+    CLOCK_OFFSET,
     Block,
     Calibration,
     choose_blocks,
@@ -46,12 +47,14 @@ def survey_jacobians(
         By each column of the spread of the survey's prior: one sigma of each parameter, where
         these are independent.
     """
-    survey, found = choose_blocks(calibration.site, SURVEY_GROUPS), dimension(nuisances)
+    site, found = calibration.site, dimension(nuisances)
+    clocks = choose_blocks(site, (CLOCK_OFFSET.group,), parameters=(CLOCK_OFFSET,))
+    survey = placed((*choose_blocks(site, SURVEY_GROUPS), *clocks))
     _, by_pose, by_calibration = linearize_channels(
         calibration, placed((*nuisances, *survey)), time, world_from_body, position_world
     )
     by_found = np.concatenate([by_pose, by_calibration[..., :found]], axis=-1)
-    by_survey = by_calibration[..., found:] @ prior_sqrt_covariance(calibration.site, survey)
+    by_survey = by_calibration[..., found:] @ prior_sqrt_covariance(site, survey)
     return whitened(sqrt_information, by_found), whitened(sqrt_information, by_survey)
 
 

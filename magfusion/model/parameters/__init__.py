@@ -5,9 +5,11 @@ over it or over the blocks chosen of it.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
+from magfusion.model.channel_effects import axis_factors, responded, tone_frequencies
 from magfusion.model.parameters.beacon import BEACON_POSITION as BEACON_POSITION
 from magfusion.model.parameters.beacon import BEACON_ROTATION as BEACON_ROTATION
 from magfusion.model.parameters.beacon import DRIFT as DRIFT
@@ -28,6 +30,7 @@ from magfusion.model.parameters.parameter import Parameter as Parameter
 from magfusion.model.parameters.parameter import SteadyView as SteadyView
 from magfusion.model.parameters.parameter import Unit as Unit
 from magfusion.model.parameters.parameter import dimension as dimension
+from magfusion.model.parameters.platform import CLOCK_OFFSET as CLOCK_OFFSET
 from magfusion.model.parameters.platform import CLOCK_RATE as CLOCK_RATE
 from magfusion.model.parameters.platform import DECLINATION as DECLINATION
 from magfusion.model.parameters.platform import MATRIX as MATRIX
@@ -36,9 +39,10 @@ from magfusion.model.parameters.platform import SENSOR_POSITION as SENSOR_POSITI
 from magfusion.model.parameters.platform import SENSOR_ROTATION as SENSOR_ROTATION
 from magfusion.model.parameters.platform import STRENGTH as STRENGTH
 from magfusion.model.parameters.platform import TIME_OFFSET as TIME_OFFSET
+from magfusion.model.parameters.platform import MagnetometerParameter as MagnetometerParameter
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
-from magfusion.units import Array
+from magfusion.units import Array, ComplexArray
 
 PARAMETERS: tuple[Parameter, ...] = (
     BEACON_ROTATION,
@@ -50,6 +54,7 @@ PARAMETERS: tuple[Parameter, ...] = (
     OFFSET,
     SENSOR_ROTATION,
     SENSOR_POSITION,
+    CLOCK_OFFSET,
     TIME_OFFSET,
     CLOCK_RATE,
     CONDUCTIVITY,
@@ -91,6 +96,37 @@ def initial_calibration(
     )
 
 
+def seen_by(calibration: Calibration, sensor: int) -> Calibration:
+    """Return the calibration of what one of the platform's magnetometers measures."""
+    site = calibration.site
+    if not site.platform.further:
+        return calibration
+    mine, one = site.of_sensor(sensor), site.platform.magnetometers[sensor]
+    late = float(calibration.clock_offsets[sensor])
+    frequencies_hz = tone_frequencies(site)
+    return replace(
+        calibration,
+        site=replace(site, platform=site.platform.carrying((one,))),
+        phase=calibration.phase[..., mine] + 2.0 * np.pi * frequencies_hz * late,
+        log_gain=calibration.log_gain[..., mine],
+    )
+
+
+def without_response(
+    phasor: ComplexArray, calibration: Calibration
+) -> tuple[ComplexArray, Calibration]:
+    """Return phasors (..., channels, 3) as one that answers alike to all would, and that one."""
+    site = calibration.site
+    answer, factors = responded(site), axis_factors(site)
+    if answer is None and factors is None:
+        return phasor, calibration
+    if answer is not None:
+        phasor = phasor / np.exp(answer[0] + 1j * answer[1])[:, None]
+    phasor = phasor if factors is None else phasor / factors
+    plain = tuple(replace(m, response=None) for m in site.platform.magnetometers)
+    return phasor, replace(calibration, site=replace(site, platform=site.platform.carrying(plain)))
+
+
 def candidates(
     site: Site, parameters: Iterable[Parameter] = PARAMETERS
 ) -> Iterator[tuple[Parameter, str]]:
@@ -98,7 +134,8 @@ def candidates(
     kinds = tuple(parameters)
     of_beacon = [kind for kind in kinds if isinstance(kind, BeaconParameter)]
     yield from ((kind, beacon.name) for beacon in site.beacons for kind in of_beacon)
-    yield from ((kind, kind.owner) for kind in kinds if not isinstance(kind, BeaconParameter))
+    others = [kind for kind in kinds if not isinstance(kind, BeaconParameter)]
+    yield from ((kind, owner) for kind in others for owner in kind.owners(site))
 
 
 def choose_blocks(

@@ -108,14 +108,20 @@ class _OfDrive(BeaconParameter):
         """Return which entries are the owner's; here one a channel."""
         return np.array([name == owner for name, _ in site.channels], dtype=bool)
 
+    def copies(self, site: Site) -> int:
+        """Return how often the array has it: the channels of every magnetometer do."""
+        return len(site.platform.magnetometers)
+
     def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
         value = getattr(calibration, self.attribute).copy()
-        value[self.mine(calibration.site, owner)] += step
+        mine = self.mine(calibration.site, owner)
+        value[mine] += step if len(step) == 1 else np.resize(step, np.count_nonzero(mine))
         return replace(calibration, **{self.attribute: value})
 
     def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
         change = getattr(new, self.attribute) - getattr(old, self.attribute)
-        return change[self.mine(old.site, owner)]
+        mine = change[self.mine(old.site, owner)]
+        return mine[: len(mine) // self.copies(old.site)]
 
 
 class _Phase(_OfDrive):
@@ -143,6 +149,9 @@ class _Drift(_OfDrive):
 
     def mine(self, site: Site, owner: str) -> BoolArray:
         return np.array([beacon.name == owner for beacon in site.beacons], dtype=bool)
+
+    def copies(self, site: Site) -> int:
+        return 1
 
     def own_jacobian(self, view: PhasorView) -> ComplexArray:
         turns = 2.0 * np.pi * view.beacon.tone_frequencies_hz[:, None]

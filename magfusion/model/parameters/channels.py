@@ -4,11 +4,12 @@ Beacons of one form are evaluated side by side: of a single epoch that costs wha
 """
 
 from collections.abc import Iterator
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from magfusion.model.channel_effects import axis_factors
 from magfusion.model.coil_field import Sources, alone, side_by_side
 from magfusion.model.field import observe, observe_from, predict
 from magfusion.model.parameters.parameter import Block, Calibration, PhasorView, dimension
@@ -71,10 +72,15 @@ def predict_channels(
     )
     out = np.empty((*shape, len(site.channels), 3), dtype=np.complex128)
     beside = world_from_body.ndim == 3 and position_world.ndim == 2
-    for group in _groups(site, beside=beside):
-        phasor = predict(group.source, site.platform.magnetometer, *poses, group.of(phase))
-        for tones, own in zip(group.tones, group.parted(phasor), strict=True):
-            out[..., tones, :] = own
+    groups = _groups(site, beside=beside)
+    for sensor, magnetometer in enumerate(site.platform.magnetometers):
+        mine = site.of_sensor(sensor)
+        for group in groups:
+            phasor = predict(group.source, magnetometer, *poses, group.of(phase[..., mine]))
+            for tones, own in zip(group.tones, group.parted(phasor), strict=True):
+                out[..., mine, :][..., tones, :] = own
+    factors = axis_factors(site)
+    out = out if factors is None else factors * out
     return np.asarray(calibration.gain_at(time)[..., None] * out)
 
 
@@ -112,28 +118,43 @@ def linearize_channels(
     by_calibration = np.zeros((n, channels, 6, dimension(blocks)))
     whole = any(not block.parameter.factor_of_phasor for block in blocks)
     elapsed = time - calibration.reference_time
-    for group in _groups(site):
-        place = group.source, site.platform.magnetometer, world_from_body, position_world
+    groups, factors = _groups(site), axis_factors(site)
+    sensors = enumerate(site.platform.magnetometers)
+    for (sensor, magnetometer), group in product(sensors, groups):
+        mine = site.of_sensor(sensor)
+        place = group.source, magnetometer, world_from_body, position_world
         if whole:
-            seen = observe(*place, group.of(phase), twist_body)
+            seen = observe(*place, group.of(phase[..., mine]), twist_body)
             phasor, pose = seen.phasor_sensor, seen.platform_pose
             observations = list[Observation | None](group.each(seen))
         else:
-            phasor, pose = observe_from(*place, group.of(phase))
+            phasor, pose = observe_from(*place, group.of(phase[..., mine]))
             observations = [None] * len(group.beacons)
         phasor, pose = group.parted(phasor), group.parted(pose)
         values, poses = _stacked(phasor[..., None])[..., 0], _stacked(pose)
         for k, (beacon, tones) in enumerate(zip(group.beacons, group.tones, strict=True)):
-            value[:, tones], by_pose[:, tones] = values[k], poses[k]
-            view = PhasorView(calibration, beacon, elapsed, phasor[k], observations[k])
+            rows = slice(mine.start + tones.start, mine.start + tones.stop)
+            value[:, rows], by_pose[:, rows] = values[k], poses[k]
+            view = PhasorView(calibration, beacon, elapsed, phasor[k], observations[k], sensor)
             for block in blocks:
                 part = block.parameter.phasor_jacobian(view, block.owner)
                 if part is not None:
-                    by_calibration[:, tones, :, block.columns] = _stacked(part)
+                    by_calibration[:, rows, :, block.columns] = _stacked(part)
+    if factors is not None:
+        parts = value[..., None], by_pose, by_calibration
+        value, by_pose, by_calibration = (_answered(part, factors) for part in parts)
+        value = value[..., 0]
     gain = calibration.gain_at(time)[..., None]
     if np.all(gain == 1.0):
         return value, by_pose, by_calibration
     return gain * value, gain[..., None] * by_pose, gain[..., None] * by_calibration
+
+
+def _answered(stacked: Array, factors: ComplexArray) -> Array:
+    """Return stacked columns (n, channels, 6, k) with what each axis makes of them."""
+    real, imaginary = stacked[..., :3, :], stacked[..., 3:, :]
+    a, b = factors.real[:, :, None], factors.imag[:, :, None]
+    return np.concatenate([a * real - b * imaginary, b * real + a * imaginary], axis=-2)
 
 
 def _stacked(block: ComplexArray) -> Array:

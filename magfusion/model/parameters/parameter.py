@@ -8,7 +8,13 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.model.channel_effects import driven, responded, warmed
+from magfusion.model.channel_effects import (
+    driven,
+    of_all_sensors,
+    responded,
+    tone_frequencies,
+    warmed,
+)
 from magfusion.model.field import EarthObservation
 from magfusion.model.receive_coils import Observation
 from magfusion.model.samples import ImuSamples
@@ -16,6 +22,7 @@ from magfusion.model.site import Beacon, Site
 from magfusion.units import DEGREE, Array, ComplexArray
 
 AXES = ("x", "y", "z")
+CLOCK = "clock_offset"  # kind of the parameter of a magnetometer's clock
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +32,8 @@ class Calibration:
     Parameters
     ----------
     phase : ndarray, shape (channels,)
-        Drive phase of each channel at ``reference_time`` beyond the coils' own (rad).
+        Drive phase of each channel at ``reference_time`` beyond the coils' own (rad), the same of
+        every magnetometer.
     drift : ndarray, shape (beacons,)
         Relative error of each beacon's clock.
     time_offset : float
@@ -55,6 +63,13 @@ class Calibration:
     clock_rate: float = 0.0
     imu_begin: float = 0.0
 
+    @property
+    def clock_offsets(self) -> Array:
+        """What was to be added to each magnetometer's stamps beyond what the site declares (s)."""
+        platform = self.site.platform
+        names = [m.name for m in platform.magnetometers] if platform.further else ["magnetometer"]
+        return np.array([np.sum(self.others.get(f"{name}.{CLOCK}", 0.0)) for name in names])
+
     def imu_offset(self, time: Array) -> Array:
         """Return what was to be added to the IMU's stamps at some times, shape of them (s)."""
         return self.time_offset + self.clock_rate * (np.asarray(time) - self.imu_begin)
@@ -82,12 +97,14 @@ class Calibration:
 
         As measured: with what was recorded of the currents, and the magnetometer's response.
         """
-        owner = [i for i, b in enumerate(self.site.beacons) for _ in b.tones]
-        frequencies = np.concatenate([b.tone_frequencies_hz for b in self.site.beacons])
-        rate = 2.0 * np.pi * frequencies * self.drift[owner]
+        frequencies = of_all_sensors(self.site, tone_frequencies(self.site))
+        rate = 2.0 * np.pi * frequencies * self.drift[self.site.owner]
         phase = self.phase + (time[..., None] - self.reference_time) * rate
         current, response = driven(self.site, time), responded(self.site)
         phase = phase if response is None else phase + response[1]
+        late = self.clock_offsets
+        if np.any(late):
+            phase = phase + 2.0 * np.pi * frequencies * late[self.site.sensor]
         return phase if current is None else phase + current[1]
 
 
@@ -111,6 +128,7 @@ class PhasorView(NamedTuple):
     elapsed: Array  # (n,) since the reference time (s)
     phasor: ComplexArray  # (n, tones, 3)
     observation: Observation | None  # None where all that is asked for is a factor of the phasor
+    sensor: int = 0  # which of the platform's magnetometers measures them
 
     @property
     def whole(self) -> Observation:
@@ -169,6 +187,10 @@ class Parameter:
     def __repr__(self) -> str:
         # Of the same settings the same in every process: checkpoints are recognised by it.
         return f"{type(self).__qualname__}()"
+
+    def owners(self, site: Site) -> tuple[str, ...]:
+        """Return whom a site has one of: but for beacons and magnetometers there is one."""
+        return (self.owner,)
 
     def sigma(self, site: Site, owner: str) -> Array:
         """Return the prior standard deviations, flat; all zero where it is known."""

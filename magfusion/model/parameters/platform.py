@@ -8,6 +8,7 @@ import numpy as np
 from magfusion.model.parameters.parameter import (
     AXES,
     CENTIMETRE,
+    CLOCK,
     DEGREES,
     METRE,
     MILLISECOND,
@@ -27,15 +28,51 @@ from magfusion.units import Array, ComplexArray
 MICROTESLA = 1e-6  # T
 
 
-class _MagnetometerParameter(SiteParameter):
+class MagnetometerParameter(SiteParameter):
+    """A parameter that every magnetometer has; where there are several, their names are owners."""
+
+    def owners(self, site: Site) -> tuple[str, ...]:
+        """Return the names of magnetometers, or of the only one what it is called everywhere."""
+        several = site.platform.further
+        return tuple(m.name for m in site.platform.magnetometers) if several else (self.owner,)
+
     def part(self, site: Site, owner: str) -> Magnetometer:
-        return site.platform.magnetometer
+        """Return the magnetometer."""
+        return site.platform.magnetometers[self.sensor(site, owner)]
+
+    def sensor(self, site: Site, owner: str) -> int:
+        """Return which of the platform's it is."""
+        return self.owners(site).index(owner)
 
     def with_part(self, site: Site, part: Magnetometer) -> Site:
-        return replace(site, platform=replace(site.platform, magnetometer=part))
+        """Return the site with the magnetometer of that name replaced."""
+        platform = site.platform
+        if not platform.further:
+            return replace(site, platform=replace(platform, magnetometer=part))
+        every = tuple(part if m.name == part.name else m for m in platform.magnetometers)
+        return replace(site, platform=platform.carrying(every))
+
+    def called(self, site: Site, owner: str, i: int) -> str:
+        """Return what one of its numbers is called, with the name where there are several."""
+        words = super().called(site, owner, i)
+        if not site.platform.further:
+            return words
+        named = words.replace("the magnetometer's", f"magnetometer {owner}'s")
+        return named if named != words else f"{words} of magnetometer {owner}"
+
+    def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
+        """Return the columns of its own phasors; it has no bearing on the others'."""
+        site = view.calibration.site
+        if site.platform.further and self.sensor(site, owner) != view.sensor:
+            return None
+        return self.own_jacobian(view)
+
+    def own_jacobian(self, view: PhasorView) -> ComplexArray | None:
+        """Return the columns of the magnetometer's own phasors."""
+        return None
 
 
-class _Matrix(_MagnetometerParameter):
+class _Matrix(MagnetometerParameter):
     group, owner, kind = "magnetometer", "magnetometer", "matrix"
     attribute = sigma_attribute = "matrix"
     components = tuple(row + column for row in AXES for column in AXES)
@@ -51,14 +88,14 @@ class _Matrix(_MagnetometerParameter):
     field_error = 3.0
     by_turning = "the magnetometer's matrix"
 
-    def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
+    def own_jacobian(self, view: PhasorView) -> ComplexArray | None:
         return view.whole.matrix
 
     def steady_jacobian(self, view: SteadyView) -> Array | None:
         return view.observation.matrix
 
 
-class _Offset(_MagnetometerParameter):
+class _Offset(MagnetometerParameter):
     group, owner, kind, components = "magnetometer", "magnetometer", "offset", AXES
     attribute = sigma_attribute = "offset"
     unit, spoken, si = Unit("nt", 1e-3), Unit("nT", 1e-3), MICROTESLA
@@ -71,7 +108,7 @@ class _Offset(_MagnetometerParameter):
         return MICROTESLA * view.observation.offset
 
 
-class _Rotation(_MagnetometerParameter):
+class _Rotation(MagnetometerParameter):
     group, owner, kind, components = "extrinsics", "sensor", "rotation", AXES
     attribute, sigma_attribute, is_rotation = "body_from_sensor", "rotation_sensor", True
     unit = spoken = DEGREES
@@ -80,14 +117,14 @@ class _Rotation(_MagnetometerParameter):
     field_error = 2.0
     by_turning = "the rotation of the mounting"
 
-    def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
+    def own_jacobian(self, view: PhasorView) -> ComplexArray | None:
         return view.whole.body_from_sensor[..., :3]
 
     def steady_jacobian(self, view: SteadyView) -> Array | None:
         return view.observation.sensor_rotation
 
 
-class _Position(_MagnetometerParameter):
+class _Position(MagnetometerParameter):
     group, owner, kind, components = "extrinsics", "sensor", "position", AXES
     attribute = sigma_attribute = "position_body"
     unit, spoken = METRE, CENTIMETRE
@@ -96,9 +133,48 @@ class _Position(_MagnetometerParameter):
     field_error, falls = 9.0, 2  # the field falls with the cube of the distance
     by_turning = "the lever arm"
 
-    def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
-        mounting = view.calibration.site.platform.magnetometer.body_from_sensor
+    def own_jacobian(self, view: PhasorView) -> ComplexArray | None:
+        mounting = view.calibration.site.platform.magnetometers[view.sensor].body_from_sensor
         return view.whole.body_from_sensor[..., 3:] @ mounting.T
+
+
+class _ClockOffset(MagnetometerParameter):
+    """What was to be added to a magnetometer's stamps beyond what is declared.
+
+    A stamp that is too early reads a phase that is ahead, and the place of a little later.
+    """
+
+    group, owner, kind = "time-offset", "magnetometer", CLOCK
+    unit, spoken = SECOND, MILLISECOND
+    words = "the clock of the magnetometer"
+    sigma_attribute = CLOCK
+    each_log = True
+
+    def sigma(self, site: Site, owner: str) -> Array:
+        return np.array([self.part(site, owner).sigma.clock_offset])
+
+    def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
+        return Parameter.moved(self, calibration, owner, step)
+
+    def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
+        return Parameter.difference(self, old, new, owner)
+
+    def value(self, calibration: Calibration, owner: str) -> Array | None:
+        found = calibration.others.get(f"{owner}.{self.kind}", np.zeros(1))
+        return self.part(calibration.site, owner).clock_offset + found
+
+    def refined(self, site: Site, calibration: Calibration, owner: str, sigma: Array) -> Site:
+        part, value = self.part(site, owner), self.value(calibration, owner)
+        assert value is not None
+        known = replace(part.sigma, clock_offset=float(sigma[0]))
+        return self.with_part(site, replace(part, clock_offset=float(value[0]), sigma=known))
+
+    def own_jacobian(self, view: PhasorView) -> ComplexArray | None:
+        turns = 2j * np.pi * view.beacon.tone_frequencies_hz[:, None]
+        by_phase = turns * view.phasor
+        # No twist where the pose alone is sought: a fix is of a platform that hardly moves in it.
+        moved = view.whole.time_offset
+        return (by_phase if moved is None else by_phase - moved)[..., None]
 
 
 class _TimeOffset(Parameter):
@@ -235,6 +311,6 @@ class _Strength(_EarthParameter):
 
 
 MATRIX, OFFSET = _Matrix(), _Offset()
-SENSOR_ROTATION, SENSOR_POSITION = _Rotation(), _Position()
+SENSOR_ROTATION, SENSOR_POSITION, CLOCK_OFFSET = _Rotation(), _Position(), _ClockOffset()
 TIME_OFFSET, CLOCK_RATE = _TimeOffset(), _ClockRate()
 DECLINATION, STRENGTH = _Declination(), _Strength()

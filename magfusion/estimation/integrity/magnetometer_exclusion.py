@@ -1,0 +1,96 @@
+"""Which of several magnetometers is not as declared: it is named and left out, the others go on.
+
+One that is mounted, placed or scaled otherwise makes the trajectory differ with and without it; the
+false one is that without which all fit far better to themselves, to the inertial samples and to
+gravity.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.integrity.magnetometers import without_magnetometer
+from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Risk
+
+SLACK = 3.0  # sigma; as of the separation of beacons
+PLAINLY = 2.0  # times the misfit of one is that of the other, before either is named
+
+Solve = Callable[[Log, Site], Smoothed]
+
+
+@dataclass(frozen=True, eq=False)
+class Agreed:
+    """A log, its site and its solution without a magnetometer that contradicts the others."""
+
+    log: Log
+    site: Site
+    result: Smoothed
+    findings: tuple[Finding, ...]
+
+
+def agreed(
+    result: Smoothed, log: Log, site: Site, solve: Solve, plain: Solve, risk: Risk | None = None
+) -> Agreed:
+    """Return a solution without magnetometers that contradict the others.
+
+    Parameters
+    ----------
+    solve : callable
+        Makes the solution of a log and its site.
+    plain : callable
+        The same with noise and model error as declared, so that misfits compare.
+    """
+    risk = Risk() if risk is None else risk
+    findings: list[Finding] = []
+    while site.platform.further:
+        found = separate_smoothed(result, by_magnetometer=True)
+        worst = 0.0 if found is None else float(np.max(found.excess(risk, SLACK)))
+        if worst <= 1.0:
+            break
+        sensors = site.platform.magnetometers
+        misfits = []
+        for which in range(len(sensors)):
+            part = without_magnetometer(log, site, which)
+            misfits.append(_misfit(plain, *part))
+        order = np.argsort(misfits)
+        names = ", ".join(sensor.name for sensor in sensors)
+        if not misfits[order[1]] > PLAINLY * misfits[order[0]]:
+            findings.append(_undecided(names, worst))
+            break
+        which = int(order[0])
+        log, site = without_magnetometer(log, site, which)
+        result = solve(log, site)
+        findings.append(_excluded(sensors[which].name, names, worst))
+    return Agreed(log, site, result, tuple(findings))
+
+
+def _misfit(plain: Solve, log: Log, site: Site) -> float:
+    """Return the misfit of a solution by each of its numbers; infinite where there is none."""
+    try:
+        result = plain(log, site)
+    except RuntimeError:  # GTSAM's own, of a singular system, or an EstimationError
+        return np.inf
+    return float(2.0 * result.cost / np.sum(np.isfinite(result.residual)))
+
+
+def _excluded(name: str, names: str, worst: float) -> Finding:
+    text = (
+        f"Magnetometer {name} contradicts the others: with and without it the trajectory differs by"
+        f" {worst:.3g} times what noise and survey explain, and without it all fits. It is left"
+        f" out. Check its body_from_sensor, matrix, response and clock_offset_s (of {names})."
+    )
+    return Finding("magnetometer_excluded", text, weight=worst)
+
+
+def _undecided(names: str, worst: float) -> Finding:
+    text = (
+        f"The magnetometers {names} contradict each other: the trajectory without one of them"
+        f" differs by {worst:.3g} times what noise and survey explain, and each alone fits alike."
+        " Check body_from_sensor, matrix, response and clock_offset_s of each; a third would tell."
+    )
+    return Finding("magnetometers_contradict", text, weight=worst)

@@ -1,0 +1,72 @@
+"""Several magnetometers online: one that the motion keeps refusing is named and left out."""
+
+import numpy as np
+
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding
+from magfusion.units import BoolArray
+
+MEMORY = 0.95  # of the running share of its phasors that were refused, an epoch of its own
+MOSTLY, SELDOM = 0.5, 0.2  # share of one that is false, and of another beside it that is right
+FEWEST = 20  # epochs of its own, before anything is said of one
+
+
+class MagnetometerWatch:
+    """Follows what share of each magnetometer's phasors the state does not explain.
+
+    Attributes
+    ----------
+    share : dict of str to float
+        By magnetometer.
+    epochs : dict of str to int
+        Of each, as many as hold any of its phasors.
+    """
+
+    share: dict[str, float]
+    epochs: dict[str, int]
+
+    def __init__(self, site: Site) -> None:
+        sensors = site.platform.magnetometers
+        several = len(sensors) > 1
+        self._names = tuple(sensor.name for sensor in sensors) if several else ()
+        self._sensor = site.sensor
+        self.share, self.epochs = {}, {}
+
+    @property
+    def false(self) -> tuple[str, ...]:
+        """Those that are left out: refused mostly, where another seldom is."""
+        asked = [name for name in self._names if self.epochs.get(name, 0) >= FEWEST]
+        right = [name for name in asked if self.share[name] < SELDOM]
+        return tuple(name for name in asked if right and self.share[name] > MOSTLY)
+
+    def heard(self, refused: BoolArray, valid: BoolArray) -> BoolArray:
+        """Take in which of an epoch's channels a state does not explain; return what is left out.
+
+        Returns
+        -------
+        bool ndarray, shape (channels,)
+            The channels of magnetometers that are false, whatever they hold now.
+        """
+        out = np.zeros(len(valid), dtype=bool)
+        for k, name in enumerate(self._names):
+            own = valid & (self._sensor == k)
+            if np.any(own):
+                now = float(np.mean(refused[own]))
+                before = self.share.get(name, now)
+                self.share[name] = MEMORY * before + (1.0 - MEMORY) * now
+                self.epochs[name] = self.epochs.get(name, 0) + 1
+        for name in self.false:
+            out |= self._sensor == self._names.index(name)
+        return out
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Return what is to be said of those that are left out."""
+        return tuple(
+            Finding(
+                "magnetometer_excluded",
+                f"Magnetometer {name} contradicts the others: {100.0 * self.share[name]:.0f} % of"
+                " its phasors are not what the motion allows, of another hardly any. It is left"
+                " out. Check its body_from_sensor, matrix, response and clock_offset_s.",
+            )
+            for name in self.false
+        )

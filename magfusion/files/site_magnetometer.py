@@ -1,0 +1,216 @@
+"""What a site's file says of magnetometers."""
+
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, Field, ValidationError
+from pydantic_core import InitErrorDetails
+
+from magfusion.files.site_casing import CasingEntry, casing_entry
+from magfusion.files.site_plain import (
+    degree_sigma_entry,
+    model_of,
+    plain,
+    rotation_of,
+    rpy_deg,
+    sigma_entry,
+)
+from magfusion.files.site_response import (
+    AxisResponsesEntry,
+    Listed,
+    check_response,
+    response_entry,
+    responses_of,
+)
+from magfusion.files.site_values import (
+    LARGEST_NOISE_DENSITY,
+    LARGEST_OFFSET,
+    LARGEST_SCALE,
+    AboveZero,
+    Angles,
+    FromZero,
+    NotNegative,
+    Position,
+    PositionSigma,
+    RotationSigma,
+    array,
+    between,
+    not_singular,
+    refusal_at,
+    sigma_array,
+    tesla,
+    zeros,
+)
+from magfusion.files.site_warming import SensorWarmingEntry, warming_entry
+from magfusion.files.yaml_files import StrictModel
+from magfusion.model.site import Magnetometer, MagnetometerSigma
+from magfusion.units import Array
+
+LARGEST_PHASE = 0.2  # rad; of a tone by a clock's sigma: three of them are still nearly linear
+
+
+class MagnetometerSigmaEntry(StrictModel):
+    """Priors of the magnetometer's calibration; an absent one is zero."""
+
+    matrix: Annotated[Array, sigma_array(3, 3, largest=10.0)] = Field(
+        default_factory=lambda: np.zeros((3, 3))
+    )
+    offset_t: Annotated[Array, sigma_array(3, largest=1e9), tesla(LARGEST_OFFSET)] = Field(
+        default_factory=zeros
+    )
+    rotation_deg: RotationSigma = Field(default_factory=zeros)
+    position_m: PositionSigma = Field(default_factory=zeros)
+    clock_offset_s: Annotated[FromZero, between(0.0, 1.0)] = 0.0
+
+
+class MountingEntry(StrictModel):
+    """Lever arm and attitude of the sensor on the body; absent ones are zero."""
+
+    position_m: Position = Field(default_factory=zeros)
+    rpy_deg: Angles = Field(default_factory=zeros)
+
+
+class MagnetometerEntry(StrictModel):
+    """``measured = matrix @ field_sensor + offset_t``, and its noise."""
+
+    body_from_sensor: MountingEntry = Field(default_factory=MountingEntry)
+    noise_density_t_rthz: Annotated[
+        AboveZero,
+        tesla(LARGEST_NOISE_DENSITY, "T/sqrt(Hz)"),
+        between(1e-18, LARGEST_NOISE_DENSITY),
+    ]
+    matrix: Annotated[Array, array(3, 3, largest=LARGEST_SCALE), AfterValidator(not_singular)] = (
+        Field(default_factory=lambda: np.eye(3))
+    )
+    offset_t: Annotated[Array, array(3), tesla(LARGEST_OFFSET)] = Field(default_factory=zeros)
+    coil_centres_m: Annotated[Array, array(3, 3, largest=10.0, unit="m")] | None = None
+    coil_kappa_m2: Annotated[float, between(-1.0, 1.0)] = Magnetometer.coil_kappa
+    offset_walk_t: Annotated[NotNegative, tesla(LARGEST_OFFSET)] = 2e-8  # gained in an hour
+    warming: SensorWarmingEntry | None = None
+    response: Listed | None = None
+    axis_responses: AxisResponsesEntry | None = None
+    casing: CasingEntry | None = None
+    axes: Annotated[list[Literal["x", "y", "z"]], Field(min_length=1, max_length=3)] | None = None
+    name: Annotated[str, Field(min_length=1)] | None = None
+    clock_offset_s: Annotated[float, between(-1e3, 1e3)] = Magnetometer.clock_offset
+    sigma: MagnetometerSigmaEntry = Field(default_factory=MagnetometerSigmaEntry)
+
+
+def check_magnetometers(
+    one: MagnetometerEntry | None, several: list[MagnetometerEntry] | None
+) -> None:
+    """Refuse none, both forms, and magnetometers that names do not tell apart."""
+    if several is None:
+        if one is None:
+            detail = InitErrorDetails(type="missing", loc=("magnetometer",), input=None)
+            raise ValidationError.from_exception_data("site", [detail])
+        if one.clock_offset_s or one.sigma.clock_offset_s:
+            remedy = "remove it: the clock of a single magnetometer is that of the log"
+            raise refusal_at(("magnetometer", "clock_offset_s"), one.clock_offset_s, remedy)
+        return
+    if one is not None:
+        remedy = "remove it, or magnetometers: a platform has one or a list"
+        raise refusal_at(("magnetometer",), "both", remedy)
+    names = [sensor.name for sensor in several]
+    for i, sensor in enumerate(several):
+        at = ("magnetometers", i)
+        if sensor.name is None:
+            detail = InitErrorDetails(type="missing", loc=(*at, "name"), input=None)
+            raise ValidationError.from_exception_data("site", [detail])
+        if sensor.name in names[:i]:
+            remedy = f"give it another name than magnetometers[{names.index(sensor.name)}]"
+            raise refusal_at((*at, "name"), sensor.name, remedy)
+        if len(several) > 1 and sensor.axes is not None and len(set(sensor.axes)) < 3:
+            remedy = "give all three axes: beside others a receiver of fewer is not taken yet"
+            raise refusal_at((*at, "axes"), sensor.axes, remedy)
+    if several[0].clock_offset_s or several[0].sigma.clock_offset_s:
+        remedy = "give it to the others: the clock of the first magnetometer is that of the log"
+        raise refusal_at(("magnetometers", 0, "clock_offset_s"), several[0].clock_offset_s, remedy)
+
+
+def check_tones(sensor: MagnetometerEntry, tones_hz: Array, at: tuple[str | int, ...]) -> None:
+    """Refuse a response that does not reach all tones, and a clock that leaves no phase known.
+
+    Parameters
+    ----------
+    at : tuple
+        Where the magnetometer stands in the site's file.
+    """
+    if sensor.response is not None and sensor.axis_responses is not None:
+        raise refusal_at((*at, "response"), "both", "remove it, or axis_responses")
+    if sensor.response is not None:
+        check_response(sensor.response, tones_hz, (*at, "response"))
+    if sensor.axis_responses is not None:
+        for axis, entries in sensor.axis_responses.axes.items():
+            check_response(entries, tones_hz, (*at, "axis_responses", axis))
+    highest = float(np.max(tones_hz, initial=0.0))
+    if 2.0 * np.pi * highest * sensor.sigma.clock_offset_s > LARGEST_PHASE:
+        most = LARGEST_PHASE / (2.0 * np.pi * highest)
+        remedy = (
+            f"give at most {most:.2g} s, {LARGEST_PHASE:g} rad of the tone at {highest:g} Hz:"
+            " beyond it the phases of magnetometers cannot be compared; record all by one clock"
+        )
+        raise refusal_at((*at, "sigma", "clock_offset_s"), sensor.sigma.clock_offset_s, remedy)
+
+
+def magnetometer_of(entry: MagnetometerEntry) -> Magnetometer:
+    """Return the magnetometer that an entry describes."""
+    return Magnetometer(
+        position_body=entry.body_from_sensor.position_m,
+        body_from_sensor=rotation_of(entry.body_from_sensor.rpy_deg),
+        noise_density=entry.noise_density_t_rthz,
+        matrix=entry.matrix,
+        offset=entry.offset_t,
+        sigma=model_of(MagnetometerSigma, entry.sigma),
+        coil_centres_sensor=entry.coil_centres_m,
+        offset_walk=entry.offset_walk_t,
+        coil_kappa=entry.coil_kappa_m2,
+        warming=None if entry.warming is None else entry.warming.warming(),
+        response=responses_of(entry.response, entry.axis_responses),
+        casing=None if entry.casing is None else entry.casing.casing(),
+        axes="".join(sorted(set(entry.axes or Magnetometer.axes))),
+        name=entry.name or Magnetometer.name,
+        clock_offset=entry.clock_offset_s,
+    )
+
+
+def magnetometer_entries(sensors: tuple[Magnetometer, ...]) -> dict[str, Any]:
+    """Return the entries of all magnetometers under their key."""
+    if len(sensors) == 1 and sensors[0].name == Magnetometer.name:
+        return {"magnetometer": _magnetometer_entry(sensors[0])}
+    return {"magnetometers": [{"name": s.name} | _magnetometer_entry(s) for s in sensors]}
+
+
+def _magnetometer_entry(magnetometer: Magnetometer) -> dict[str, Any]:
+    sigma, centres = magnetometer.sigma, magnetometer.coil_centres_sensor
+    own = {} if centres is None else {"coil_centres_m": plain(centres)}
+    if magnetometer.coil_kappa != Magnetometer.coil_kappa:
+        own["coil_kappa_m2"] = float(magnetometer.coil_kappa)
+    if magnetometer.offset_walk != Magnetometer.offset_walk:
+        own["offset_walk_t"] = float(magnetometer.offset_walk)
+    own |= {} if magnetometer.axes == Magnetometer.axes else {"axes": list(magnetometer.axes)}
+    if magnetometer.clock_offset != Magnetometer.clock_offset:
+        own["clock_offset_s"] = float(magnetometer.clock_offset)
+    clock = {"clock_offset_s": float(sigma.clock_offset)} if sigma.clock_offset else {}
+    return (
+        own
+        | warming_entry(magnetometer.warming)
+        | response_entry(magnetometer.response)
+        | casing_entry(magnetometer.casing)
+        | {
+            "body_from_sensor": {
+                "position_m": plain(magnetometer.position_body),
+                "rpy_deg": rpy_deg(magnetometer.body_from_sensor),
+            },
+            "noise_density_t_rthz": float(magnetometer.noise_density),
+            "matrix": plain(magnetometer.matrix),
+            "offset_t": plain(magnetometer.offset),
+            "sigma": {
+                "matrix": sigma_entry(sigma.matrix),
+                "offset_t": sigma_entry(sigma.offset),
+                "rotation_deg": degree_sigma_entry(sigma.rotation_sensor),
+                "position_m": sigma_entry(sigma.position_body),
+                **clock,
+            },
+        }
+    )

@@ -1,0 +1,90 @@
+"""A magnetometer on the platform, or a triad of receive coils, and how well it is known."""
+
+from dataclasses import dataclass
+
+from magfusion.model.physics.casing import Casing
+from magfusion.model.response import AxisResponses, FrequencyResponse
+from magfusion.model.temperature import SensorWarming
+from magfusion.units import Array
+
+
+@dataclass(frozen=True, eq=False)
+class MagnetometerSigma:
+    """Prior standard deviations of the magnetometer's calibration; zero means known.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (3, 3)
+    offset : ndarray, shape (3,)
+        (T)
+    rotation_sensor : ndarray, shape (3,)
+        Of the mounting, sensor axes (rad).
+    position_body : ndarray, shape (3,)
+        Of the lever arm, body axes (m).
+    clock_offset : float
+        (s)
+    """
+
+    matrix: Array
+    offset: Array
+    rotation_sensor: Array
+    position_body: Array
+    clock_offset: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Magnetometer:
+    """``measured = matrix @ field_sensor + offset`` at ``position_body`` on the platform.
+
+    Parameters
+    ----------
+    position_body : ndarray, shape (3,)
+        Lever arm (m).
+    body_from_sensor : ndarray, shape (3, 3)
+        Mounting rotation.
+    noise_density : float
+        One-sided white noise (T/sqrt(Hz)).
+    matrix : ndarray, shape (3, 3)
+    offset : ndarray, shape (3,)
+        (T)
+    coil_centres_sensor : ndarray, shape (3, 3), optional
+        Magnetic centre of each axis's own coil (m), row by row; None where all three are at
+        ``position_body``.
+    offset_walk : float
+        Standard deviation that the offset gains in an hour (T).
+    coil_kappa : float
+        Finite size of each axis's coil (m^2, `magfusion.model.receive_coils`); zero for a point.
+    warming : SensorWarming, optional
+        How matrix and offset change with temperature.
+    response : FrequencyResponse or AxisResponses, optional
+        To fields that are not steady; None where they are measured as steady ones are.
+    axes : str
+        Letters of the axes that it has.
+    casing : Casing, optional
+        Steel tube that it is in.
+    name : str
+        By which data and reports call it where there are several.
+    clock_offset : float
+        What it stamps t was taken at t + clock_offset on the log's clock (s).
+    """
+
+    position_body: Array
+    body_from_sensor: Array
+    noise_density: float
+    matrix: Array
+    offset: Array
+    sigma: MagnetometerSigma
+    coil_centres_sensor: Array | None = None
+    offset_walk: float = 2e-8
+    coil_kappa: float = 0.0
+    warming: SensorWarming | None = None
+    response: FrequencyResponse | AxisResponses | None = None
+    axes: str = "xyz"
+    casing: Casing | None = None
+    name: str = "magnetometer"
+    clock_offset: float = 0.0
+
+    @property
+    def lacking(self) -> tuple[int, ...]:
+        """Numbers of the axes that it has not."""
+        return tuple(k for k, axis in enumerate("xyz") if axis not in self.axes)
