@@ -75,8 +75,8 @@ def test_the_models_error_of_one_axis_is_that_of_the_whole_field() -> None:
     site, truth = replace(demo_site(), model_error=0.01), poses(6)
     lever = site.platform.magnetometer.position_body
     place = truth.position_world + truth.world_from_body @ lever
-    whole = measurement_cov(site, seen(site, truth), sensor_world=place)
-    one = measurement_cov(site, seen(with_axes(site, "z"), truth), sensor_world=place)
+    whole = measurement_cov(site, seen(site, truth), sensor_world=place[:, None])
+    one = measurement_cov(site, seen(with_axes(site, "z"), truth), sensor_world=place[:, None])
     np.testing.assert_allclose(one[..., 2, 2], whole[..., 2, 2], rtol=0.1)
 
 

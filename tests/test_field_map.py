@@ -157,7 +157,7 @@ def owners(site):
 def test_each_channel_has_the_error_of_its_own_beacon_where_the_sensor_is():
     site = half_mapped()
     mapped = owners(site)
-    error = model_error(site, np.concatenate([POINTS[:1], FAR]))
+    error = model_error(site, np.concatenate([POINTS[:1], FAR])[:, None])
     assert error.shape == (2, len(site.channels))
     assert np.all(error[:, ~mapped] == 0.03)
     gain, turn = textbook_variance(POINTS[:1])[0]
@@ -181,9 +181,9 @@ def test_phasors_weigh_less_where_the_map_is_not_known():
         phasor_cov=np.broadcast_to(1e-20 * np.eye(3), (*shape, 3)).copy(),
     )
     places = np.concatenate([POINTS[:1], FAR])
-    cov = measurement_cov(site, samples, sensor_world=places)
+    cov = measurement_cov(site, samples, sensor_world=places[:, None])
     expected = samples.phasor_cov + model_error_cov(
-        samples.phasor_sensor, model_error(site, places)
+        samples.phasor_sensor, model_error(site, places[:, None])
     )
     np.testing.assert_allclose(cov, expected, rtol=1e-12)
     plain = replace(site, beacons=tuple(replace(b, field_map=None) for b in site.beacons))

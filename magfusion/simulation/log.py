@@ -15,7 +15,7 @@ from magfusion.model.physics.earth import earth_field_world
 from magfusion.model.samples import FieldSamples, Log, Waveform
 from magfusion.model.site import Beacon, Magnetometer, Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.simulation.disturbance import Ambient, Spheres, draw_bending, draw_spheres
+from magfusion.simulation.disturbance import Ambient, Bending, Spheres, draw_bending, draw_spheres
 from magfusion.simulation.field import Drives, phasors_world, synchronised_drives
 from magfusion.simulation.inertial import BiasInstability, simulate_imu
 from magfusion.simulation.layers import Layers
@@ -256,6 +256,7 @@ def simulate_fields(
     window: float = 0.4,
     spheres: Spheres | None = None,
     layers: Layers | None = None,
+    bending: Bending | None = None,
 ) -> FieldSamples:
     """Return phasors with white noise directly, without a waveform and its receiver.
 
@@ -275,6 +276,8 @@ def simulate_fields(
         Iron in the room.
     layers : Layers, optional
         Of the ground, in place of the full space that the site declares.
+    bending : Bending, optional
+        Of each beacon's field.
     """
     drives = drives or synchronised_drives(site)
     time = trajectory.time
@@ -287,6 +290,9 @@ def simulate_fields(
         point_world = trajectory.position_world + lever_world
         world_from_sensor = trajectory.world_from_body @ magnetometer.body_from_sensor
         fields_world = [phasors_world(b, point_world, spheres, layers) for b in site.beacons]
+        if bending is not None:
+            straight = enumerate(fields_world)
+            fields_world = [bending.bent_world(i, own, point_world) for i, own in straight]
         world = np.concatenate(fields_world, axis=1)
         turned = world * np.exp(1j * phase)[..., None]
         seen = turned @ world_from_sensor @ magnetometer.matrix.T
