@@ -15,5 +15,4 @@ def test_a_design_beats_the_median_of_random_layouts_and_the_best_of_them() -> N
     assert 0.9 < low < middle < high < 1.1
     assert 0.98 < middle < 1.02
     assert found.worst_sigma[2] < found.worst_sigma[0]  # for accuracy alone A is better
-    assert sum(found.seconds) < 600.0
     assert "below the median" in report(found)
