@@ -17,6 +17,7 @@ from magfusion.files.log import read_log, write_log
 from magfusion.files.plain_data import resume, to_plain
 from magfusion.files.site import load_site, save_site
 from magfusion.files.stream import Record
+from magfusion.jobs.import_log import ImportSettings, run_import
 from magfusion.model.marks import SILENT, UNTOLD, Marks, SlotColumn, marks_of_column
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import MarkedSlots, Site, Slots
@@ -381,3 +382,17 @@ def test_pulses_have_their_coils_sign(tmp_path: Path) -> None:
 def test_records_of_marks_are_checked(record: dict[str, object], sentence: str) -> None:
     with pytest.raises(ValidationError, match=sentence):
         Record.model_validate(record)
+
+
+def test_a_foreign_table_brings_the_slot_beside_its_samples(tmp_path: Path) -> None:
+    told = ["0", "", "1", "-1", "2"]
+    rows = [f"{0.01 * k:.2f},1e-5,2e-5,{4e-5 + 1e-9 * k:.9f},{told[k // 8]}" for k in range(40)]
+    (tmp_path / "mag.csv").write_text("\n".join(["t,bx,by,bz,mux", *rows]) + "\n")
+    said = ("magnetometer.time=t[s]", "magnetometer.field=bx,by,bz[T]", "magnetometer.slot=mux")
+    settings = ImportSettings(magnetometer=tmp_path / "mag.csv", map=said)
+    run_import(settings, tmp_path / "log")
+    found = read_log(tmp_path / "log").waveform
+    assert found is not None
+    assert found.marks is not None
+    assert found.marks.slot.tolist() == [0, 1, SILENT, 2]
+    assert len(found) == 40

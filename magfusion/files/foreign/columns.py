@@ -39,6 +39,8 @@ STREAMS: dict[str, dict[str, Dimension]] = {
     },
 }
 OPTIONAL = frozenset(VELOCITY)
+# What is taken only where it is said, and may be missing in any row.
+BESIDE: dict[str, dict[str, Dimension]] = {"magnetometer": {"slot": Dimension.NUMBER}}
 # What stands for several columns.
 GROUPS = {
     **{stem: tuple(f"{stem}_{a}" for a in _AXES) for stem in ("gyro", "accel", "field")},
@@ -116,7 +118,7 @@ def parse_entry(text: str) -> list[Entry]:
         )
     if stream not in STREAMS:
         raise InputError(f"--map {text!r}: {stream} is no table; write one of {', '.join(STREAMS)}")
-    if not column or column in STREAMS[stream]:
+    if not column or column in STREAMS[stream] or column in BESIDE.get(stream, {}):
         return [Entry(stream, column, value)]
     if column not in GROUPS or GROUPS[column][0] not in STREAMS[stream]:
         known = [*STREAMS[stream]]
@@ -152,6 +154,11 @@ def _split(stream: str, group: str, value: str, text: str) -> list[Entry]:
     ]
 
 
+def dimension_of(stream: str, column: str) -> Dimension:
+    """Return what a column of a stream is."""
+    return (STREAMS[stream] | BESIDE.get(stream, {}))[column]
+
+
 def resolve(entry: Entry, columns: Sequence[Column]) -> tuple[Term, ...]:
     """Return the columns of the file that an entry means; stamps may be a sum of several.
 
@@ -160,7 +167,7 @@ def resolve(entry: Entry, columns: Sequence[Column]) -> tuple[Term, ...]:
     Undecided
         With the reason, for a column that is not there or a unit that is not said.
     """
-    dimension = STREAMS[entry.stream][entry.column]
+    dimension = dimension_of(entry.stream, entry.column)
     parts = [entry.value]
     if dimension is Dimension.TIME and place_of(entry.value, columns) is None:
         parts = re.split(r"(?<=\])\s*\+\s*", entry.value)

@@ -10,7 +10,7 @@ import pyarrow.parquet
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.files.foreign.columns import EULER, QUATERNION, TIME, Term
+from magfusion.files.foreign.columns import BESIDE, EULER, QUATERNION, TIME, Term
 from magfusion.files.foreign.plan import Plan
 from magfusion.files.foreign.source import Part
 from magfusion.files.foreign.units import NO_STAMP, Raw, to_nanoseconds
@@ -171,7 +171,8 @@ def _kept(
     counts.read += len(stamps)
     keep: BoolArray = stamps != NO_STAMP
     counts.leave_out("without a time", int(np.sum(~keep)))
-    missing: BoolArray = np.asarray(np.isnan(values).any(axis=1))
+    needed = [name not in BESIDE.get(plan.stream, {}) for name in names]
+    missing: BoolArray = np.asarray(np.isnan(values[:, needed]).any(axis=1))
     if plan.stream == "truth":
         # A truth has no use for rows that hold no pose; a stream of samples knows that one is lost.
         counts.leave_out("without a pose", int(np.sum(keep & missing)))

@@ -9,6 +9,7 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.files.foreign.columns import (
+    BESIDE,
     EULER,
     GROUPS,
     OPTIONAL,
@@ -18,6 +19,7 @@ from magfusion.files.foreign.columns import (
     Entry,
     Term,
     Undecided,
+    dimension_of,
     resolve,
 )
 from magfusion.files.foreign.guess import (
@@ -153,6 +155,9 @@ def plan_stream(
             own.terms |= {target: usual[target]} if target in usual else {}
         elif target != TIME or rate is None:
             own.guess(target, named[target], target in OPTIONAL and not velocity)
+    for target in BESIDE.get(stream, {}):
+        if target in given:
+            own.say(given[target])
     return own.plan(velocity)
 
 
@@ -235,7 +240,8 @@ class _Planning:
             for name in parts:
                 del self.terms[name]
         self._check_lengths()
-        ordered = {t: self.terms[t] for t in STREAMS[self.stream] if t in self.terms}
+        known = (*STREAMS[self.stream], *BESIDE.get(self.stream, {}))
+        ordered = {t: self.terms[t] for t in known if t in self.terms}
         plan = Plan(self.stream, self.source, ordered, self.rate)
         sure = {target: self.terms[target] for target in self.guessed if target in self.terms}
         self.told.guessed += as_options(self.stream, self.source, sure)
@@ -284,7 +290,7 @@ class _Planning:
         self.told.proposals += as_options(self.stream, self.source, terms)
 
     def _likely(self, target: str, place: int, sign: float) -> Term:
-        dimension = STREAMS[self.stream][target]
+        dimension = dimension_of(self.stream, target)
         stem = target.rpartition("_")[0]
         places = [p for t, (p, _, _) in self.open.items() if t.rpartition("_")[0] == stem]
         if dimension is Dimension.TIME:
