@@ -16,6 +16,7 @@ from magfusion.estimation.ranging_windows import ranging_log
 from magfusion.estimation.relative_wells import Wells
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
+from magfusion.jobs.range_wells import _near_casing
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.units import Array
@@ -209,3 +210,15 @@ def test_published_accuracy_is_bettered_by_a_factor_of_five_and_no_error_is_beyo
     found = scenario.judged(rows)
     assert found.rms_share <= scenario.PUBLISHED / scenario.BETTER
     assert found.nees <= scenario.MOST_NEES
+
+
+def test_near_a_casing_the_sigmas_are_widened_and_that_is_said(
+    ranged: tuple[Ranged, RangingWindows], scene: scenario.Scene
+) -> None:
+    found, windows = ranged
+    told = ranging_log(scene.log, scenario.declared_site(cased=False), QUICK.window)
+    wells = Wells(found, windows, np.array([1.0, 0.0, 0.0]))
+    trust, wider = _near_casing(wells, told)
+    nearest = min(scenario.true_place(scene, own)[0] for own in scene.passes)
+    assert [finding.code for finding in trust.findings] == ["iron"]
+    assert wider == pytest.approx((10.0 / nearest) ** 2, rel=0.01)
