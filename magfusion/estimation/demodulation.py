@@ -133,6 +133,8 @@ def demodulated(log: Log, site: Site, settings: LockinSettings | None = None) ->
             raise EstimationError(f"log {log.name} has neither waveform nor phasors")
         refuse_too_deep(log.fields, site)
         return Demodulation(log, without_silence(log.fields), {})
+    if site.platform.further:
+        raise InputError("samples of several magnetometers are not demodulated; give their phasors")
     receiver = Receiver.of(site, beside_lines(log, site, settings))
     windows, fields = receiver.whole(log.waveform, log.imu)
     refuse_too_deep(fields, site)

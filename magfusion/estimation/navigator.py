@@ -150,6 +150,8 @@ class Navigator:
         InputError
             Where a number is not finite or the clock jumped.
         """
+        if self.site.platform.further:
+            raise InputError("magnetometer: samples of several are not taken; give their phasors")
         known, sensor = self.site.temperatures, self.site.platform.magnetometer
         if sensor.lacking:
             measured_sensor = np.array(measured_sensor, dtype=np.float64)
