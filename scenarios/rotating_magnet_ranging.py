@@ -1,9 +1,8 @@
 """Two wells, a magnet that turns in one and a sensor at rest in the other: how far, and where.
 
-Rotating magnet ranging as it is practised (A. F. Kuckes, US patents 5 589 775 and 5 923 170; J. I.
-de Lange and T. J. Darling, SPE Drilling Engineering, June 1990): a magnet across a shaft near the
-bit goes by a sensor in a cased well, twice, the sensor elsewhere the second time.  Published
-systems are told to be good for about 3 % of the distance at 25 m.
+Rotating magnet ranging as it is practised (A. F. Kuckes, US patent 5 589 775): a magnet across a
+shaft near the bit goes by a sensor in a cased well, twice, the sensor elsewhere the second time.
+Published systems are told to be good for about 3 % of the distance at 25 m.
 
 Two cases.  ``crossing``: about 25 m apart, any direction, wells that converge by some degrees.
 ``pair``: a steam-assisted pair, 5 m apart over 80 m.  The field of the magnet is that of a stack
