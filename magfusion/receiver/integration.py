@@ -163,10 +163,11 @@ def searched(found: Pieces, tones: list[int], frequencies_hz: Array, largest: fl
         noise = float(np.median(np.sum(np.abs(phasor) ** 2, axis=1)))
         own.append(weight[:, None] * phasor / np.sqrt(noise))
     fine = 1.0 / (PER_RESOLUTION * half * highest)
-    drifts = fine * np.arange(-np.ceil(largest / fine), np.ceil(largest / fine) + 1)
+    drifts = np.linspace(-largest, largest, 2 * int(np.ceil(largest / fine)) + 1)
     best = float(drifts[np.argmax(_loudness(own, tones, frequencies_hz, elapsed, drifts))])
     for finer in (fine / 4.0, fine / 32.0):
-        near = np.asarray(best + finer * np.arange(-6.0, 7.0))
+        # What is tried beyond would not be counted among the trials.
+        near = np.clip(best + finer * np.arange(-6.0, 7.0), -largest, largest)
         best = float(near[np.argmax(_loudness(own, tones, frequencies_hz, elapsed, near))])
     slope = float(np.pi * half / np.sqrt(3.0))
     return Search(best, 2.0 * largest * highest * slope)
