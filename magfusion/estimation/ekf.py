@@ -99,8 +99,8 @@ class ErrorStateFilter:
         )
         for _ in range((3 if far else 1) if measurements else 0):
             error, jacobian = measured_rows(measurements, state, self.blocks)
-            # From the prediction, which holds the prior.
-            error = error - jacobian @ between(prior, state, self.blocks)
+            if state is not prior:  # from the prediction, which holds the prior
+                error = error - jacobian @ between(prior, state, self.blocks)
             try:
                 found = (_step_from_far if far else _step)(prior.cov, error, jacobian)
             except np.linalg.LinAlgError as failure:

@@ -33,12 +33,12 @@ from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.propagation import Propagated
-from magfusion.estimation.state import State
+from magfusion.estimation.state import POSITION, ROTATION, State
 from magfusion.model.parameters import Block
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding
-from magfusion.units import BoolArray
+from magfusion.units import Array, BoolArray
 
 WIDE_POSITION, WIDE_ROTATION = 0.3, 0.2  # m, rad; beyond, the prediction is no place to linearise
 LOST_POSITION = 10.0  # m; a prediction wider than this is worth nothing
@@ -262,14 +262,15 @@ class EpochUpdate:
     # Being lost, and found again
 
     def _lost(self, state: State) -> bool:
-        return self.gate.lost or state.position_sigma > LOST_POSITION
+        return self.gate.lost or not _no_wider(state.cov[POSITION, POSITION], LOST_POSITION)
 
     def _linearization_point(
         self, samples: FieldSamples, state: State
     ) -> tuple[State | None, BoolArray]:
         """Return where to linearise if a prediction is too wide for it, and what disagrees."""
         nothing = np.zeros(len(samples.channels), dtype=bool)
-        if state.position_sigma <= WIDE_POSITION and state.rotation_sigma <= WIDE_ROTATION:
+        wide = (POSITION, WIDE_POSITION), (ROTATION, WIDE_ROTATION)
+        if all(_no_wider(state.cov[part, part], sigma) for part, sigma in wide):
             self._pointing.over()
             return None, nothing
         if not self._pointing.due(state.time):
@@ -313,6 +314,12 @@ class EpochUpdate:
         self.gate.refused_in_a_row = 0
         self._attempts.over()
         self.witness.uncertain("found_again", time)
+
+
+def _no_wider(cov: Array, sigma: float) -> bool:
+    """Tell whether no axis of a covariance (3, 3) has a larger sigma."""
+    # The trace is not below the variance of any axis, and costs less.
+    return bool(np.trace(cov) <= sigma**2 or np.linalg.eigvalsh(cov)[-1] <= sigma**2)
 
 
 def _of_place(site: Site, state: State) -> tuple[Finding, ...]:

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.preintegration import low_pass_reach
 from magfusion.model.quaternion import (
-    components,
     cross,
     inverse,
     matrices,
+    of_matrices,
     of_vectors,
     product,
     turned,
@@ -105,7 +105,7 @@ class MotionShape:
         accel = imu.accel_body - interpolated(time, states.time, states.accel_bias_body)
         chain = turn_from_gyro(time, gyro)
         at_states = turn_at(chain, time, gyro, states.time)
-        known = components(Rotation.from_matrix(states.world_from_body))
+        known = of_matrices(states.world_from_body)
         world_from_start = product(known, inverse(at_states))
         spread = _between(world_from_start)
         world_from_body, world_accel = np.empty_like(chain), np.empty_like(accel)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, BinaryIO, TextIO
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.estimation.integrity.judgement import JudgedState
@@ -30,6 +29,7 @@ from magfusion.jobs.checkpoint import begin, save
 from magfusion.jobs.live import LiveSettings, StateSink, state_sinks
 from magfusion.jobs.region import ANYWHERE, Where
 from magfusion.model.marks import Marks
+from magfusion.model.quaternion import of_matrices
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding
 from magfusion.units import Array
@@ -257,7 +257,7 @@ def state_content(navigator: Navigator, state: JudgedState) -> dict[str, Any]:
     rival = navigator.rival_chi_square
     position_cov = world_from_body @ cov[POSITION, POSITION] @ world_from_body.T
     biases, sigmas = _of_imu(navigator, state)
-    quaternion = Rotation.from_matrix(world_from_body).as_quat(scalar_first=True)
+    quaternion = of_matrices(world_from_body[None])[:, 0]
     return told | {
         "ambiguous": rival is not None and rival < AMBIGUOUS_CHI_SQUARE,
         "position": state.position_world.tolist(),

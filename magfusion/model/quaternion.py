@@ -63,6 +63,25 @@ def matrices(quaternion: Array) -> Array:
     return out
 
 
+def of_matrices(rotation: Array) -> Array:
+    """Return the quaternions, shape (4, n), scalar first, of rotation matrices, shape (n, 3, 3).
+
+    By the largest component: of the other way to write it, none is lost in rounding.
+    """
+    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(rotation, 0, -1)
+    trace = a + e + i
+    largest = np.argmax([trace, a, e, i], axis=0)
+    own = np.array(
+        [
+            [1.0 + trace, h - f, c - g, d - b],
+            [h - f, 1.0 - trace + 2.0 * a, b + d, c + g],
+            [c - g, b + d, 1.0 - trace + 2.0 * e, f + h],
+            [d - b, c + g, f + h, 1.0 - trace + 2.0 * i],
+        ]
+    )
+    return unit(own[largest, :, np.arange(len(trace))].T)
+
+
 def unit(quaternion: Array) -> Array:
     """Return quaternions, shape (4, ...), without what rounding adds to their length."""
     return quaternion / np.sqrt(np.sum(quaternion**2, axis=0))

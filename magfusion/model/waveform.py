@@ -12,6 +12,7 @@ from magfusion.model.channel_effects import are_driven
 from magfusion.model.coil_field import side_by_side
 from magfusion.model.field import driven_field
 from magfusion.model.parameters import Calibration
+from magfusion.model.quaternion import cross
 from magfusion.model.receive_coils import is_apart, joined_samples, points_apart
 from magfusion.model.site import Magnetometer, Site
 from magfusion.model.trajectory import Trajectory
@@ -114,7 +115,7 @@ def _at_point(
     lever = rotation @ magnetometer.position_body
     along = None
     if change is not None:
-        along = change.position_world + np.cross(change.rotation_world, lever)
+        along = change.position_world + cross(change.rotation_world.T, lever.T).T
     field, by = np.tile(earth_field_world, (len(rotation), 1)), np.zeros((len(rotation), 3))
     for (_, source), current in zip(side_by_side(site), currents, strict=True):
         driven = driven_field(source, motion.position_world + lever, current, along)
@@ -123,6 +124,6 @@ def _at_point(
             by += np.sum(driven.along.reshape(-1, *field.shape), axis=0)
     measured_from_body = (magnetometer.matrix @ magnetometer.body_from_sensor.T).T
     if change is not None:
-        by += np.cross(field, change.rotation_world)
+        by += cross(field.T, change.rotation_world.T).T
         by = np.einsum("nji,nj->ni", rotation, by) @ measured_from_body
     return np.einsum("nji,nj->ni", rotation, field) @ measured_from_body, by

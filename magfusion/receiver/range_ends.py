@@ -5,6 +5,7 @@ faster than it measures keeps all three, and one that rests between two steps ke
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -70,41 +71,69 @@ def saturated(
     changed = np.any(measured[1:] != measured[:-1], axis=1)
     fresh = np.concatenate([[0], np.flatnonzero(changed) + 1])
     begin, end = np.searchsorted(fresh, first), np.searchsorted(fresh, last)
-    time = waveform.time[fresh]
-    for axis, known in enumerate(ends):
-        spoilt |= _at_end(measured[fresh, axis], time, begin, end, known)
+    value, time = measured[fresh], waveform.time[fresh]
+    known = np.array([(one.low, one.high, one.finest, one.kept) for one in ends]).T
+    low = np.minimum(np.minimum.accumulate(value), known[0])
+    high = np.maximum(np.maximum.accumulate(value), known[1])
+    change = np.zeros_like(value)
+    np.abs(value[1:] - value[:-1], out=change[1:])
+    moved = change > 0.0
+    finest = np.minimum.accumulate(np.where(moved, change, np.inf))
+    finest = np.minimum(finest, known[2])
+    index = np.arange(len(value))[:, None]
+    start = np.maximum.accumulate(np.where(moved, index, 0))
+    inner = (value > low) & (value < high)
+    inner &= time[:, None] > np.array([one.until for one in ends])
+    length = np.minimum(index - start + 1, LONGEST)
+    kept = np.maximum(np.maximum.accumulate(np.where(inner, length, 0)), known[3])
+    for axis in np.flatnonzero(np.max(length, axis=0) >= SHORTEST).tolist():
+        runs = _Runs(*(part[:, axis] for part in (value, low, high, finest, start, kept)))
+        spoilt |= _at_end(runs, begin, end)
+    newest = float(time[-1])
+    for axis, one in enumerate(ends):
+        one.low, one.high = float(low[-1, axis]), float(high[-1, axis])
+        one.finest, one.kept = float(finest[-1, axis]), int(kept[-1, axis])
+        one.until = max(one.until, newest)
     return spoilt
 
 
-def _at_end(
-    value: Array, time: Array, begin: IntArray, end: IntArray, known: RangeEnds
-) -> BoolArray:
+class _Runs(NamedTuple):
+    """What is known of one axis at each sample, shape (samples,) each.
+
+    Parameters
+    ----------
+    value : ndarray
+        (T)
+    low, high, finest, kept : ndarray
+        As of `RangeEnds`, until then.
+    start : int ndarray
+        Since which sample it has had this value.
+    """
+
+    value: Array
+    low: Array
+    high: Array
+    finest: Array
+    start: IntArray
+    kept: Array
+
+
+def _at_end(runs: _Runs, begin: IntArray, end: IntArray) -> BoolArray:
     """Return which windows, samples ``begin`` to before ``end``, hold an end of range."""
-    low = np.minimum(np.minimum.accumulate(value), known.low)
-    high = np.maximum(np.maximum.accumulate(value), known.high)
-    change = np.abs(np.diff(value, prepend=value[:1]))
-    finest = np.minimum.accumulate(np.where(change > 0.0, change, np.inf))
-    finest = np.minimum(finest, known.finest)
-    index = np.arange(len(value))
-    start = np.maximum.accumulate(np.where(change > 0.0, index, 0))
-    inner = (value > low) & (value < high) & (time > known.until)
-    length = np.minimum(index - start + 1, LONGEST)
-    kept = np.maximum(np.maximum.accumulate(np.where(inner, length, 0)), known.kept)
+    value, low, high, finest, start, kept = runs
     found = np.zeros(len(begin), dtype=bool)
-    first = np.flatnonzero(start == index)
+    first = np.flatnonzero(start == np.arange(len(value)))
     stop = np.append(first[1:], len(value))
     extreme = (value[first] == low[stop - 1]) | (value[first] == high[stop - 1])
     long = (stop - first >= SHORTEST) & extreme
     first, stop = first[long], stop[long]
     from_run, to_run = np.searchsorted(stop, begin, side="right"), np.searchsorted(first, end)
     for k in np.flatnonzero((to_run > from_run) & (end > begin)):
-        at, runs = end[k] - 1, slice(from_run[k], to_run[k])
+        at, within = end[k] - 1, slice(from_run[k], to_run[k])
         if high[at] - low[at] <= STEPS * finest[at]:
             continue
         least = max(SHORTEST, min(int(kept[at]) + 1, LONGEST))
-        whole = np.minimum(stop[runs], end[k]) - np.maximum(first[runs], begin[k])
-        own = value[first[runs]]
+        whole = np.minimum(stop[within], end[k]) - np.maximum(first[within], begin[k])
+        own = value[first[within]]
         found[k] = bool(np.any((whole >= least) & ((own == low[at]) | (own == high[at]))))
-    known.low, known.high, known.finest = float(low[-1]), float(high[-1]), float(finest[-1])
-    known.kept, known.until = int(kept[-1]), max(known.until, float(time[-1]))
     return found

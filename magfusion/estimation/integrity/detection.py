@@ -47,12 +47,11 @@ def drowned(samples: FieldSamples) -> BoolArray:
 
 def above_noise(samples: FieldSamples, least: float) -> BoolArray:
     """Tell which phasors have more than so much of chi square against nothing, (n, channels)."""
-    sqrt_information = whitening(samples.phasor_cov, samples.there)
-    phasor = np.nan_to_num(samples.phasor_sensor)[..., None]
-    square = (
-        np.abs(sqrt_information @ phasor.real) ** 2 + np.abs(sqrt_information @ phasor.imag) ** 2
-    )
-    return np.asarray(samples.valid & (np.sum(square, axis=(-1, -2)) > least))
+    there = samples.there
+    phasor = np.where(there, samples.phasor_sensor, 0.0)
+    parts = np.stack([phasor.real, phasor.imag], axis=-1)
+    white = whitening(samples.phasor_cov, there) @ parts
+    return np.asarray(samples.valid & (np.sum(white**2, axis=(-1, -2)) > least))
 
 
 def detected(samples: FieldSamples, least: float = DETECTION_CHI_SQUARE) -> BoolArray:
@@ -106,11 +105,12 @@ class DetectionFilter:
         step : float
             Since the epoch before (s).
         """
-        loud = detected(samples, DETECTION_CHI_SQUARE_ONLINE)
+        loud, valid = detected(samples, DETECTION_CHI_SQUARE_ONLINE), samples.valid[0]
         reach = int(np.ceil(samples.window[0] / step - 1e-6))
         if self._detected_for is None:
             self._detected_for = np.full(loud.shape[1], reach)
         # What an epoch does not hold (another slot's tone) has not fallen silent.
         counted = np.where(loud[0], self._detected_for + 1, 0)
-        self._detected_for = np.where(samples.valid[0], counted, self._detected_for)
-        return only(samples, loud & (self._detected_for > reach))
+        self._detected_for = np.where(valid, counted, self._detected_for)
+        kept = loud & (self._detected_for > reach)
+        return samples if np.all(kept) else only(samples, kept)

@@ -36,9 +36,12 @@ class Freeze:
     def stretches(self, time: Array, samples: Array) -> list[tuple[float, float]]:
         """Return after which sample and up to which (s) samples (k, 3) only repeat it."""
         out: dict[float, float] = {}
-        same = np.all(samples == np.vstack([self._sample, samples])[:-1], axis=1)
-        if len(time):
-            self._sample = samples[-1].copy()
+        if len(time) == 0:
+            return []
+        same = np.empty(len(time), dtype=bool)
+        same[0] = np.array_equal(samples[0], self._sample)
+        np.logical_and.reduce(samples[1:] == samples[:-1], axis=1, out=same[1:])
+        self._sample = samples[-1].copy()
         if self._passed(time, same):
             return []
         for k in range(len(time)):
@@ -55,6 +58,13 @@ class Freeze:
 
     def _passed(self, time: Array, same: BoolArray) -> bool:
         """Count samples none of which is repeated for long, as nearly always; else do nothing."""
+        if not (self.found or same.any() or self._repeats >= FEWEST):
+            self._seen, self._alike = (
+                self._seen + len(same) + self._repeats,
+                self._alike + self._repeats,
+            )
+            self._repeats, self.since = 0, float(time[-1])
+            return True
         changed = np.flatnonzero(~same)
         ends = np.concatenate([changed, [len(same)]])
         repeats = np.diff(ends, prepend=-1 - self._repeats) - 1

@@ -84,11 +84,12 @@ class NearMetal:
         error = rows.error[0, valid].reshape(-1)
         jacobian = rows.jacobian(len(state.cov) - MOTION)[0, valid].reshape(len(error), -1)
         spread = jacobian @ state.cov @ jacobian.T + np.eye(len(error))
-        along = np.zeros((len(error), len(error)))
-        for k, channel in enumerate(np.flatnonzero(valid)):
-            part = slice(size * k, size * (k + 1))
-            shape = own.sqrt_information[0, channel] @ _in_phase(phasors.measured[0, channel])
-            along[part, part] = power[channel] * shape @ shape.T
+        shape = own.sqrt_information[0, valid] @ _in_phase(phasors.measured[0, valid])
+        alone = power[valid, None, None] * shape @ np.swapaxes(shape, 1, 2)
+        blocks = np.zeros((len(alone), size, len(alone), size))
+        channel = np.arange(len(alone))
+        blocks[channel, :, channel] = alone
+        along = blocks.reshape(len(error), -1)
         weight = np.linalg.solve(spread, np.column_stack([along, error]))
         shared, seen = weight[:, :-1], weight[:, -1]
         information = float(np.sum(shared * shared.T))
@@ -123,10 +124,11 @@ class NearMetal:
 
 
 def _in_phase(measured: Array) -> Array:
-    """Return the directions (6, 3) of a phasor, real part first, at the phase that it has."""
-    phasor = measured[:3] + 1j * measured[3:]
-    turn = np.exp(0.5j * np.angle(np.sum(phasor**2)))
-    return np.vstack([turn.real * np.eye(3), turn.imag * np.eye(3)])
+    """Return the directions (n, 6, 3) of phasors (n, 6), real part first, at their phase."""
+    phasor = measured[:, :3] + 1j * measured[:, 3:]
+    turn = np.exp(0.5j * np.angle(np.sum(phasor**2, axis=1)))
+    both = np.stack([turn.real, turn.imag], axis=1)
+    return (both[:, :, None, None] * np.eye(3)).reshape(len(measured), 6, 3)
 
 
 def _with_share(

@@ -66,8 +66,8 @@ class Radius(NamedTuple):
 def radii(cov: Array) -> Radius:
     """Return the norms of rotation and position, shape (..., 2), of covariances (..., 6, 6)."""
     blocks = np.stack([cov[..., part, part] for part in PARTS], axis=-3)
+    # What is known exactly may round below.
     trace = np.maximum(np.einsum("...ii->...", blocks), 0.0)
-    trace = np.maximum(trace, 0.0)  # what is known exactly may round below
     largest = np.clip(_largest_eigenvalue(blocks), 0.0, trace)
     return Radius(np.sqrt(trace), np.sqrt(largest))
 
@@ -78,8 +78,8 @@ def _largest_eigenvalue(matrix: Array) -> Array:
     rest = matrix - mean[..., None, None] * np.eye(3)
     size = np.sqrt(np.einsum("...ij,...ij->...", rest, rest) / 6.0)
     scaled = rest / np.where(size > 0.0, size, 1.0)[..., None, None]
-    a, b, c = (scaled[..., i, :] for i in range(3))
-    half = 0.5 * np.einsum("...i,...i->...", a, np.cross(b, c))
+    (a, b, c), (_, d, e), (_, _, f) = np.moveaxis(scaled, (-2, -1), (0, 1))
+    half = 0.5 * (a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d))
     return mean + 2.0 * size * np.cos(np.arccos(np.clip(half, -1.0, 1.0)) / 3.0)
 
 

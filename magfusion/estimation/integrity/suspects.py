@@ -38,6 +38,7 @@ from magfusion.model.parameters import (
     placed,
 )
 from magfusion.model.parameters.parameter import AXES, Unit
+from magfusion.model.perturbation import skew
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.units import DEGREE, Array
@@ -94,8 +95,8 @@ class _GyroAlignment(Inertial):
     words = "the turn of the gyro against the accelerometer about {axis}"
 
     def as_bias(self, stream: Stream) -> Array:
-        turned = np.cross(np.eye(3)[None], stream.imu.gyro_body[:, None])  # by each unit turn
-        return _stacked(np.zeros((len(stream.imu), 3, 3)), np.swapaxes(turned, 1, 2))
+        # Each unit turn across the rate is a column.
+        return _stacked(np.zeros((len(stream.imu), 3, 3)), -skew(stream.imu.gyro_body))
 
 
 class _Gravity(Inertial):

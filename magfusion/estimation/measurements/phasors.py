@@ -5,7 +5,6 @@ from itertools import zip_longest
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.measurements.measurement import Loss, Measurement, Rows
 from magfusion.estimation.state import States
@@ -25,6 +24,7 @@ from magfusion.model.parameters import (
     linearize_channels,
     predict_channels,
 )
+from magfusion.model.quaternion import matrices, of_vectors
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -190,7 +190,7 @@ class FieldPhasors(Measurement):
         The states carry the IMU's clock: that was a little before or after.
         """
         lag = np.where(self.moving, calibration.imu_offset(self.time) - self.applied_offset, 0.0)
-        turn = Rotation.from_rotvec(-lag[:, None] * self.rate_body).as_matrix()
+        turn = matrices(of_vectors((-lag[:, None] * self.rate_body).T))
         return (
             lag,
             states.world_from_body @ turn,
