@@ -6,6 +6,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from magfusion.model import strapdown
+from magfusion.model.quaternion import of_matrices
+from magfusion.model.samples import ImuSamples
 from magfusion.model.site import MotionModel
 from magfusion.model.strapdown import (
     attitude_at,
@@ -14,6 +16,7 @@ from magfusion.model.strapdown import (
     resting,
     rotation_increments,
 )
+from magfusion.receiver.turn import Turn, body_turn_of
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log
 from magfusion.simulation.motion import Rests, turning_motion
@@ -207,3 +210,26 @@ def test_what_is_rest_is_for_the_sites_motion_model_to_say():
     still = resting(time, gyro, accel, motion=drill)
     assert np.all(still[(time > 1.01) & (time < 8.98)])
     assert not np.any(still[time < 0.99])  # the span is the model's
+
+
+def test_quaternions_of_matrices_are_those_of_any_turn() -> None:
+    rng = np.random.default_rng(3)
+    half_turns = np.concatenate([np.eye(3), rng.normal(size=(50, 3))])
+    half_turns *= np.pi / np.linalg.norm(half_turns, axis=1, keepdims=True)
+    vectors = np.concatenate([np.zeros((1, 3)), rng.normal(0.0, 2.0, (500, 3)), half_turns])
+    turns = Rotation.from_rotvec(vectors)
+    found = of_matrices(turns.as_matrix())
+    np.testing.assert_allclose(np.linalg.norm(found, axis=0), 1.0, rtol=1e-15)
+    assert largest_angle(Rotation.from_quat(found.T, scalar_first=True), turns) < 1e-14
+
+
+def test_a_field_is_turned_back_by_the_inverse_of_what_turned_it() -> None:
+    time, gyro = stream(4)
+    rng = np.random.default_rng(5)
+    matrix = np.eye(3) + 0.1 * rng.normal(size=(3, 3))  # scales and skew: no rotation
+    turn = Turn(body_turn_of(ImuSamples(time, gyro, np.zeros_like(gyro))), matrix)
+    wanted = np.linspace(time[0], time[-1], 40)
+    there, back = turn.both(wanted)
+    np.testing.assert_allclose(there, turn(wanted), atol=1e-15)
+    np.testing.assert_allclose(back, turn.back(wanted), atol=1e-15)
+    np.testing.assert_allclose(back, np.linalg.inv(turn(wanted)), atol=1e-14)

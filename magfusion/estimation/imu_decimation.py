@@ -26,7 +26,7 @@ JOINED = (20, 10)  # steps made one: as many as leave enough
 FEWEST_LEFT = 200  # joined steps of an interval that is thinned
 MOST_TURN = 0.5  # rad; within a joined step, for the series and for the derivatives
 CHUNK = 8192  # pairs of joined steps at a time: what is computed of them stays in the cache
-STRETCH = 1_000_000  # samples cut at a time: what is made of them is no multiple of a long log
+STRETCH = 200_000  # samples cut at a time: what is made of them is no multiple of a long log
 
 
 def preintegrate_stream(

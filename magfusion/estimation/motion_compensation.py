@@ -75,18 +75,20 @@ def demodulate_about(
 
     offset, designs = calibration.time_offset, operator.designs
     shape = MotionShape.of(known, imu, offset, site.gravity)
-    predicted, change = np.empty_like(measured_sensor), np.empty_like(measured_sensor)
+    unexplained, change = np.empty_like(measured_sensor), np.empty_like(measured_sensor)
     for begin in range(0, len(designs.time), AT_ONCE):
         rows = slice(begin, begin + AT_ONCE)
         time = designs.time[rows]
-        predicted[rows], change[rows] = predicted_waveform(
+        predicted, change[rows] = predicted_waveform(
             shape.at(time),
             calibration,
             earth,
             carriers(designs.frequencies_hz, time),
             Motion(*shape.by_time_offset(time)),
         )
-    rest, left = operator.demodulate(measured_sensor - predicted)
+        unexplained[rows] = measured_sensor[rows] - predicted
+    del shape  # which is larger than all that follows
+    rest, left = operator.demodulate(unexplained)
     at_centre = predict_channels(
         calibration, states.time, states.world_from_body, states.position_world
     )

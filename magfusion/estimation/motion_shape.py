@@ -1,5 +1,6 @@
 """The motion between states, of the IMU's shape; and how it changes with the IMU's time offset."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -109,8 +110,7 @@ class MotionShape:
         world_from_start = product(known, inverse(at_states))
         spread = _between(world_from_start)
         world_from_body, world_accel = np.empty_like(chain), np.empty_like(accel)
-        for begin in range(0, len(time), AT_ONCE):
-            rows = slice(begin, begin + AT_ONCE)
+        for rows in _pieces(len(time)):
             start = _turn_at(states.time, world_from_start, spread, time[rows])
             world_from_body[:, rows] = product(start, chain[:, rows])
             world_accel[rows] = turned(world_from_body[:, rows], accel[rows].T).T
@@ -206,14 +206,17 @@ class MotionShape:
     @cached_property
     def _by_offset(self) -> "_ByOffset":
         known = self.states.time
-        slow_body = self._averaged(self.gyro_body)
-        rate = turned(self.world_from_body, slow_body.T).T
+        rate, tilted = self._averaged(self.gyro_body), np.empty_like(self.accel_world)
+        for rows in _pieces(len(rate)):
+            rate[rows] = turned(self.world_from_body[:, rows], rate[rows].T).T
         at_states = interpolated(known, self.time, rate)
         # What the states hold back of the turn tilts the specific force.
-        force = self.accel_world + np.array([0.0, 0.0, self.gravity])
-        held = interpolated(self.time, known, at_states)
-        speed, moved = _integrated(self.time, cross(held.T, force.T).T)
-        del slow_body, force, held
+        for rows in _pieces(len(rate)):
+            force = self.accel_world[rows] + np.array([0.0, 0.0, self.gravity])
+            held = interpolated(self.time[rows], known, at_states)
+            tilted[rows] = cross(held.T, force.T).T
+        speed, moved = _integrated(self.time, tilted)
+        del tilted
         moved -= self.velocity_world
         speed -= self.accel_world
         position, velocity = self._averaged(moved), self._averaged(speed)
@@ -250,11 +253,24 @@ def motion_at(
 
 def _integrated(time: Array, rate: Array) -> tuple[Array, Array]:
     """Return the integral of samples (n, 3) that are linear in between, and its integral."""
-    step, zero = np.diff(time)[:, None], np.zeros((1, 3))
-    once = np.concatenate([zero, np.cumsum(0.5 * (rate[:-1] + rate[1:]) * step, axis=0)])
-    inner = (2.0 * rate[:-1] + rate[1:]) * step**2 / 6.0
-    twice = np.concatenate([zero, np.cumsum(once[:-1] * step + inner, axis=0)])
+    once, twice = np.zeros((2, *rate.shape))
+    for rows in _pieces(len(time) - 1):
+        later = slice(rows.start + 1, rows.stop + 1)
+        before, after = rate[rows], rate[later]
+        step = (time[later] - time[rows])[:, None]
+        gained = 0.5 * (before + after) * step
+        gained[0] += once[rows.start]
+        np.cumsum(gained, axis=0, out=once[later])
+        gained = once[rows] * step + (2.0 * before + after) * step**2 / 6.0
+        gained[0] += twice[rows.start]
+        np.cumsum(gained, axis=0, out=twice[later])
     return once, twice
+
+
+def _pieces(count: int) -> Iterator[slice]:
+    """Yield rows, as many at once as stay in the cache."""
+    for begin in range(0, count, AT_ONCE):
+        yield slice(begin, min(begin + AT_ONCE, count))
 
 
 def _hermite(known: Array, value: Array, slope: Array, wanted: Array) -> tuple[Array, Array]:

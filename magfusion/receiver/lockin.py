@@ -32,6 +32,7 @@ from magfusion.units import Array, BoolArray, ComplexArray
 
 MOST_COMPARED = 50  # windows by which two clocks are compared
 LEAST_COMPARED = 0.8  # of the samples of the fullest
+AT_ONCE = 1 << 14  # samples that are turned at once: what is made of them stays in the cache
 UNSEEN_TURN = 1.0  # rad/s; of a person or a vehicle, while the gyro is silent
 
 
@@ -154,7 +155,12 @@ class WindowOperator:
 
     def _still(self, measured_sensor: Array) -> Array:
         """Return the samples in axes that stand still, shape (samples, 3)."""
-        return turned(self.still_from_body, self.body_from_measured @ measured_sensor.T).T
+        out = np.empty_like(measured_sensor)
+        for begin in range(0, len(out), AT_ONCE):
+            rows = slice(begin, begin + AT_ONCE)
+            in_body = self.body_from_measured @ measured_sensor[rows].T
+            out[rows] = turned(self.still_from_body[:, rows], in_body).T
+        return out
 
     def _bent(self, rows: slice, maps: Maps) -> Array:
         """Return the relative variance of phasors by the square of a turn that is not seen.

@@ -27,7 +27,7 @@ def mended(log: Log, site: Site) -> Log:
     ``clocks`` and ``noticed`` of the result say what was.
     """
     log = _without_freeze(on_even_clocks(log, site), site)
-    found = {stream.name: false_rows(stream, log, site) for stream in streams(log)}
+    found = {stream.name: false_rows(stream, site) for stream in streams(log)}
     if not any(len(rows) for rows in found.values()):
         return log
     noticed = [replace(f, verdict=Verdict.TRUSTWORTHY) for f in false_samples(log, site)]

@@ -196,28 +196,34 @@ def repeated_samples(log: Log, site: Site | None) -> Iterator[Finding]:
 def clipped_samples(log: Log, _site: Site | None) -> Iterator[Finding]:
     """Yield the axes that stop at a limit of their instrument."""
     for stream in streams(log):
+        yield from _clipped_axes(stream)
+
+
+def _clipped_axes(stream: Stream) -> Iterator[Finding]:
+    value, still = stream.value, _all_frozen(stream)
+    if len(still):
         kept = np.ones(len(stream.time), dtype=bool)
-        still = _all_frozen(stream)
         for first, last in zip(still.first, still.last, strict=True):
             kept[first : last + 1] = False
-        if np.sum(kept) < LEAST_PILE:
-            continue
-        largest = float(np.max(np.abs(stream.value[kept])))
-        for axis in range(len(stream.axes)):
-            for sign in (-1.0, 1.0):
-                count, limit = clipped(sign * stream.value[kept, axis], largest)
-                if count == 0:
-                    continue
-                share = count / len(stream.time)
-                first_at = stream.time[np.argmax(stream.value[:, axis] == sign * limit)]
-                yield Finding(
-                    "saturated",
-                    f"{stream.name}: axis {stream.axes[axis]} stops at"
-                    f" {sign * limit * stream.scale:+.4g} {stream.unit} in {count} samples"
-                    f" ({100.0 * share:.2g} %), first at {first_at:.2f} s: its range ends there."
-                    " Choose a larger range, or keep away from what drives it there.",
-                    weight=500.0 + 100.0 * share,
-                )
+        value = value[kept]
+    if len(value) < LEAST_PILE:
+        return
+    largest = float(np.max(np.abs(value)))
+    for axis in range(len(stream.axes)):
+        for sign in (-1.0, 1.0):
+            count, limit = clipped(sign * value[:, axis], largest)
+            if count == 0:
+                continue
+            share = count / len(stream.time)
+            first_at = stream.time[np.argmax(stream.value[:, axis] == sign * limit)]
+            yield Finding(
+                "saturated",
+                f"{stream.name}: axis {stream.axes[axis]} stops at"
+                f" {sign * limit * stream.scale:+.4g} {stream.unit} in {count} samples"
+                f" ({100.0 * share:.2g} %), first at {first_at:.2f} s: its range ends there."
+                " Choose a larger range, or keep away from what drives it there.",
+                weight=500.0 + 100.0 * share,
+            )
 
 
 def clipped(value: Array, largest: float = np.inf) -> tuple[int, float]:
@@ -250,27 +256,25 @@ def clipped(value: Array, largest: float = np.inf) -> tuple[int, float]:
     return (count if pile and longest >= max(LEAST_RUN, 0.5 * by_chance) else 0), limit
 
 
-def spikes(stream: Stream, least: float = SPIKE) -> BoolArray:
-    """Tell which samples are false alone, shape (n, 3): off the curve through their neighbours.
+def _spikes(stream: Stream) -> tuple[IntArray, int]:
+    """Return the samples that are false alone, and how many are for sure.
 
-    Parameters
-    ----------
-    stream : Stream
-        Its neighbours must agree among each other: a knock moves several samples.
-    least : float
-        Deviation, in units of the scatter about it.
+    They are off the curve through their neighbours, which agree among each other: a knock moves
+    several samples.
     """
     x = stream.value
-    found = np.zeros(x.shape, dtype=bool)
     if len(x) < 2 * BLOCK:
-        return found
+        return np.zeros(0, dtype=np.int64), 0
     before, after = x[1:-3], x[3:-1]
     curve = (4.0 * (before + after) - x[:-4] - x[4:]) / 6.0
     off = np.abs(x[2:-2] - curve)
     floor = 1e-9 * np.max(np.abs(x))
     apart = np.maximum(np.abs(after - before), np.abs(x[:-4] - x[4:]))
-    found[2:-2] = (off > least * _scatter(off) + floor) & (off > 3.0 * apart)
-    return found
+    alone, scatter = off > 3.0 * apart, _scatter(off)
+    found, sure = (
+        np.any(alone & (off > least * scatter + floor), axis=1) for least in (SPIKE, SURE_SPIKE)
+    )
+    return np.flatnonzero(found) + 2, int(np.sum(sure))
 
 
 def _scatter(off: Array) -> Array:
@@ -283,16 +287,14 @@ def _scatter(off: Array) -> Array:
     return np.asarray(widest[block])
 
 
-def false_rows(stream: Stream, log: Log, site: Site | None) -> IntArray:
+def false_rows(stream: Stream, site: Site | None) -> IntArray:
     """Return the samples of a stream that are false alone; none where they are too few to tell."""
-    if any(finding.text.startswith(stream.name) for finding in clipped_samples(log, site)):
+    if next(_clipped_axes(stream), None) is not None:
         return np.zeros(0, dtype=np.int64)  # a limit makes corners
     if stream.name == "magnetometer" and site is not None and not _smooth_between(stream, site):
         return np.zeros(0, dtype=np.int64)
-    bad = spikes(stream)
-    rows = np.flatnonzero(bad.any(axis=1))
-    sure = int(np.sum(spikes(stream, SURE_SPIKE).any(axis=1)))
-    few = len(rows) < max(LEAST_SPIKES, SPIKE_SHARE * len(bad)) and sure < LEAST_SURE
+    rows, sure = _spikes(stream)
+    few = len(rows) < max(LEAST_SPIKES, SPIKE_SHARE * len(stream.value)) and sure < LEAST_SURE
     return rows[:0] if few else rows
 
 
@@ -307,7 +309,7 @@ def _smooth_between(stream: Stream, site: Site) -> bool:
 def false_samples(log: Log, site: Site | None) -> Iterator[Finding]:
     """Yield the instruments that give single false samples."""
     for stream in streams(log):
-        rows = false_rows(stream, log, site)
+        rows = false_rows(stream, site)
         if len(rows) == 0:
             continue
         x = stream.value
