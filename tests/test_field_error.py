@@ -54,7 +54,7 @@ def test_a_mode_moves_the_estimate_as_its_response_says() -> None:
     site, fields = result.calibration.site, result.fields
     poses = result.states
     column = 7  # the second mode
-    steps = result.graph.responses(result.estimate, result.uncertain)
+    steps = list(result.graph.responses(result.estimate, result.uncertain))
     first = result.uncertain[-len(result.field_errors)].columns.start
     response = steps[first + column]
     phasors = next(m for m in result.graph.measurements if isinstance(m, FieldPhasors))

@@ -24,6 +24,7 @@ from magfusion.estimation.prepared import prepared
 from magfusion.estimation.relaxation import Step, part_of_the_way
 from magfusion.estimation.settings import SmootherSettings as SmootherSettings
 from magfusion.estimation.solve.bordered import Optimised, eliminate, marginal, optimise
+from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.model.noise import twice
 from magfusion.model.parameters import Block, Calibration, placed
 from magfusion.model.progress import Report, quiet
@@ -209,6 +210,8 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
             step = Step.of(step, before, states, old, calibration)
             moved = before, states, old, calibration
             states, calibration = part_of_the_way(*moved, graph.blocks, step.share)
+            del graph, found  # of a long log they are most of what there is
+            give_back_memory()
     report("posterior", settings.passes + 2, settings.passes + 3)
     fields = log.samples if wave is None else wave.fields
     result = posterior(log, graph, found, fields, gaps)

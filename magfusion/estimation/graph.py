@@ -296,8 +296,8 @@ class Graph:
 
     def responses(
         self, estimate: Estimate, considered: tuple[Block, ...]
-    ) -> list[gtsam.VectorValues]:
-        """Return the step of every variable that considered parameters cause.
+    ) -> Iterator[gtsam.VectorValues]:
+        """Yield the step of every variable that considered parameters cause.
 
         One for each column of their prior's spread: one sigma of each where they are independent.
         They are left over when all else is eliminated, so that one elimination serves them all.
@@ -315,14 +315,17 @@ class Graph:
         return steps_of_others(conditional, spread.shape[1])
 
 
-def steps_of_others(conditional: gtsam.GaussianBayesNet, count: int) -> list[gtsam.VectorValues]:
-    """Return the step of every variable that a unit of each parameter that is held causes."""
-    steps = []
+def steps_of_others(
+    conditional: gtsam.GaussianBayesNet, count: int
+) -> Iterator[gtsam.VectorValues]:
+    """Yield the step of every variable that a unit of each parameter that is held causes.
+
+    One at a time: of a long log all of them are as much as the log.
+    """
     for one in np.eye(count):
         given = gtsam.VectorValues()
         given.insert(CONSIDERED_KEY, one)
-        steps.append(conditional.optimize(given))
-    return steps
+        yield conditional.optimize(given)
 
 
 def initial_estimate(
@@ -382,11 +385,14 @@ def marginals(
     response = np.zeros((len(calibration), 0))
     del tree, linear  # of a long log they are as much again as what follows
     if considered and graph.measurements:
-        steps = graph.responses(estimate, considered)
-        keys = [X(i) for i in range(graph.epochs)]
-        by_pose = np.array([step.vector(keys).reshape(-1, 6) for step in steps])
-        poses += np.einsum("hni,hnj->nij", by_pose, by_pose)
+        keys, by_pose, by_calibration = [X(i) for i in range(graph.epochs)], [], []
+        for step in graph.responses(estimate, considered):
+            by_pose.append(step.vector(keys).reshape(-1, 6))
+            if graph.blocks:
+                by_calibration.append(step.at(CALIBRATION_KEY))
+        every = np.array(by_pose)
+        poses += np.einsum("hni,hnj->nij", every, every)
         if graph.blocks:
-            response = np.array([step.at(CALIBRATION_KEY) for step in steps]).T
+            response = np.array(by_calibration).T
             calibration += response @ response.T
     return poses, calibration, response

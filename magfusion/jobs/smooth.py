@@ -126,6 +126,7 @@ def run_smooth(
         In the latter case the single-epoch fixes have been saved in the output directory.
     """
     from magfusion.estimation.self_survey import smooth_and_place
+    from magfusion.estimation.solve.memory import give_back_memory
     from magfusion.jobs.failure import reason_of
     from magfusion.jobs.inputs import claim, named, read_job, refuse_failed
     from magfusion.jobs.rates import refuse_rate
@@ -156,7 +157,7 @@ def run_smooth(
         raise EstimationError(
             f"{job.log_path}: {told}; the single-epoch fixes were saved in {job.output / FAILED}"
         ) from error
-    _give_back_memory()
+    give_back_memory()
     done = finished(log, site, settings, result, risk, said=said)
     elapsed = Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     done = replace(done, figures=done.figures | elapsed)
@@ -201,17 +202,6 @@ def _agreed(
         risk,
     )
     return found.log, found.site, found.result, found.findings
-
-
-def _give_back_memory() -> None:
-    """Give what GTSAM's factors were in back to the system: glibc keeps it in small pieces."""
-    import ctypes
-
-    try:
-        trim = ctypes.CDLL(None).malloc_trim
-    except (AttributeError, OSError, TypeError):  # another system's library
-        return
-    trim(0)
 
 
 def _save_fixes_instead(

@@ -21,6 +21,7 @@ from magfusion.estimation.measurements.earth import EarthField
 from magfusion.estimation.measurements.measurement import Rows
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.solve.bordered import eliminate_partial
+from magfusion.estimation.state import MOTION
 from magfusion.model.noise import twice
 from magfusion.model.parameters import Block, Calibration, dimension, prior_sigma, retract
 from magfusion.model.prior import prior_sqrt_covariance
@@ -128,12 +129,13 @@ def score_of(result: Smoothed, imu: ImuSamples) -> Score | None:
     order = gtsam.Ordering()
     order.push_back(CONSIDERED_KEY)
     information, gradient = rest.hessian(order)
-    moved = steps_of_others(_without_error(conditional), size)
     keys = [key for i in range(graph.epochs) for key in (X(i), V(i), B(i))]
-    by_state = np.stack([step.vector(keys).reshape(-1, 15) for step in moved], axis=2)
+    by_state = np.empty((graph.epochs, MOTION, size))
     by_calibration = np.zeros((dimension(result.blocks), size))
-    if result.blocks:
-        by_calibration[:] = np.array([step.at(CALIBRATION_KEY) for step in moved]).T
+    for k, step in enumerate(steps_of_others(_without_error(conditional), size)):
+        by_state[:, :, k] = step.vector(keys).reshape(-1, MOTION)
+        if result.blocks:
+            by_calibration[:, k] = step.at(CALIBRATION_KEY)
     spread = _declared(result, held)
     return Score(held, information, gradient, spread, by_state, by_calibration)
 
