@@ -1,5 +1,6 @@
 """A magnetometer that answers to a tone by less than to a steady field, and late."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from magfusion.estimation.demodulation import phasors
 from magfusion.estimation.integrity.judge import judged
 from magfusion.files.site import load_site, save_site
 from magfusion.model.parameters import initial_calibration, predict_channels
-from magfusion.model.response import FrequencyResponse
+from magfusion.model.response import AxisResponses, FrequencyResponse
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Verdict
@@ -66,6 +67,39 @@ def test_phasors_are_predicted_as_they_are_measured(filtered: Log) -> None:
         error[name] = np.linalg.norm(found - expected, axis=1) / np.linalg.norm(expected, axis=1)
     assert np.max(error["declared"]) < 0.003
     assert np.min(error["not declared"]) > 0.05
+
+
+def apart(site: Site) -> Site:
+    """Return the site with axes that answer each in its own way."""
+    lag = -np.arctan(FREQUENCIES / CUT_OFF)
+    x, y, z = (FrequencyResponse(FREQUENCIES, np.cos(k * lag), k * lag) for k in (0.5, 1.0, 1.5))
+    magnetometer = replace(site.platform.magnetometer, response=AxisResponses(x, y, z))
+    return replace(site, platform=replace(site.platform, magnetometer=magnetometer))
+
+
+@pytest.mark.parametrize("respond", [answering, apart])
+def test_simulated_samples_are_what_such_a_magnetometer_reads(
+    respond: Callable[[Site], Site],
+) -> None:
+    site = respond(demo_site())
+    config = SimulationConfig(DEMO_BOX_WORLD, duration=6.0, perturb=False, motion="static")
+    log = simulate_log(site, config, np.random.default_rng(3)).log
+    assert log.truth is not None
+    fields = phasors(log, site)[0].rows(slice(2, None))
+    pose = log.truth.world_from_body[:1], log.truth.position_world[:1]
+    found = np.mean(fields.phasor_sensor, axis=0)
+    for known, differs in ((site, False), (demo_site(), True)):
+        expected = predict_channels(initial_calibration(known, 0.0), fields.time[:1], *pose)[0]
+        off = np.linalg.norm(found - expected, axis=1) / np.linalg.norm(expected, axis=1)
+        assert np.min(off) > 0.05 if differs else np.max(off) < 0.003
+
+
+def test_samples_of_axes_that_answer_apart_are_to_be_demodulated_first() -> None:
+    site = apart(demo_site())
+    config = SimulationConfig(DEMO_BOX_WORLD, duration=6.0, perturb=False)
+    log = simulate_log(site, config, np.random.default_rng(3)).log
+    with pytest.raises(InputError, match="axis_responses: raw samples of axes"):
+        smooth(log, site, SmootherSettings(tune=False))
 
 
 def test_a_site_keeps_the_response(tmp_path: Path) -> None:

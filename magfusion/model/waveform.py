@@ -8,12 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.errors import InputError
 from magfusion.model.channel_effects import are_driven
 from magfusion.model.coil_field import side_by_side
 from magfusion.model.field import driven_field
 from magfusion.model.parameters import Calibration
 from magfusion.model.quaternion import cross
 from magfusion.model.receive_coils import is_apart, joined_samples, points_apart
+from magfusion.model.response import AxisResponses
 from magfusion.model.site import Magnetometer, Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import AnyArray, Array, ComplexArray
@@ -65,8 +67,19 @@ def predicted_waveform(
         (T), measured axes, without noise.
     ndarray, shape (n, 3)
         By what it changes with; zero where no change is given.
+
+    Raises
+    ------
+    InputError
+        If the axes of the magnetometer answer each in its own way.
     """
     magnetometer = calibration.site.platform.magnetometer
+    if isinstance(magnetometer.response, AxisResponses):
+        raise InputError(
+            "platform.magnetometer.axis_responses: raw samples of axes that answer each in its own"
+            " way are not followed along a motion; demodulate the log first (magfusion demodulate),"
+            " and give this command the directory that it writes"
+        )
     currents = _currents(calibration, motion.time, carrier)
     if not is_apart(magnetometer):
         field, by = _at_point(

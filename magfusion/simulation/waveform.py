@@ -1,5 +1,6 @@
 """The raw magnetometer stream along a true motion."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,9 +11,10 @@ from magfusion.model.samples import Waveform
 from magfusion.model.site import Site, Slots
 from magfusion.simulation.disturbance import Ambient
 from magfusion.simulation.field import Drives, phasors_world
+from magfusion.simulation.magnetometers import answered
 from magfusion.simulation.motion import Motion
 from magfusion.simulation.slots import Multiplexer, check_slots, slot_gates
-from magfusion.units import Array
+from magfusion.units import Array, ComplexArray
 
 LEAST_SAMPLES_PER_CYCLE = 2.5
 USUAL_RATE_HZ, USUAL_SAMPLES_PER_SLOT = 400.0, 16
@@ -107,7 +109,8 @@ def simulate_waveform(
     world_from_body = motion.world_from_body(time)
     lever_world = world_from_body.apply(magnetometer.position_body)
     point_world = motion.position_world(time) + lever_world
-    field_world = beacons_world(site, drives, time, point_world, ambient or Ambient(), marks)
+    here = site, drives, time, point_world, ambient or Ambient(), marks
+    field_world = np.zeros((count, 3)) if magnetometer.response else beacons_world(*here)
     if site.earth_field_world is not None:
         field_world += site.earth_field_world
     if mains is not None:
@@ -116,6 +119,16 @@ def simulate_waveform(
         field_world += ambient.background_world(time, rate_hz, rng)
     field_sensor = world_from_body.inv().apply(field_world) @ magnetometer.body_from_sensor
     measured = field_sensor @ magnetometer.matrix.T + magnetometer.offset
+    if magnetometer.response:
+        measured_from_world = (
+            magnetometer.matrix
+            @ magnetometer.body_from_sensor.T
+            @ world_from_body.inv().as_matrix()
+        )
+        for frequency_hz, tone_world in _tones_world(*here):
+            tone = np.einsum("nij,nj->ni", measured_from_world, tone_world)
+            heard = answered(tone[:, None], magnetometer.response, np.array([frequency_hz]))
+            measured += np.real(heard[:, 0])
     measured += rng.normal(0.0, magnetometer.noise_density * np.sqrt(rate_hz / 2.0), (count, 3))
     if quantisation:
         measured = quantisation * np.round(measured / quantisation)
@@ -144,6 +157,20 @@ def beacons_world(
 ) -> Array:
     """Return the field of all beacons at a place (m) of each time (s), shape (n, 3) (T)."""
     field_world = np.zeros((len(time), 3))
+    for _, tone_world in _tones_world(site, drives, time, point_world, ambient, marks):
+        field_world += np.real(tone_world)
+    return field_world
+
+
+def _tones_world(
+    site: Site,
+    drives: Drives,
+    time: Array,
+    point_world: Array,
+    ambient: Ambient,
+    marks: Marks | None,
+) -> Iterator[tuple[float, ComplexArray]]:
+    """Yield frequency and field of each tone (n, 3), of which the real part is there (Hz, T)."""
     first = 0
     for i, (beacon, drift) in enumerate(zip(site.beacons, drives.drift, strict=True)):
         phasors = phasors_world(beacon, point_world, ambient.spheres, ambient.layers)
@@ -153,9 +180,8 @@ def beacons_world(
         for k, frequency_hz in enumerate(beacon.tone_frequencies_hz):
             turns = 2.0 * np.pi * frequency_hz * (1.0 + drift) * time
             carrier = np.exp(1j * (turns + drives.phase[first + k]))
-            field_world += np.real(phasors[:, k] * (gates[:, k] * carrier)[:, None])
+            yield float(frequency_hz), phasors[:, k] * (gates[:, k] * carrier)[:, None]
         first += len(beacon.tones)
-    return field_world
 
 
 def _mains_world(mains: Mains, time: Array, rng: np.random.Generator) -> Array:
