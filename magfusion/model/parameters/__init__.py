@@ -168,7 +168,7 @@ def choose_blocks(
         raise ValueError(f"groups must be among {tuple(known)}; got {sorted(wanted - set(known))}")
 
     def chosen(parameter: Parameter, sigma: float) -> bool:
-        return sigma > parameter.negligible if wanted is None else parameter.group in wanted
+        return sigma > parameter.kept_to(site) if wanted is None else parameter.group in wanted
 
     return _blocks(site, kinds, chosen)
 

@@ -178,6 +178,10 @@ class Parameter:
     by_turning: ClassVar[str] = ""  # what it is called where turning would determine it
     walk: ClassVar[str] = ""  # where the site says what standard deviation it gains in an hour (SI)
 
+    def kept_to(self, site: Site) -> float:
+        """Return the largest sigma with which it is kept at its declared value."""
+        return self.negligible
+
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other)
 

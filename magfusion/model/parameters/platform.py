@@ -52,6 +52,13 @@ class MagnetometerParameter(SiteParameter):
         every = tuple(part if m.name == part.name else m for m in platform.magnetometers)
         return replace(site, platform=platform.carrying(every))
 
+    def kept_to(self, site: Site) -> float:
+        """Return the largest sigma with which it is kept at its declared value.
+
+        Of several magnetometers none is kept: what is between two of them turns the platform.
+        """
+        return 0.0 if site.platform.further else self.negligible
+
     def called(self, site: Site, owner: str, i: int) -> str:
         """Return what one of its numbers is called, with the name where there are several."""
         words = super().called(site, owner, i)
