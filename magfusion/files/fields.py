@@ -152,6 +152,24 @@ def on_log_clock(fields: FieldSamples, site: Site) -> FieldSamples:
     )
 
 
+def by_own_clocks(fields: FieldSamples, site: Site) -> FieldSamples:
+    """Return phasors of several magnetometers as each stamps them; `order_channels` undoes it."""
+    offsets = [sensor.clock_offset for sensor in site.platform.magnetometers]
+    if not any(offsets):
+        return fields
+    tones, parts = tone_frequencies(site), []
+    for sensor, late in enumerate(offsets):
+        mine = site.of_sensor(sensor)
+        own = fields.rows(np.any(fields.valid[:, mine], axis=1))
+        phasor, cov = np.full_like(own.phasor_sensor, np.nan), np.full_like(own.phasor_cov, np.nan)
+        turn = np.exp(2j * np.pi * tones * late)
+        phasor[:, mine] = own.phasor_sensor[:, mine] * turn[:, None]
+        cov[:, mine] = own.phasor_cov[:, mine]
+        parts.append(replace(own, time=own.time - late, phasor_sensor=phasor, phasor_cov=cov))
+    whole = FieldSamples.joined(parts)
+    return whole.rows(np.argsort(whole.time, kind="stable"))
+
+
 def side_by_side(parts: list[FieldSamples], site: Site) -> FieldSamples:
     """Return the phasors of each of a site's magnetometers as one; times as one are one epoch."""
     every = np.concatenate([part.time for part in parts])

@@ -23,10 +23,10 @@ Stream = TypeVar("Stream", FieldSamples, Trajectory)
 
 _GYRO = ("gyro_x", "gyro_y", "gyro_z")
 _ACCEL = ("accel_x", "accel_y", "accel_z")
-_FIELD = ("field_x", "field_y", "field_z")
+FIELD = ("field_x", "field_y", "field_z")
 IMU_LAYOUT = Layout(numbers=(*_GYRO, *_ACCEL), repeats=True)
-FIELD_LAYOUT = Layout(numbers=_FIELD, repeats=True)
-_SOME_AXES = Layout(numbers=(), repeats=True, some=_FIELD)
+FIELD_LAYOUT = Layout(numbers=FIELD, repeats=True)
+_SOME_AXES = Layout(numbers=(), repeats=True, some=FIELD)
 
 
 def read_imu(
@@ -47,7 +47,7 @@ def read_imu(
     table = read_table(path, IMU_LAYOUT, span, names)
     if not len(table):
         raise InputError(f"{path}: holds no row {span}; choose a span that the log covers.")
-    time, values, noticed = _measured(table, (*_GYRO, *_ACCEL), "IMU")
+    time, values, noticed = measured_rows(table, (*_GYRO, *_ACCEL), "IMU")
     imu = ImuSamples(time, values[:, :3].copy(), values[:, 3:].copy())
     check_imu(imu, str(path))
     return imu, noticed
@@ -83,18 +83,18 @@ def read_waveform(
     table = read_table(path, _SOME_AXES, span, names)
     if not len(table):
         return None, ()
-    columns = tuple(name for name in _FIELD if table.has((name,)))
-    time, values, noticed = _measured(table, columns, "magnetometer")
+    columns = tuple(name for name in FIELD if table.has((name,)))
+    time, values, noticed = measured_rows(table, columns, "magnetometer")
     check_field(np.linalg.norm(values, axis=1), str(path))
-    if columns == _FIELD:
+    if columns == FIELD:
         return Waveform(time, values), noticed
     whole = np.zeros((len(time), 3))
-    whole[:, [_FIELD.index(name) for name in columns]] = values
+    whole[:, [FIELD.index(name) for name in columns]] = values
     axes = "".join(name[-1] for name in columns)
     return Waveform(time, whole, axes=axes), noticed
 
 
-def _measured(
+def measured_rows(
     table: Table, names: tuple[str, ...], stream: str
 ) -> tuple[Array, Array, tuple[Finding, ...]]:
     """Return times (s) and columns of the rows that hold a sample, and what the others are."""
@@ -119,7 +119,7 @@ def write_waveform(
 ) -> None:
     """Write magnetometer samples, and currents and angles beside them, as Parquet."""
     columns: dict[str, object] = {TIME: Span(epoch_ns).stamps(waveform.time)}
-    values = dict(zip(_FIELD, waveform.measured_sensor.T, strict=True))
+    values = dict(zip(FIELD, waveform.measured_sensor.T, strict=True))
     columns |= {name: value for name, value in values.items() if name[-1] in waveform.axes}
     columns |= {} if drive is None else columns_beside(drive, waveform)
     columns |= {} if rotation is None else angles_beside(rotation, waveform)

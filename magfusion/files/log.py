@@ -21,12 +21,13 @@ from magfusion.files.inertial_tables import (
     write_waveform,
 )
 from magfusion.files.marks_table import read_marks, write_marks
+from magfusion.files.named_samples import names_magnetometers, read_waveforms, write_waveforms
 from magfusion.files.rotor_columns import read_rotation
 from magfusion.files.table import LARGEST_TIME_NS, Span, find_table
 from magfusion.files.temperature_table import read_temperatures, write_temperatures
 from magfusion.files.trajectory_table import read_trajectory, write_trajectory
 from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
-from magfusion.model.samples import ImuSamples, Log
+from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
 
@@ -86,10 +87,16 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
     imu, of_imu = ImuSamples.empty(), _NOTHING
     if tables["imu"] is not None:
         imu, of_imu = read_imu(tables["imu"], span)
-    waveform, of_waveform = read_waveform(tables["magnetometer"], span)
+    waveforms, waveform, of_waveform = dict[str, Waveform](), None, _NOTHING
+    if names_magnetometers(tables["magnetometer"]):
+        waveforms, of_waveform = read_waveforms(tables["magnetometer"], span)
+    else:
+        waveform, of_waveform = read_waveform(tables["magnetometer"], span)
     marks = read_marks(tables["magnetometer"], tables["marks"], span)
     if waveform is not None and marks is not None:
         waveform = replace(waveform, marks=marks)
+    if marks is not None:
+        waveforms = {name: replace(wave, marks=marks) for name, wave in waveforms.items()}
     log = Log(
         name=header.name,
         epoch_ns=header.epoch_ns,
@@ -104,8 +111,9 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
         reference=read_waveform(tables["reference"], span)[0],
         rotation=read_rotation(tables["magnetometer"], span),
         depths=read_depths(tables["depth"], header.epoch_ns),
+        waveforms=waveforms,
     )
-    if log.waveform is None and log.fields is None:
+    if log.waveform is None and log.fields is None and not log.waveforms:
         raise InputError(f"{path}: holds no field {span}; choose a span that the log covers.")
     # Arrow keeps what the columns were decoded into: as much as the log again.
     pa.default_memory_pool().release_unused()
@@ -129,11 +137,7 @@ def write_log(log: Log, path: Path) -> None:
         write_yaml(header | {"source": log.source}, unfinished / HEADER)
         if log.inertial and len(log.imu):
             write_imu(log.imu, unfinished / "imu.parquet", log.epoch_ns)
-        if log.waveform is not None:
-            table = unfinished / "magnetometer.parquet"
-            write_waveform(log.waveform, table, log.epoch_ns, log.drive, log.rotation)
-            if log.waveform.marks is not None:
-                write_marks(log.waveform.marks, unfinished / "marks.parquet", log.epoch_ns)
+        _write_samples(log, unfinished)
         if log.fields is not None:
             write_fields(log.fields, unfinished / "fields.parquet", log.epoch_ns)
         if log.truth is not None:
@@ -145,6 +149,17 @@ def write_log(log: Log, path: Path) -> None:
             write_temperatures(known, unfinished / "temperature.parquet", log.epoch_ns)
         if log.depths is not None and log.depths.readings:
             write_depths(log.depths, unfinished / "depth.parquet", log.epoch_ns)
+
+
+def _write_samples(log: Log, directory: Path) -> None:
+    table, several = directory / "magnetometer.parquet", list(log.waveforms.values())
+    if several:
+        write_waveforms(log.waveforms, table, log.epoch_ns)
+    wave = several[0] if several else log.waveform
+    if log.waveform is not None:
+        write_waveform(log.waveform, table, log.epoch_ns, log.drive, log.rotation)
+    if wave is not None and wave.marks is not None:
+        write_marks(wave.marks, directory / "marks.parquet", log.epoch_ns)
 
 
 def _keep_others(former: Path, directory: Path) -> None:

@@ -13,6 +13,7 @@ from magfusion.files.fields import read_fields
 from magfusion.files.inertial_tables import read_if_there
 from magfusion.files.log import HEADER, LogHeader, is_log
 from magfusion.files.marks_table import SLOT
+from magfusion.files.named_samples import MAGNETOMETER
 from magfusion.files.plausible import check_field, check_imu
 from magfusion.files.rotor_columns import rotor_columns
 from magfusion.files.table import LONGEST_GAP, Span, find_table
@@ -152,7 +153,12 @@ def long_log(path: Path, start: float | None = None, end: float | None = None) -
         return None  # which is refused where it is read whole
     raw = tables["magnetometer"]
     if find_table(path, "marks") is not None or (
-        raw is not None and (drive_columns(raw) or SLOT in column_names(raw) or rotor_columns(raw))
+        raw is not None
+        and (
+            drive_columns(raw)
+            or {SLOT, MAGNETOMETER} & set(column_names(raw))
+            or rotor_columns(raw)
+        )
     ):
         return None
     span = Span(read_yaml(path / HEADER, LogHeader).epoch_ns, start, end)

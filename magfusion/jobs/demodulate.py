@@ -12,7 +12,7 @@ from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figure, Figures, heading
 
 if TYPE_CHECKING:
-    from magfusion.model.samples import Log
+    from magfusion.model.samples import FieldSamples, Log
     from magfusion.model.site import Site
 
 
@@ -31,9 +31,11 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     """
     import numpy as np
 
+    from magfusion.estimation.demodulated_apart import demodulated_apart
     from magfusion.estimation.demodulation import phasors
     from magfusion.estimation.drive_reference import referred
     from magfusion.estimation.integrity.recording import passed_on
+    from magfusion.files.fields import by_own_clocks
     from magfusion.files.log import write_log
     from magfusion.files.site import save_site
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
@@ -45,19 +47,29 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     claimed, job = claim(output, "demodulate"), settings.job(output)
     lockin = settings.lockin(job)
     used = settings.at_rest
-    log, site = read_job(job, fewer=not used, reference=used, report=report)
-    if log.waveform is None:
+    log, site = read_job(job, fewer=not used, several=True, raw=True, reference=used, report=report)
+    if used and log.waveforms:
+        raise InputError(
+            "--at-rest integrates the samples of one magnetometer; leave it out, or give a site of"
+            " the one to integrate"
+        )
+    if log.waveform is None and not log.waveforms:
         raise InputError(
             f"{job.log_path}: holds no magnetometer.parquet to demodulate; give the raw log"
         )
     report("demodulating", 0, 1)
     with named(job.log_path):
         rested = settings.integrated(log, site, lockin)
-        if rested is None:
+        if log.waveforms:
+            apart = demodulated_apart(log, site, lockin)
+            assert apart.log.fields is not None
+            log = replace(apart.log, noticed=(*log.noticed, *apart.noticed))
+            samples, dropped = by_own_clocks(apart.log.fields, site), apart.dropped
+        elif rested is None:
             samples, dropped = phasors(log, site, lockin)
         else:
             samples, dropped = rested.fields, rested.dropped
-        samples = referred(samples, site)
+        samples = samples if site.platform.further else referred(samples, site)
     report("done", 1, 1)
     trust = passed_on(log, site)
     if rested is not None:
@@ -71,13 +83,14 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
             Figure("window_s", float(np.median(samples.window)), "s"),
             *(
                 Figure(
-                    f"sigma_{{beacon}}_{tone}_t",
+                    f"sigma_{_of(samples, c, '_')}{{beacon}}_{tone}_t",
                     float(np.median(sigma[samples.valid[:, c], c])),
                     "T",
                     beacon,
-                    label=f"sigma of a phasor of tone {tone}",
+                    label=f"sigma of a phasor of tone {tone}{_of(samples, c, ' by ')}",
                 )
                 for c, (beacon, tone) in enumerate(samples.channels)
+                if not samples.magnetometers or np.any(samples.valid[:, c])
             ),
         )
     )
@@ -93,6 +106,14 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
         write_report(whole, figures)
     refuse_failed(job.log_path, job.output, trust)
     return figures
+
+
+def _of(samples: FieldSamples, channel: int, joint: str) -> str:
+    """Return the name of the magnetometer that a channel is of; nothing where there is one."""
+    if not samples.magnetometers:
+        return ""
+    name = samples.magnetometers[channel]
+    return f"{name}{joint}" if joint == "_" else f"{joint}{name}"
 
 
 def _freed(log: Log, site: Site) -> Site:

@@ -142,7 +142,13 @@ def run_fix(
     claimed = claim(job.output, "smooth", "fix")
     used = rest is not None and rest.at_rest
     log, site = read_job(
-        job, fewer=True, amplitudes=True, several=True, reference=used, report=report
+        job,
+        fewer=True,
+        amplitudes=True,
+        several=True,
+        lockin=lockin,
+        reference=used,
+        report=report,
     )
     began = time.perf_counter()
     report("demodulating", 0, 3)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.demodulated_apart import demodulated_apart, of_site
 from magfusion.estimation.drive_reference import turning_currents, with_drives
 from magfusion.estimation.integrity.magnetometers import without_silent
 from magfusion.estimation.integrity.mending import mended
@@ -35,6 +36,7 @@ from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.model.without_imu import logged
 from magfusion.receiver.receiver import Receiver
 from magfusion.receiver.slots import has_schedule
+from magfusion.receiver.windows import LockinSettings
 from magfusion.results.page import PAGE
 from magfusion.results.report import FAILED
 
@@ -262,6 +264,8 @@ def read_job(
     reference: bool = False,
     rotor: bool = False,
     several: bool = False,
+    raw: bool = False,
+    lockin: LockinSettings | None = None,
     report: Report = quiet,
 ) -> tuple[Log, Site]:
     """Read the log and the site of a job, and see that they belong together.
@@ -282,6 +286,10 @@ def read_job(
         Whether it takes the angle of a rotor and a casing itself.
     several : bool
         Whether it can do with several magnetometers.
+    raw : bool
+        Whether it demodulates the samples of several itself.
+    lockin : LockinSettings, optional
+        By which the samples of several are demodulated.
 
     Raises
     ------
@@ -289,14 +297,7 @@ def read_job(
         For anything in either file that a user must correct.
     """
     site = read_site(job, unknown=unknown, without=without, several=several)
-    log = _open(job, report)
-    if site.platform.further and log.fields is None:
-        raise InputError(
-            f"{job.log_path}: the samples of several magnetometers are not demodulated; demodulate"
-            " each by its own site, and give all in one fields.parquet with a column magnetometer"
-        )
-    if site.platform.further:
-        log = replace(log, waveform=None)
+    log = _as_known(job, _open(job, report), site)
     _check_axes(job, log, site, fewer=fewer, amplitudes=amplitudes)
     if site.platform.magnetometer.casing is not None and not rotor:
         raise InputError(
@@ -314,7 +315,12 @@ def read_job(
             with named(job.declared_path):
                 Receiver.of(site).check()
         log = mended(log, site)
-    if log.fields is not None:
+    if log.waveforms and not raw:
+        with named(job.log_path):
+            found = demodulated_apart(log, site, lockin)
+        noticed = (*log.noticed, *found.noticed)
+        log, site = without_silent(replace(found.log, noticed=noticed), site)
+    elif log.fields is not None:
         with named(job.log_path):
             log = replace(log, fields=order_channels(log.fields, site))
         log, site = without_silent(log, site)
@@ -325,6 +331,20 @@ def read_job(
     if log.reference is not None and not reference:
         log = replace(log, reference=None, noticed=(*log.noticed, NOT_USED))
     return at_reference(log, site)
+
+
+def _as_known(job: Job, log: Log, site: Site) -> Log:
+    """Return a log with the samples of the magnetometers that the site has."""
+    with named(job.log_path):
+        log = of_site(log, site)
+    if not site.platform.further:
+        return log
+    if log.fields is None and not log.waveforms:
+        raise InputError(
+            f"{job.log_path}: the samples do not say which of the site's magnetometers took them;"
+            " add a column magnetometer with its name to magnetometer.parquet"
+        )
+    return replace(log, waveform=None, fields=None if log.waveforms else log.fields)
 
 
 def _check_axes(job: Job, log: Log, site: Site, *, fewer: bool, amplitudes: bool) -> None:
@@ -414,7 +434,7 @@ def read_recording(job: Job, report: Report = quiet) -> tuple[Log, Site | None]:
 
 def _open(job: Job, report: Report = quiet) -> Log:
     log = open_log(job.log_path, job.start, job.end, job.topics, report)
-    if log.waveform is None and log.fields is None:
+    if log.waveform is None and log.fields is None and not log.waveforms:
         raise InputError(
             f"{job.log_path}: holds no magnetometer samples in the part to use; record the"
             " magnetometer beside the inertial sensor"

@@ -218,7 +218,7 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
         claim_rows(_rows_path(path))
         if path != place or not settings.resume:
             claim_checkpoint(path)
-    log, site = read_job(job, fewer=True, several=True, report=report)
+    log, site = read_job(job, fewer=True, several=True, lockin=navigator.lockin, report=report)
     refuse_rate(job.log_path, log, settings.rates)
     with named(job.log_path):
         require_motion_prior(site)

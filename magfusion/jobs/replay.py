@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
+from magfusion.errors import InputError
 from magfusion.jobs.settings import Command, PartSettings, ReplayedSettings
 from magfusion.units import Array, IntArray
 
@@ -216,7 +217,7 @@ class ReplaySettings(PartSettings, ReplayedSettings):
 
 def run(settings: ReplaySettings) -> None:
     """Print a log as records; see `run_replay`."""
-    from magfusion.files.long_log import long_log
+    from magfusion.files.long_log import LongLog, long_log
     from magfusion.files.open import open_log
     from magfusion.files.standard_streams import binary_output, until_closed
     from magfusion.jobs.inputs import topics_option
@@ -224,6 +225,11 @@ def run(settings: ReplaySettings) -> None:
     sink = binary_output()
     part, topics = (settings.start, settings.end), topics_option(settings.topics)
     found = long_log(settings.log, *part) or open_log(settings.log, *part, topics)
+    if not isinstance(found, LongLog) and found.waveforms:
+        raise InputError(
+            f"{settings.log}: the pipe takes the samples of one magnetometer, and these are of"
+            f" {', '.join(found.waveforms)}; run magfusion demodulate and navigate what it writes"
+        )
     with until_closed():
         run_replay(found, sink, settings.form, settings.realtime)
 

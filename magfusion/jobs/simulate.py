@@ -147,7 +147,7 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
     from magfusion.simulation.slots import Multiplexer
     from magfusion.simulation.waveform import usual_rate_hz
 
-    site = demo_site() if settings.site is None else load_site(settings.site)
+    site = demo_site() if settings.site is None else load_site(settings.site, several=True)
     box = box_option(settings.box)
     reference = reference_option(settings.reference)
     if reference is not None:

@@ -134,7 +134,9 @@ def run_smooth(
     from magfusion.results.report import FAILED
 
     claimed = claim(job.output, "smooth", "fix")
-    log, site = read_job(job, unknown=True, fewer=True, several=True, report=report)
+    log, site = read_job(
+        job, unknown=True, fewer=True, several=True, lockin=settings.lockin, report=report
+    )
     refuse_rate(job.log_path, log, rate)
     if free_gain:
         site = _with_gain(job, log, site, settings)

@@ -267,6 +267,8 @@ class Log:
     ``drive`` is what was recorded of the currents of coils beside the waveform, ``reference`` the
     samples of a second magnetometer that stands elsewhere, by its own stamps,
     ``rotation`` the angles of rotors.  ``depths`` are those of wells, for ranging.
+    ``waveforms`` are the samples of several magnetometers, by name and each by its own stamps; then
+    ``waveform`` is None.
     """
 
     name: str
@@ -285,6 +287,7 @@ class Log:
     reference: Waveform | None = None
     rotation: RotorAngles | None = None
     depths: Depths | None = None
+    waveforms: Mapping[str, Waveform] = field(default_factory=dict)
 
     @property
     def vectors(self) -> Waveform | None:

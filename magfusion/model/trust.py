@@ -28,6 +28,7 @@ CODES = {
     "body_iron": "iron or a magnet on the body changes the field",
     "coil_reversed": "a coil of a beacon is wired in reverse, or exchanged for another",
     "coils_swapped": "the coils of every beacon are exchanged",
+    "demodulated_apart": "several magnetometers were demodulated each by itself",
     "diverged": "the estimator neither converged nor explains what was measured",
     "drive_current": "the current recorded of a coil is not the one declared, or noisy",
     "earth_field": "the steady field is not the Earth's as declared",

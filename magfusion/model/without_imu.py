@@ -77,7 +77,11 @@ def without_imu(log: Log, site: Site) -> tuple[Log, Site]:
 
     Samples of zeros cover the log: the accelerometer of `on_motion_prior` measures no more.
     """
-    times = [s.time for s in (log.waveform, log.fields) if s is not None and len(s)]
+    times = [
+        s.time
+        for s in (log.waveform, log.fields, *log.waveforms.values())
+        if s is not None and len(s)
+    ]
     first, last = min(float(t[0]) for t in times), max(float(t[-1]) for t in times)
     step, length = LONGEST_STEP, 0.0
     if log.fields is not None and len(log.fields) > 1:

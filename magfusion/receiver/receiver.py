@@ -427,7 +427,7 @@ class LockinReceiver(Receiver):
                 f" window (--window), or sample faster than at {rate_hz:.4g} Hz"
             )
         grid = Grid(
-            centre=float(waveform.time[0]) - 0.5 / rate_hz + window / 2.0,
+            centre=self.settings.first_centre(float(waveform.time[0]) - 0.5 / rate_hz),
             step=self.settings.step,
             length=window,
             wait=-0.6 / rate_hz,  # the last sample is half a step earlier

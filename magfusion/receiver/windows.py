@@ -9,6 +9,7 @@ from magfusion.model.site import Site
 from magfusion.units import Array
 
 LONGEST_WINDOW = 4.0  # s; motion within a longer one is no longer a ramp
+EVEN = 1e-6  # steps; less is rounding of stamps
 CLOSEST_TONES_HZ = 2.0 / LONGEST_WINDOW
 
 
@@ -26,6 +27,9 @@ class LockinSettings:
         Windows over which the noise beside the tones is averaged.
     lines_hz : tuple of float
         Lines that are no tones of the site; they are fitted beside these as tones are.
+    origin : float, optional
+        Where a window is centred, or would be (s); None begins with the first sample. By it the
+        windows of several streams are at the same times.
     """
 
     window: float
@@ -33,6 +37,14 @@ class LockinSettings:
     mains_hz: float = 50.0
     noise_windows: int = 9
     lines_hz: tuple[float, ...] = ()
+    origin: float | None = None
+
+    def first_centre(self, begin: float) -> float:
+        """Return the centre of the first window of samples that begin at a time (s)."""
+        centre = begin + self.window / 2.0
+        if self.origin is None:
+            return centre
+        return self.origin + self.step * float(np.ceil((centre - self.origin) / self.step - EVEN))
 
 
 def default_settings(site: Site, mains_hz: float = 50.0) -> LockinSettings:

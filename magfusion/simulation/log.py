@@ -180,18 +180,15 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
     marks = None
     if is_multiplexed(site):
         marks = draw_marks(site, config.multiplexer, config.duration, rng.spawn(1)[0])
-    waveform = simulate_waveform(
-        motion,
-        true_site,
-        drives,
-        config.magnetometer_rate_hz,
-        config.duration,
-        magnetometer_rng,
-        config.mains,
-        config.quantisation,
-        ambient,
-        marks,
-    )
+
+    def recorded(site: Site, rng: np.random.Generator, own: np.random.Generator | None) -> Waveform:
+        rate_hz, duration = config.magnetometer_rate_hz, config.duration
+        parts = config.mains, config.quantisation, ambient, marks, own
+        return simulate_waveform(motion, site, drives, rate_hz, duration, rng, *parts)
+
+    several = bool(true_site.platform.further)
+    waveform = None if several else recorded(true_site, magnetometer_rng, None)
+    waveforms = _of_each(true_site, recorded, magnetometer_rng) if several else {}
     stamp = imu.samples.time
     clock = true_site.platform.imu
     taken = (1.0 + clock.clock_rate) * stamp + clock.time_offset
@@ -214,8 +211,27 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         waveform=waveform,
         truth=truth,
         reference=reference,
+        waveforms=waveforms,
     )
     return SimulatedLog(log, true_site, drives, motion, ambient)
+
+
+def _of_each(
+    site: Site,
+    recorded: Callable[[Site, np.random.Generator, np.random.Generator | None], Waveform],
+    rng: np.random.Generator,
+) -> dict[str, Waveform]:
+    """Return what each records: the surroundings are the same, its noise is its own."""
+    surroundings = int(rng.integers(1 << 62))
+    sensors = site.platform.magnetometers
+    return {
+        sensor.name: recorded(
+            replace(site, platform=site.platform.carrying((sensor,))),
+            np.random.default_rng(surroundings),
+            own,
+        )
+        for sensor, own in zip(sensors, rng.spawn(len(sensors)), strict=True)
+    }
 
 
 def simulate_reference(

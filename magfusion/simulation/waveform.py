@@ -71,6 +71,7 @@ def simulate_waveform(
     quantisation: float | None = None,
     ambient: Ambient | None = None,
     marks: Marks | None = None,
+    own: np.random.Generator | None = None,
 ) -> Waveform:
     """Return the field of everything at each sample's own pose, as the magnetometer gives it.
 
@@ -91,6 +92,8 @@ def simulate_waveform(
         Iron, bending, noise and drift of the room.
     marks : Marks, optional
         When the coils are driven whose slots no clock tells.
+    own : Generator, optional
+        Of the instrument's noise; without it all is drawn from one.
 
     Raises
     ------
@@ -104,8 +107,9 @@ def simulate_waveform(
         raise InputError(
             f"magnetometer_rate_hz: found {rate_hz} Hz for {duration} s; give at least one sample"
         )
-    time = np.arange(count) / rate_hz
     magnetometer = site.platform.magnetometer
+    stamps = np.arange(count) / rate_hz
+    time = stamps + magnetometer.clock_offset
     world_from_body = motion.world_from_body(time)
     lever_world = world_from_body.apply(magnetometer.position_body)
     point_world = motion.position_world(time) + lever_world
@@ -129,11 +133,14 @@ def simulate_waveform(
             tone = np.einsum("nij,nj->ni", measured_from_world, tone_world)
             heard = answered(tone[:, None], magnetometer.response, np.array([frequency_hz]))
             measured += np.real(heard[:, 0])
-    measured += rng.normal(0.0, magnetometer.noise_density * np.sqrt(rate_hz / 2.0), (count, 3))
+    instrument = rng if own is None else own
+    measured += instrument.normal(
+        0.0, magnetometer.noise_density * np.sqrt(rate_hz / 2.0), (count, 3)
+    )
     if quantisation:
         measured = quantisation * np.round(measured / quantisation)
     measured[:, magnetometer.lacking] = 0.0
-    return Waveform(time, measured, marks, magnetometer.axes)
+    return Waveform(stamps, measured, marks, magnetometer.axes)
 
 
 def _check_tones(site: Site, rate_hz: float, marks: Marks | None) -> None:

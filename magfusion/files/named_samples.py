@@ -1,0 +1,87 @@
+"""The samples of several magnetometers in one table, whose column says which took each."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from magfusion.errors import InputError
+from magfusion.files.drive_columns import column_names, drive_columns
+from magfusion.files.inertial_tables import FIELD, measured_rows
+from magfusion.files.marks_table import SLOT
+from magfusion.files.plausible import check_field
+from magfusion.files.rotor_columns import rotor_columns
+from magfusion.files.table import TIME, Layout, Span, read_table, write_table
+from magfusion.model.samples import Waveform
+from magfusion.model.trust import Finding
+from magfusion.units import IntArray
+
+MAGNETOMETER = "magnetometer"
+_LAYOUT = Layout(numbers=FIELD, texts=(MAGNETOMETER,), repeats=True)
+
+
+def names_magnetometers(path: Path | None) -> bool:
+    """Return whether a table of samples says which magnetometer took each."""
+    return path is not None and MAGNETOMETER in column_names(path)
+
+
+def read_waveforms(
+    path: Path | None, span: Span
+) -> tuple[dict[str, Waveform], tuple[Finding, ...]]:
+    """Read and check the samples of several magnetometers, by name, each by its own stamps.
+
+    Returns
+    -------
+    dict, tuple of Finding
+        As `magfusion.files.inertial_tables.read_waveform`, of each; those without a row within the
+        span are not there.
+
+    Raises
+    ------
+    InputError
+        As `read_table` and `check_field`; or where currents, slots or angles stand beside them.
+    """
+    assert path is not None
+    beside = [n for n in column_names(path) if n == SLOT]
+    beside = [*beside, *drive_columns(path), *rotor_columns(path)]
+    if beside:
+        raise InputError(
+            f"{path}: {', '.join(beside)}: beside the samples of several magnetometers nothing else"
+            " is recorded yet; give bursts in marks.parquet, and leave the rest out."
+        )
+    table = read_table(path, _LAYOUT, span)
+    names, of = table.texts(MAGNETOMETER)
+    found: dict[str, Waveform] = {}
+    noticed: list[Finding] = []
+    for k, name in enumerate(names):
+        own = np.flatnonzero(of == k)
+        if not len(own):
+            continue
+        place = Path(f"{path}, {MAGNETOMETER} {name}")
+        mine = replace(
+            table,
+            path=place,
+            data=table.data.take(pa.array(own)),
+            time_ns=table.time_ns[own],
+            time=table.time[own],
+            first_row=0,
+        )
+        time, values, lost = measured_rows(mine, FIELD, f"{MAGNETOMETER} {name}")
+        check_field(np.linalg.norm(values, axis=1), str(place))
+        found[name] = Waveform(time, values)
+        noticed += lost
+    return found, tuple(noticed)
+
+
+def write_waveforms(waveforms: Mapping[str, Waveform], path: Path, epoch_ns: int) -> None:
+    """Write the samples of several magnetometers as Parquet, sorted by their stamps."""
+    stamps = np.concatenate([Span(epoch_ns).stamps(wave.time) for wave in waveforms.values()])
+    order: IntArray = np.argsort(stamps, kind="stable")
+    values = np.concatenate([wave.measured_sensor for wave in waveforms.values()])[order]
+    of = np.repeat(np.arange(len(waveforms)), [len(wave) for wave in waveforms.values()])[order]
+    columns: dict[str, object] = {TIME: stamps[order]}
+    columns[MAGNETOMETER] = pa.array(list(waveforms), pa.string()).take(pa.array(of))
+    columns |= dict(zip(FIELD, values.T, strict=True))
+    write_table(columns, path)
