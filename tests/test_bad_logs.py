@@ -93,7 +93,11 @@ BAD_TABLES = [
     ("imu", _scale(_axes("accel"), 1 / 9.80665), "probably in g"),
     ("imu", _scale(_axes("gyro"), 180 / np.pi), "probably in deg/s"),
     ("imu", _microseconds, "not in nanoseconds"),
-    ("magnetometer", lambda c: c.pop("field_z"), "column field_z is missing"),
+    (
+        "magnetometer",
+        lambda c: [c.pop(name) for name in _axes("field")],
+        "columns field_x, field_y, field_z are missing",
+    ),
     ("magnetometer", _scale(_axes("field"), 1e9), "divide nanotesla by 1e9"),
     ("magnetometer", _scale(_axes("field"), 1e4), "gauss by 1e4"),
     ("magnetometer", _most("time_ns", 0, None), r"column time_ns, row 1 .*remove one"),
