@@ -17,6 +17,7 @@ from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.files.fields import by_own_clocks, order_channels
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import save_site
+from magfusion.jobs.check import CheckSettings, run_check
 from magfusion.jobs.demodulate import DemodulateSettings, run_demodulate
 from magfusion.jobs.fix import run_fix
 from magfusion.jobs.inputs import Job
@@ -217,3 +218,19 @@ def test_rests_of_several_are_refused(directory: Path, tmp_path: Path) -> None:
 def test_the_pipe_names_the_way(directory: Path) -> None:
     with pytest.raises(InputError, match=r"left, right; run magfusion demodulate"):
         replay(ReplaySettings(log=directory))
+
+
+def test_check_judges_each_by_its_name(directory: Path, walk: SimulatedLog) -> None:
+    gone = walk.log.waveforms["right"]
+    kept = (gone.time < 3.0) | (gone.time > 4.0)
+    waves = {**walk.log.waveforms, "right": gone.rows(kept)}
+    write_log(replace(walk.log, waveforms=waves), directory)
+    found = run_check(CheckSettings(log=directory))
+    assert found["left_gaps"] == 0
+    assert found["right_gaps"] == 1
+    assert np.isclose(float(str(found["right_gap_s"])), 1.0, rtol=0.0, atol=0.02)
+    assert {"left_rate_hz", "right_rate_hz", "left_heard_A", "right_snr_D"} <= set(found)
+    assert "imu_rate_hz" in found
+    assert "Of right:" in json.dumps(dict(found))
+    (directory / "site.yaml").unlink()
+    assert run_check(CheckSettings(log=directory))["right_gaps"] == 1

@@ -77,6 +77,19 @@ def each_alone(log: Log, site: Site) -> Iterator[tuple[str, Log, Site]]:
         yield sensor.name, own, replace(site, platform=alone)
 
 
+def each_recorded(log: Log, site: Site | None) -> Iterator[tuple[str, Log, Site | None]]:
+    """Yield each magnetometer as `each_alone`, mended; without a site, its samples alone.
+
+    Of which the site has and the log has no samples, nothing is yielded.
+    """
+    if site is not None:
+        for name, own, alone in each_alone(log, site):
+            yield name, mended(replace(own, noticed=log.noticed), alone), alone
+        return
+    for name, wave in log.waveforms.items():
+        yield name, replace(log, waveform=wave, waveforms={}), None
+
+
 def demodulated_apart(log: Log, site: Site, lockin: LockinSettings | None = None) -> Apart:
     """Demodulate each magnetometer by its own mounting, matrix and response, at its own stamps.
 

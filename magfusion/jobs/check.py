@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,8 +37,10 @@ def run_check(
     """
     from contextlib import nullcontext
 
+    from magfusion.estimation.demodulated_apart import by_name, each_recorded
     from magfusion.estimation.integrity.first_look import first_look
     from magfusion.jobs.inputs import claim, found_in, read_recording
+    from magfusion.model.trust import Trust
     from magfusion.results.plots.check import write_check_plot
     from magfusion.results.report import write_report
     from magfusion.results.verdict import trust_figures
@@ -49,8 +52,16 @@ def run_check(
     log, site = read_recording(job, report)
     report("checking", 1, 3)
     lockin = None if site is None or not site.beacons else settings.lockin(job)
-    look = first_look(log, site, lockin)
-    figures = heading("check", log.name) | trust_figures(look.trust) | check_figures(look)
+    if log.waveforms:
+        looks = {
+            name: first_look(own, alone, lockin) for name, own, alone in each_recorded(log, site)
+        }
+        trust = Trust(tuple(by_name({name: one.trust.findings for name, one in looks.items()})))
+        look = replace(next(iter(looks.values())), trust=trust)
+        figures = heading("check", log.name) | trust_figures(trust) | _of_several(looks)
+    else:
+        look = first_look(log, site, lockin)
+        figures = heading("check", log.name) | trust_figures(look.trust) | check_figures(look)
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     with claimed as whole:
         if whole is not None:
@@ -58,6 +69,21 @@ def run_check(
             write_report(whole, figures)
     report("done", 3, 3)
     return figures
+
+
+def _of_several(looks: Mapping[str, Look]) -> Figures:
+    """Return the figures of each of several magnetometers by its name; of the IMU once."""
+    found: dict[tuple[str, str | None], Figure] = {}
+    for name, look in looks.items():
+        for figure in check_figures(look).all:
+            if figure.name.startswith("imu_") or figure.name == "gravity_m_s2":
+                found.setdefault((figure.name, None), figure)
+            else:
+                key = f"{name}_{figure.name.removeprefix('magnetometer_')}"
+                found[key, figure.beacon] = replace(
+                    figure, name=key, label=f"{figure.title} by {name}"
+                )
+    return Figures(*found.values())
 
 
 def check_figures(look: Look) -> Figures:

@@ -425,9 +425,17 @@ def read_recording(job: Job, report: Report = quiet) -> tuple[Log, Site | None]:
     InputError
     """
     if job.site_path is not None or job.declared_path.is_file():
-        site = load_site(job.declared_path, unknown=True, without=True)
-        if site.beacons:
-            return read_job(job, unknown=True, fewer=True, report=report)
+        site = load_site(job.declared_path, unknown=True, without=True, several=True)
+        if site.beacons or site.platform.further:
+            log, site = read_job(
+                job, unknown=True, without=True, fewer=True, several=True, raw=True, report=report
+            )
+            if site.platform.further and not log.waveforms:
+                raise InputError(
+                    f"{job.log_path}: holds only phasors of several magnetometers, of which check"
+                    " judges the samples; give the log with magnetometer.parquet"
+                )
+            return log, site
         return mended(_open(job, report), site), site
     return open_log(job.log_path, job.start, job.end, job.topics, report), None
 
