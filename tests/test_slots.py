@@ -25,7 +25,7 @@ from magfusion.receiver.slots import (
     slot_settings_of,
 )
 from magfusion.receiver.turn import on_clock
-from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz
+from magfusion.receiver.windows import LockinSettings, sent_frequencies_hz
 from magfusion.simulation.field import synchronised_drives
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.motion import Motion, Rests, static_motion, turning_motion
@@ -326,10 +326,10 @@ def test_beacons_keep_one_schedule_and_a_slot_each() -> None:
 def test_the_lock_in_names_what_separates_slots() -> None:
     site = tracker(2e3, Slots(5e-3, 4))
     with pytest.raises(InputError, match="which the lock-in cannot separate; give its demodulated"):
-        channel_frequencies_hz(site)
+        sent_frequencies_hz(site)
     bare = replace(site, beacons=(replace(site.beacons[0], slots=None),))
     with pytest.raises(InputError, match=r"declare its slots: \{duration_s, count\}, or give"):
-        channel_frequencies_hz(bare)
+        sent_frequencies_hz(bare)
 
 
 def test_a_window_that_is_no_slot_is_refused() -> None:

@@ -17,6 +17,7 @@ from magfusion.estimation.rest_witness import (
     witness_of,
     witnessed,
 )
+from magfusion.model.audibility import tones_of
 from magfusion.model.samples import FieldSamples, Log, Waveform
 from magfusion.model.site import Beacon, Site
 from magfusion.model.strapdown import resting
@@ -31,7 +32,7 @@ from magfusion.receiver.integration import (
 )
 from magfusion.receiver.pieces import Pieces
 from magfusion.receiver.slots import has_schedule
-from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz, default_settings
+from magfusion.receiver.windows import LockinSettings, default_settings, sent_frequencies_hz
 from magfusion.units import Array, BoolArray
 
 HOUR = 3600.0  # s
@@ -124,6 +125,11 @@ def at_rest(
         raise InputError("holds no magnetometer.parquet to integrate at rest; give the raw log")
     if has_schedule(site):
         raise InputError("--at-rest integrates tones, and a beacon has time slots; leave it out")
+    if tones_of(site).reused:
+        raise InputError(
+            "--at-rest integrates each tone for one beacon, and beacons share a frequency; leave it"
+            " out"
+        )
     usual = default_settings(site)
     given = usual if lockin is None else lockin
     longest = _coherent(site)
@@ -204,7 +210,7 @@ def _piece(
     most = duration / LEAST_LENGTHS
     if lockin is not None and lockin.window != usual.window:
         return lockin.window if lockin.window <= most else None
-    lines = np.sort(np.append(channel_frequencies_hz(site), 0.0))
+    lines = np.sort(np.append(sent_frequencies_hz(site), 0.0))
     spacing = float(np.min(np.diff(lines)))
     wanted = min(max(PIECE_TURNS / spacing, usual.window), LONGEST_PIECE)
     for beacon in site.beacons:
@@ -218,7 +224,7 @@ def _piece(
 def _coherent(site: Site) -> float:
     """Return how long a rest may be one epoch (s): as long as phases and clocks stay."""
     duration = 1000.0 * HOUR
-    while _walk(site, float(np.max(channel_frequencies_hz(site))), duration) > LARGEST_WALK**2:
+    while _walk(site, float(np.max(sent_frequencies_hz(site))), duration) > LARGEST_WALK**2:
         duration *= 0.9
     return duration
 
@@ -256,7 +262,7 @@ def _rest(
     rows = slice(*np.searchsorted(log.waveform.time, span))
     wave = Waveform(log.waveform.time[rows], log.waveform.measured_sensor[rows])
     hum = hum_of(wave, mains_hz)
-    time, nominal_hz = 0.5 * (span[0] + span[1]), channel_frequencies_hz(site)
+    time, nominal_hz = 0.5 * (span[0] + span[1]), sent_frequencies_hz(site)
     witness = witness_of(wave, log.reference, nominal_hz, hum)
 
     def by(sent_hz: Array) -> Freed:

@@ -9,6 +9,7 @@ from gtsam.symbol_shorthand import V
 from magfusion.errors import InputError
 from magfusion.estimation.convergence import last_move, refuse_open, settled_at
 from magfusion.estimation.graph import Estimate, Graph, initial_estimate, marginals, read_states
+from magfusion.estimation.hearing import heard_site
 from magfusion.estimation.initialization.chain import Start
 from magfusion.estimation.integrity.mending import mended
 from magfusion.estimation.log_graph import PreparedLog, graph_of
@@ -160,6 +161,7 @@ def smooth(
             )
     if settings.earth:
         check_earth(site)
+    log, site = heard_site(log, site, settings.lockin)
     known = mended(log, site)
     return _solved(prepared(known, site, settings, report), settings, report)
 

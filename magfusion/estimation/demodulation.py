@@ -12,6 +12,7 @@ from magfusion.estimation.motion_compensation import MotionCompensated, demodula
 from magfusion.estimation.skin_depths import refuse_too_deep
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.audibility import tones_of
 from magfusion.model.parameters import Calibration
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields
 from magfusion.model.site import Site
@@ -139,6 +140,8 @@ def demodulated(log: Log, site: Site, settings: LockinSettings | None = None) ->
     windows, fields = receiver.whole(log.waveform, log.imu)
     refuse_too_deep(fields, site)
     heard, hidden = without_silence(fields), drowned(fields)
+    if tones_of(site).reused:  # the states will tell better whose a phasor is
+        hidden |= ~fields.valid
     without = receiver.without_turn if isinstance(receiver, LockinReceiver) else Windows.none()
     dropped = receiver.dropped
     return Demodulation(log, heard, dropped, receiver, windows, hidden, without_turn=without)

@@ -7,6 +7,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError
 from magfusion.estimation.measurements.measurement import Measurement
+from magfusion.estimation.measurements.phasors import leaves_out
 from magfusion.estimation.propagation import Propagated
 from magfusion.estimation.state import MOTION, State, between, consider_update, moved, states_of
 from magfusion.model.parameters import Block
@@ -24,6 +25,17 @@ def measured_rows(
         errors.append(rows.error.reshape(-1))
         jacobians.append(rows.jacobian(size - MOTION).reshape(-1, size))
     return np.concatenate(errors), np.concatenate(jacobians)
+
+
+def telling_rows(
+    measurements: Sequence[Measurement], state: State, blocks: tuple[Block, ...]
+) -> tuple[Array, Array]:
+    """Return `measured_rows` without those, of many beacons, of what was not heard."""
+    error, jacobian = measured_rows(measurements, state, blocks)
+    if not leaves_out(measurements):
+        return error, jacobian
+    kept = np.any(jacobian, axis=1)
+    return error[kept], jacobian[kept]
 
 
 def _step(cov: Array, error: Array, jacobian: Array) -> tuple[Array, Array]:
@@ -98,7 +110,7 @@ class ErrorStateFilter:
             prior if linearization_point is None else replace(linearization_point, cov=prior.cov)
         )
         for _ in range((3 if far else 1) if measurements else 0):
-            error, jacobian = measured_rows(measurements, state, self.blocks)
+            error, jacobian = telling_rows(measurements, state, self.blocks)
             if state is not prior:  # from the prediction, which holds the prior
                 error = error - jacobian @ between(prior, state, self.blocks)
             try:

@@ -119,7 +119,10 @@ class EpochUpdate:
             self.gate.counts["inertial gap bridged"] += 1
         step = max(state.time - arrived.last_epoch, 1e-6)
         earth, standing = self._earth is not None, arrived.rests(state)
-        found = arrived.measured(before, state, samples, step, earth=earth, standing=standing)
+        lost = self._lost(state)
+        found = arrived.measured(
+            before, state, samples, step, earth=earth, standing=standing, lost=lost
+        )
         measurements: list[Measurement] = arrived.others_at(state.time)
         if standing:
             measurements.append(zero_velocity(NOW, self.site.platform.motion.rest_speed_sigma))
@@ -127,7 +130,7 @@ class EpochUpdate:
         if found is None or not np.any(found.samples.valid):
             self.gate.nothing_measured()
         else:
-            if self._lost(state) and self._found_again(estimator, found, predicted):
+            if lost and self._found_again(estimator, found, predicted):
                 return self._judged(estimator.state, None)
             point, refused = self._linearization_point(found.samples, state)
             explained, valid = state if point is None else point, found.samples.valid[0]

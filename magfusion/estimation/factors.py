@@ -6,6 +6,7 @@ rewritten in place at each iteration.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -13,6 +14,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.estimation.measurements.measurement import Measurement, Rows
+from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.state import States
 from magfusion.model.parameters import Block, Calibration
 from magfusion.units import Array, IntArray
@@ -67,14 +69,16 @@ class Factors:
         right = -rows.error.reshape(len(jacobian), -1)
         if not self._views:
             keys = [(key, part.shape[-1]) for key, part in parts]
-            for epoch in self.measurement.epoch.tolist():
+            for epoch, told in zip(self.measurement.epoch.tolist(), self.told, strict=True):
                 own = [(key(epoch), width) for key, width in keys]
-                factor, size = empty_factor(own, right.shape[1]), right.shape[1]
+                size = right.shape[1] if isinstance(told, slice) else len(told)
+                factor = empty_factor(own, size)
                 self.graph.push_back(factor)
                 self._views.append((factor.getA()[:size], factor.getb()[:size]))
-        for (by, error), own_by, own_right in zip(self._views, jacobian, right, strict=True):
-            by[...] = own_by
-            error[...] = own_right
+        rows_of = zip(self._views, jacobian, right, self.told, strict=True)
+        for (by, error), own_by, own_right, told in rows_of:
+            by[...] = own_by[told]
+            error[...] = own_right[told]
         return self.graph
 
     def considering(
@@ -107,13 +111,24 @@ class Factors:
             own = piece.rows(states, calibration, self.blocks)
             parts = piece._beside(states, calibration, own, others, spread, nuisance)
             for i, epoch in enumerate(piece.measurement.epoch.tolist()):
-                size = parts[0][1].shape[1]
+                told = piece.told[i]
+                values = np.concatenate([p[i][told] for _, p in parts], axis=1)
+                size = len(values)
                 factor = empty_factor([(k(epoch), p.shape[-1]) for k, p in parts], size)
-                factor.getA()[:size] = np.concatenate([p[i] for _, p in parts], axis=1)
+                factor.getA()[:size] = values
                 if explaining:
-                    factor.getb()[:size] = -own.error[i].ravel()
+                    factor.getb()[:size] = -own.error[i].ravel()[told]
                 graph.push_back(factor)
         return graph
+
+    @cached_property
+    def told(self) -> list[slice | IntArray]:
+        """Rows of each epoch's factor: all, or of many beacons those that are heard."""
+        epochs, measured = len(self.measurement.epoch), self.measurement
+        heard = measured.heard if isinstance(measured, FieldPhasors) else None
+        if heard is None:
+            return [slice(None)] * epochs
+        return [np.flatnonzero(np.repeat(own, 6)) for own in heard]
 
     def pieces(self) -> Iterator["Factors"]:
         """Yield the factors of some epochs after the other: derivatives of all take much memory."""

@@ -391,6 +391,7 @@ class Arrivals:
         *,
         earth: bool,
         standing: bool,
+        lost: bool = False,
     ) -> Measured | None:
         """Return what was detected and measured at a prediction; None where nothing was.
 
@@ -410,7 +411,7 @@ class Arrivals:
         time = predicted.time
         by_offset, steady = None, self.steady.pop(time, None)
         if samples is None:
-            wave = self._demodulated(before, predicted)
+            wave = self._demodulated(before, predicted, lost=lost)
             if wave is None:
                 return None  # only the clock went on
             samples, steady, by_offset = wave.fields, wave.steady, wave.by_time_offset
@@ -450,7 +451,9 @@ class Arrivals:
         self._heard_by |= dict.fromkeys(names, time)
         return max(min(steps, default=np.inf), SHORTEST_STEP)
 
-    def _demodulated(self, before: State, predicted: State) -> MotionCompensated | None:
+    def _demodulated(
+        self, before: State, predicted: State, *, lost: bool
+    ) -> MotionCompensated | None:
         """Return the window at a prediction; None where there is none."""
         number, receiver = self._window, self.receiver
         if number is None or receiver.centre_of(number) != predicted.time:
@@ -462,7 +465,7 @@ class Arrivals:
         wave, offset = self._waveform_samples(), self.applied_offset
         blind = self.stand_in.covers(begin - offset, end - offset)
         found = demodulate_predicted(
-            receiver, number, wave, imu, before, predicted, offset, blind=blind
+            receiver, number, wave, imu, before, predicted, offset, blind=blind, lost=lost
         )
         unseen = found.unseen or blind
         self.unseen += unseen

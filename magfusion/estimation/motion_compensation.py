@@ -3,14 +3,23 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.linalg import norm
 
+from magfusion.errors import InputError
+from magfusion.estimation.integrity.detection import only
 from magfusion.estimation.motion_shape import MotionShape
+from magfusion.estimation.sending import Sending
 from magfusion.estimation.state import State, as_trajectory
+from magfusion.model.audibility import Owned, only_owned, owned_at
+from magfusion.model.channel_effects import tone_frequencies
 from magfusion.model.field import observe_earth
+from magfusion.model.noise import calibration_error, model_error, sensor_positions
 from magfusion.model.parameters import Calibration, linearize_channels, predict_channels
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
+from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.waveform import Motion, carriers, predicted_waveform
+from magfusion.receiver.cells import owned_by
 from magfusion.receiver.lockin import WindowOperator, window_operator
 from magfusion.receiver.receiver import LockinReceiver
 from magfusion.receiver.turn import on_clock
@@ -18,7 +27,6 @@ from magfusion.units import Array, BoolArray, ComplexArray
 
 # By how much a motion that was found without an IMU errs within a window, one sigma.
 MISSED_SPIN, MISSED_PUSH = 1.5, 3.0  # rad/s^2, m/s^2
-AT_ONCE = 1 << 14  # samples that are predicted at once: what is made of them fits the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,14 +84,17 @@ def demodulate_about(
     offset, designs = calibration.time_offset, operator.designs
     shape = MotionShape.of(known, imu, offset, site.gravity)
     unexplained, change = np.empty_like(measured_sensor), np.empty_like(measured_sensor)
-    for begin in range(0, len(designs.time), AT_ONCE):
-        rows = slice(begin, begin + AT_ONCE)
+    sending = Sending.of(calibration, designs.settings.window)
+    for begin in range(0, len(designs.time), sending.at_once):
+        rows = slice(begin, begin + sending.at_once)
         time = designs.time[rows]
+        motion = shape.at(time)
+        heard = sending.along(motion)
         predicted, change[rows] = predicted_waveform(
-            shape.at(time),
-            calibration,
+            motion,
+            heard,
             earth,
-            carriers(designs.frequencies_hz, time),
+            carriers(tone_frequencies(heard.site), time),
             Motion(*shape.by_time_offset(time)),
         )
         unexplained[rows] = measured_sensor[rows] - predicted
@@ -93,11 +104,28 @@ def demodulate_about(
         calibration, states.time, states.world_from_body, states.position_world
     )
     steady = observe_earth(site.platform.magnetometer, states.world_from_body, earth)
+    fields = replace(rest, phasor_sensor=rest.phasor_sensor + at_centre)
     return MotionCompensated(
-        fields=replace(rest, phasor_sensor=rest.phasor_sensor + at_centre),
+        fields=fields if operator.tone_of_channel is None else _of_loudest(fields, sending, states),
         by_time_offset=operator.apply(change),
         steady=replace(left, measured_sensor=left.measured_sensor + steady.measured_sensor),
     )
+
+
+def _of_loudest(fields: FieldSamples, sending: Sending, states: Trajectory) -> FieldSamples:
+    """Return phasors of the loudest on each frequency; what is foreseen of the others is off."""
+    site = sending.calibration.site
+    places = sensor_positions(site, states)
+    place = places[:, 0]  # samples are demodulated of one magnetometer alone
+    unknown = np.ones((len(place), len(site.channels)))
+    felt = sending.along(states)
+    far = np.stack([norm(place - b.position_world, axis=1) for b in felt.site.beacons], axis=1)
+    names = {beacon.name for beacon in felt.site.beacons}
+    own = np.array([name in names for name, _ in site.channels])
+    missed = calibration_error(felt.site, far)[:, felt.site.owner]
+    unknown[:, own] = np.hypot(missed, model_error(felt.site, places))
+    owned, count = owned_at(site, place, unknown=unknown), len(fields.channels)
+    return only_owned(fields, Owned(owned.channels[:, :count], owned.others[:, :count]))
 
 
 def _without_motion(
@@ -107,6 +135,16 @@ def _without_motion(
     fields, steady = operator.demodulate(measured_sensor - offset)
     steady = replace(steady, measured_sensor=steady.measured_sensor + offset)
     return MotionCompensated(fields, np.zeros_like(fields.phasor_sensor), steady, unseen=True)
+
+
+def _by_strength(operator: WindowOperator, measured_sensor: Array, site: Site) -> MotionCompensated:
+    """Demodulate windows of beacons that share frequencies, wherever they were recorded."""
+    found = _without_motion(operator, measured_sensor, site.platform.magnetometer.offset)
+    try:
+        fields = owned_by(found.fields, site)
+    except InputError:
+        fields = only(found.fields, np.zeros(found.fields.valid.shape, dtype=bool))
+    return replace(found, fields=fields, unseen=False)
 
 
 def demodulate_predicted(
@@ -119,6 +157,7 @@ def demodulate_predicted(
     offset: float,
     *,
     blind: bool = False,
+    lost: bool = False,
 ) -> MotionCompensated:
     """Demodulate one window about a prediction.
 
@@ -134,6 +173,8 @@ def demodulate_predicted(
         IMU time offset with which the states were propagated (s).
     blind : bool
         Whether samples stand in for inertial ones.
+    lost : bool
+        Whether the prediction may be anywhere, so that it tells not whose a phasor is.
     """
     assert receiver.grid is not None
     assert receiver.admission is not None
@@ -147,6 +188,8 @@ def demodulate_predicted(
     operator = window_operator(samples, known, site, receiver.settings, alone, step)
     if operator.unseen[0]:
         return _without_motion(operator, samples.measured_sensor, site.platform.magnetometer.offset)
+    if lost and operator.tone_of_channel is not None:
+        return _by_strength(operator, samples.measured_sensor, receiver.site)
     centre, path = as_trajectory([predicted]), as_trajectory([before, predicted])
     found = demodulate_about(operator, samples.measured_sensor, centre, imu, calibration, path)
     length = receiver.settings.window

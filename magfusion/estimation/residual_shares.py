@@ -112,12 +112,13 @@ class Leavings:
         self._unwhitening = np.linalg.inv(np.array(roots).reshape(-1, ROWS, ROWS))
         self.sigma = np.sqrt(np.sum(self._unwhitening**2, axis=2))
         self.ordinary = np.all(self.sigma < ORDINARY * np.median(self.sigma, axis=0), axis=1)
-        self._fields = []
+        self._fields, self._told = [], []
         begin = first_fields
         for factors in graph.factors:
             end = begin + len(factors.measurement.epoch)
             if isinstance(factors.measurement, FieldPhasors):
                 self._fields += self._factors[begin:end]
+                self._told += factors.told
             begin = end
 
     def _draw(self, site: Site, sensor_world: Array, windows: float) -> None:
@@ -145,8 +146,10 @@ class Leavings:
         """Return what the estimate leaves of errors of fields and inertial factors."""
         for factor in self._factors:
             factor.getb()[...] = 0.0
-        for factor, own in zip(self._fields, self._weight * field, strict=True):
-            factor.getb()[: own.size] = own.ravel()
+        weighed = self._weight * field
+        for factor, own, told in zip(self._fields, weighed, self._told, strict=True):
+            part = own.ravel()[told]
+            factor.getb()[: part.size] = part
         for factor, own in zip(self._inertial, inertial, strict=True):
             factor.getb()[: own.size] = own
         return self._left_of_all()
@@ -154,9 +157,10 @@ class Leavings:
     def _left_of_all(self) -> tuple[Array, Array]:
         """Return what the linear system leaves of its right-hand sides."""
         step = eliminate(self._linear, self._ordering).optimize()
-        components = self._error[0].size
-        rows = [factor.error_vector(step)[:components] for factor in self._fields]
-        kept = np.array(rows).reshape(self._error.shape) / self._weight
+        rows = np.zeros((len(self._error), self._error[0].size))
+        for row, factor, told in zip(rows, self._fields, self._told, strict=True):
+            row[told] = factor.error_vector(step)[: row[told].size]
+        kept = rows.reshape(self._error.shape) / self._weight
         return kept, self._rows_of([factor.error_vector(step) for factor in self._inertial])
 
     def _rows_of(self, errors: list[Array]) -> Array:

@@ -157,12 +157,12 @@ def save_site(site: Site, path: Path | str) -> None:
         it, as ``<stem>_field_map.parquet``, a correlation as ``<stem>_correlation.parquet``.
     """
     path, site = Path(path), as_declared(site)
-    maps = {b.name: b.field_map for b in site.beacons if b.field_map is not None}
+    maps = {b.name: b.field_map for b in site.every_beacon if b.field_map is not None}
     beside = path.with_name(f"{path.stem}_field_map.parquet")
     content = {
         "magfusion_site": 1,
         "world": _world_entry(site) | ({"field_map": beside.name} if maps else {}),
-        "beacons": [_beacon_entry(b) for b in site.beacons],
+        "beacons": [_beacon_entry(b) for b in site.every_beacon],
         "platform": {
             **imu_entry(site.platform.imu),
             **magnetometer_entries(site.platform.magnetometers),

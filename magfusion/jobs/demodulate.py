@@ -39,6 +39,7 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     from magfusion.files.log import write_log
     from magfusion.files.site import save_site
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.model.audibility import MANY
     from magfusion.model.trust import Trust
     from magfusion.results.report import dropped_figures, write_report
     from magfusion.results.rest_figures import rest_figures
@@ -47,7 +48,15 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     claimed, job = claim(output, "demodulate"), settings.job(output)
     lockin = settings.lockin(job)
     used = settings.at_rest
-    log, site = read_job(job, fewer=not used, several=True, raw=True, reference=used, report=report)
+    log, site = read_job(
+        job,
+        fewer=not used,
+        several=True,
+        raw=True,
+        reference=used,
+        heard=not used,
+        report=report,
+    )
     if used and log.waveforms:
         raise InputError(
             "--at-rest integrates the samples of one magnetometer; leave it out, or give a site of"
@@ -90,7 +99,8 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
                     label=f"sigma of a phasor of tone {tone}{_of(samples, c, ' by ')}",
                 )
                 for c, (beacon, tone) in enumerate(samples.channels)
-                if not samples.magnetometers or np.any(samples.valid[:, c])
+                if np.any(samples.valid[:, c])
+                or (not samples.magnetometers and len(site.every_beacon) <= MANY)
             ),
         )
     )

@@ -148,6 +148,7 @@ def run_fix(
         several=True,
         lockin=lockin,
         reference=used,
+        heard=not used,
         report=report,
     )
     began = time.perf_counter()

@@ -11,6 +11,7 @@ from pathlib import Path
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.demodulated_apart import demodulated_apart, of_site
 from magfusion.estimation.drive_reference import turning_currents, with_drives
+from magfusion.estimation.hearing import heard_site
 from magfusion.estimation.integrity.magnetometers import without_silent
 from magfusion.estimation.integrity.mending import mended
 from magfusion.estimation.warming import at_reference
@@ -266,6 +267,7 @@ def read_job(
     several: bool = False,
     raw: bool = False,
     lockin: LockinSettings | None = None,
+    heard: bool = True,
     report: Report = quiet,
 ) -> tuple[Log, Site]:
     """Read the log and the site of a job, and see that they belong together.
@@ -290,6 +292,8 @@ def read_job(
         Whether it demodulates the samples of several itself.
     lockin : LockinSettings, optional
         By which the samples of several are demodulated.
+    heard : bool
+        Whether, of many beacons, those alone are of use that are heard in a window.
 
     Raises
     ------
@@ -330,7 +334,11 @@ def read_job(
         log, site = with_drives(log, site)
     if log.reference is not None and not reference:
         log = replace(log, reference=None, noticed=(*log.noticed, NOT_USED))
-    return at_reference(log, site)
+    log, site = at_reference(log, site)
+    if not heard:
+        return log, site
+    with named(job.log_path):
+        return heard_site(log, site)
 
 
 def _as_known(job: Job, log: Log, site: Site) -> Log:

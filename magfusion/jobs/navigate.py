@@ -218,7 +218,10 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
         claim_rows(_rows_path(path))
         if path != place or not settings.resume:
             claim_checkpoint(path)
-    log, site = read_job(job, fewer=True, several=True, lockin=navigator.lockin, report=report)
+    # As of a stream: which beacons will be heard is not known beforehand.
+    log, site = read_job(
+        job, fewer=True, several=True, lockin=navigator.lockin, heard=False, report=report
+    )
     refuse_rate(job.log_path, log, settings.rates)
     with named(job.log_path):
         require_motion_prior(site)

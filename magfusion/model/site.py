@@ -200,6 +200,11 @@ class Beacon:
         return drive
 
     @cached_property
+    def tone_moments(self) -> Array:
+        """Size of the complex moment of each tone (A m^2), shape (tones,)."""
+        return np.asarray(np.linalg.norm(self.moments_beacon.T @ self.excitation, axis=0))
+
+    @cached_property
     def moments_beacon(self) -> Array:
         """Peak moments (A m^2), shape (coils, 3)."""
         return np.array([c.moment_beacon for c in self.coils])
@@ -330,6 +335,8 @@ class Site:
         Of the logarithm of the conductivity that its beacons have; zero means known.
     reference_world : ndarray, shape (3,), optional
         Where a second magnetometer stands that witnesses the noise (m).
+    unheard : tuple of (int, Beacon)
+        Beacons that a log does not hear, with their places among all; they stay as declared.
     """
 
     gravity: float
@@ -348,11 +355,20 @@ class Site:
     drives: DriveShares | None = None
     log_conductivity_sigma: float = 0.0
     reference_world: Array | None = None
+    unheard: tuple[tuple[int, Beacon], ...] = ()
 
     @cached_property
     def bounds(self) -> Bounds | None:
         """Planes that the magnetometer does not cross; None where nothing is said of its place."""
         return bounds_of(self.region, self.beacons)
+
+    @property
+    def every_beacon(self) -> tuple[Beacon, ...]:
+        """Those that are heard, and those that are not, in the order of the file."""
+        every = list(self.beacons)
+        for number, beacon in self.unheard:
+            every.insert(number, beacon)
+        return tuple(every)
 
     @cached_property
     def channels(self) -> tuple[tuple[str, int], ...]:

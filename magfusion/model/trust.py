@@ -25,6 +25,7 @@ CODES = {
     "beacon_fault": "the field of a beacon is false, for a while or altogether",
     "beacon_pose": "a beacon is not where, or not turned as, it was surveyed",
     "beacons_swapped": "beacons are taken for each other",
+    "beacons_unheard": "of many beacons a log hears some; the others stay as declared",
     "body_iron": "iron or a magnet on the body changes the field",
     "coil_reversed": "a coil of a beacon is wired in reverse, or exchanged for another",
     "coils_swapped": "the coils of every beacon are exchanged",

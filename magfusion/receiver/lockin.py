@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magfusion.model.audibility import tones_of
 from magfusion.model.quaternion import inverse, matrices, turned
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
 from magfusion.model.site import Site
@@ -27,8 +28,8 @@ from magfusion.receiver.noise import (
     smoothed_over_windows,
 )
 from magfusion.receiver.turn import body_turn_of, measured_from_body, on_clock, standing_in
-from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz
-from magfusion.units import Array, BoolArray, ComplexArray
+from magfusion.receiver.windows import LockinSettings
+from magfusion.units import AnyArray, Array, BoolArray, ComplexArray, IntArray
 
 MOST_COMPARED = 50  # windows by which two clocks are compared
 LEAST_COMPARED = 0.8  # of the samples of the fullest
@@ -45,6 +46,8 @@ class WindowOperator:
     designs : Designs
         Of the sample times alone.
     channels : tuple of (str, int)
+    tone_of_channel : int ndarray, shape (channels,), optional
+        Where several send on one frequency: each of them has its phasor.
     body_from_measured : ndarray, shape (3, 3)
     still_from_body : ndarray, shape (4, samples)
         Takes each sample to axes that do not turn with the body; quaternions, scalar first.
@@ -71,6 +74,17 @@ class WindowOperator:
     unseen: BoolArray
     apart: BoolArray
     lacking: tuple[int, ...] = ()
+    tone_of_channel: IntArray | None = None
+
+    @property
+    def frequencies_hz(self) -> Array:
+        """Frequency of each channel (Hz)."""
+        return self._by_channel(self.designs.frequencies_hz, axis=0)
+
+    def _by_channel(self, by_tone: AnyArray, axis: int = 1) -> AnyArray:
+        if self.tone_of_channel is None:
+            return by_tone
+        return np.take(by_tone, self.tone_of_channel, axis=axis)
 
     def apply(self, measured_sensor: Array) -> ComplexArray:
         """Return the phasors of a waveform given at the same sample times.
@@ -86,12 +100,13 @@ class WindowOperator:
             (T), measured axes at the centre of the window.
         """
         still = self._still(measured_sensor)
-        return np.concatenate(
+        found = np.concatenate(
             [
                 self._phasor(rows, maps.solver[:, 1:] @ _of_windows(still, maps))
                 for rows, maps in self.designs.pieces()
             ]
         )
+        return self._by_channel(found)
 
     def demodulate(self, measured_sensor: Array) -> tuple[FieldSamples, SteadyFields]:
         """Turn raw samples into phasors and the steady field beside them, each with covariance.
@@ -134,8 +149,10 @@ class WindowOperator:
             time=centre,
             window=np.full(len(centre), settings.window),
             channels=self.channels,
-            phasor_sensor=phasor,
-            phasor_cov=unit[..., None, None] * smooth + bent[..., None, None] * np.eye(3),
+            phasor_sensor=self._by_channel(phasor),
+            phasor_cov=self._by_channel(
+                unit[..., None, None] * smooth + bent[..., None, None] * np.eye(3)
+            ),
             axes="".join(axis for k, axis in enumerate("xyz") if k not in self.lacking),
         )
         beside = constant_unit[:, None, None] * np.mean(smooth, axis=1)
@@ -231,6 +248,7 @@ def window_operator(
         at_centre = np.broadcast_to(from_body, at_centre.shape)
         still = np.zeros_like(still)
         still[0] = 1.0
+    tones = tones_of(site)
     return WindowOperator(
         designs=designs_of(waveform, site, settings, windows) if designs is None else designs,
         channels=site.channels,
@@ -241,6 +259,7 @@ def window_operator(
         unseen=meets_silence(windows, settings.window, waveform.time, silence),
         apart=np.zeros(len(windows), dtype=bool),
         lacking=lacking,
+        tone_of_channel=tones.of_channel if tones.reused else None,
     )
 
 
@@ -248,7 +267,7 @@ def designs_of(
     waveform: Waveform, site: Site, settings: LockinSettings, windows: Windows
 ) -> Designs:
     """Return what the lock-in makes of the sample times of windows."""
-    frequencies, nyquist_hz = channel_frequencies_hz(site), sample_rate_hz(waveform) / 2.0
+    frequencies, nyquist_hz = tones_of(site).frequencies_hz, sample_rate_hz(waveform) / 2.0
     nuisances = nuisances_hz(settings, frequencies, nyquist_hz)
     return Designs(settings, frequencies, nuisances, waveform.time, windows)
 

@@ -26,6 +26,7 @@ from magfusion.receiver.admission import (
     sample_rate_hz,
     usual_step,
 )
+from magfusion.receiver.cells import owned_by
 from magfusion.receiver.cycles import cycles, joins
 from magfusion.receiver.design import Designs, separable, variance_growth
 from magfusion.receiver.lockin import WindowOperator, designs_of, window_operator
@@ -44,7 +45,7 @@ from magfusion.receiver.slots import (
     slot_settings_of,
 )
 from magfusion.receiver.turn import Turn, on_clock, turn_of
-from magfusion.receiver.windows import LockinSettings, channel_frequencies_hz, default_settings
+from magfusion.receiver.windows import LockinSettings, default_settings, sent_frequencies_hz
 from magfusion.units import Array, BoolArray, IntArray
 
 NO_SILENT_SLOT = "no silent slot beside it"
@@ -405,14 +406,18 @@ class LockinReceiver(Receiver):
     def _chosen(self) -> LockinSettings:
         return default_settings(self.site) if self._given is None else self._given
 
+    @cached_property
+    def _sent(self) -> Array:
+        return sent_frequencies_hz(self.site)
+
     def check(self) -> None:
         """Refuse tones that cannot be separated, as `Receiver.check`."""
-        channel_frequencies_hz(self.site)
+        sent_frequencies_hz(self.site)
 
     def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
         """Lay windows from the first sample on, as `Receiver.begin`."""
         rate_hz = sample_rate_hz(waveform)
-        frequencies = channel_frequencies_hz(self.site)
+        frequencies = self._sent
         highest = float(np.max(frequencies))
         if highest > 0.45 * rate_hz:
             raise InputError(
@@ -433,6 +438,15 @@ class LockinReceiver(Receiver):
             wait=-0.6 / rate_hz,  # the last sample is half a step earlier
         )
         self._begin(waveform, imu, grid, LEAST_SHARE, clips=True)
+
+    def whole(self, waveform: Waveform, imu: ImuSamples) -> tuple[Windows, FieldSamples]:
+        """Return windows and phasors as `Receiver.whole`, each phasor of one beacon."""
+        windows, found = super().whole(waveform, imu)
+        return windows, owned_by(found, self.site)
+
+    def sent(self, waveform: Waveform, imu: ImuSamples) -> FieldSamples:
+        """Return what is received of each channel, of whichever beacon on its frequency."""
+        return super().whole(waveform, imu)[1]
 
     def phasors(
         self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
@@ -458,7 +472,7 @@ class LockinReceiver(Receiver):
 
     def _growth(self, windows: Windows, time: Array) -> Array:
         assert self.admission is not None
-        frequencies = channel_frequencies_hz(self.site)
+        frequencies = self._sent
         step = self.admission.magnetometer_step
         return variance_growth(windows, time, step, self.settings, frequencies)
 

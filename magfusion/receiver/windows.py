@@ -5,12 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.model.site import Site
+from magfusion.model.audibility import phasor_sigma, tones_of, unheard_by_each_other
+from magfusion.model.site import Beacon, Site
 from magfusion.units import Array
 
 LONGEST_WINDOW = 4.0  # s; motion within a longer one is no longer a ramp
 EVEN = 1e-6  # steps; less is rounding of stamps
 CLOSEST_TONES_HZ = 2.0 / LONGEST_WINDOW
+AGAIN_WINDOW = 1.0  # s; in which one beacon on a frequency must not be heard beside another
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ def default_settings(site: Site, mains_hz: float = 50.0) -> LockinSettings:
     InputError
         Where two beacons share a frequency, or a beacon is driven in time slots.
     """
-    frequencies = channel_frequencies_hz(site)
+    frequencies = sent_frequencies_hz(site)
     lines = np.sort(np.concatenate([[0.0], frequencies]))
     gaps = np.diff(lines)
     spacing = float(np.min(gaps))
@@ -70,8 +72,11 @@ def default_settings(site: Site, mains_hz: float = 50.0) -> LockinSettings:
     return LockinSettings(window=window, step=window / 2.0, mains_hz=mains_hz)
 
 
-def channel_frequencies_hz(site: Site) -> Array:
-    """Return the frequency of each channel (Hz), refusing tones that cannot be separated."""
+def sent_frequencies_hz(site: Site) -> Array:
+    """Return the frequencies that are sent (Hz), refusing tones that cannot be separated.
+
+    One that beacons use again which do not hear each other stands once.
+    """
     for beacon in site.beacons:
         if any(slot is not None for _, slot in beacon.tones):
             remedy = "" if beacon.slots else "declare its slots: {duration_s, count}, or "
@@ -80,12 +85,29 @@ def channel_frequencies_hz(site: Site) -> Array:
                 f"{remedy}give its demodulated fields.parquet instead of the waveform"
             )
     frequencies = np.concatenate([b.tone_frequencies_hz for b in site.beacons])
-    order = np.argsort(frequencies)
+    order = np.argsort(frequencies, kind="stable")
     close = np.flatnonzero(np.diff(frequencies[order]) < CLOSEST_TONES_HZ)
-    if len(close):
-        a, b = (site.channels[order[close[0] + i]][0] for i in (0, 1))
+    again = len(close) > 0 and _used_again(site)
+    for k in close:
+        i, j = order[k], order[k + 1]
+        if frequencies[i] == frequencies[j] and again:
+            continue
+        a, b = site.channels[i][0], site.channels[j][0]
         raise InputError(
-            f"beacons {a} and {b} both transmit at {frequencies[order[close[0]]]:g} Hz; "
+            f"beacons {a} and {b} both transmit at {frequencies[i]:g} Hz; "
             f"tones must differ by at least {CLOSEST_TONES_HZ:g} Hz to be separated"
         )
-    return frequencies
+    return tones_of(site).frequencies_hz
+
+
+def _used_again(site: Site) -> bool:
+    """Return whether no two beacons on one frequency hear each other."""
+    sigma = phasor_sigma(site, AGAIN_WINDOW)
+    on_tone: dict[float, list[Beacon]] = {}
+    for beacon in site.beacons:
+        for frequency in beacon.tone_frequencies_hz.tolist():
+            others = on_tone.setdefault(frequency, [])
+            if not all(unheard_by_each_other(beacon, other, sigma) for other in others):
+                return False
+            others.append(beacon)
+    return True

@@ -8,10 +8,12 @@ bound is that of whoever knows on which side the platform is.
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 
-from magfusion.model.parameters import choose_blocks, initial_calibration
+from magfusion.model.audibility import are_many, largest_fields, phasor_sigma
+from magfusion.model.parameters import beacons_of, choose_blocks, initial_calibration
 from magfusion.model.site import Beacon, Site
 from magfusion.model.trust import Risk
 from magfusion.results.pose_information import (
@@ -27,6 +29,7 @@ from magfusion.results.pose_information import phasor_variance as phasor_varianc
 from magfusion.units import Array, BoolArray, IntArray
 
 CHUNK = 500  # points linearised at once
+TOGETHER = 64  # points at which the same of many beacons are heard
 COMPARED = 400  # points at which candidates for one more beacon are compared
 
 
@@ -152,6 +155,44 @@ def coverage(
         What protection levels are to promise; they are found only where it is given.
     """
     attitude = np.eye(3) if world_from_body is None else world_from_body
+    if are_many(site) and len(position_world):
+        parts = []
+        for start in range(0, len(position_world), TOGETHER):
+            points = position_world[start : start + TOGETHER]
+            near = _heard_at(site, points, window)
+            own = _of_window(near, points, window, survey, attitude_known, attitude, risk)
+            parts.append(own)
+        return _joined(parts)
+    return _of_window(site, position_world, window, survey, attitude_known, attitude, risk)
+
+
+def _heard_at(site: Site, position_world: Array, window: float) -> Site:
+    """Return a site of those beacons that are heard at any of some points."""
+    largest = np.max(largest_fields(site, position_world), axis=0)
+    heard = beacons_of(site, np.asarray(largest > phasor_sigma(site, window))).tolist()
+    kept = heard or [0]
+    others = tuple((k, b) for k, b in enumerate(site.beacons) if k not in kept)
+    return replace(site, beacons=tuple(site.beacons[k] for k in kept), unheard=others)
+
+
+def _joined(parts: list[Coverage]) -> Coverage:
+    """Return the coverage of all points."""
+    values: dict[str, Any] = {}
+    for name, first in vars(parts[0]).items():
+        each = [getattr(part, name) for part in parts]
+        values[name] = None if first is None else np.concatenate(each)
+    return Coverage(**values)
+
+
+def _of_window(
+    site: Site,
+    position_world: Array,
+    window: float,
+    survey: bool,
+    attitude_known: bool,
+    attitude: Array,
+    risk: Risk | None,
+) -> Coverage:
     variance, calibration = phasor_variance(site, window), initial_calibration(site, 0.0)
     blocks = choose_blocks(site, SURVEY_GROUPS if survey else ("phase",))
     prior = prior_of(site, blocks)
@@ -226,7 +267,19 @@ def boundary_places(box_world: Array) -> Array:
 def _copy(site: Site, place: Array) -> Beacon:
     names = {b.name for b in site.beacons}
     name = next(n for n in ("extra", *(f"extra {i}" for i in range(len(names)))) if n not in names)
-    return replace(site.beacons[0], name=name, position_world=place)
+    copy = replace(site.beacons[0], name=name, position_world=place)
+    if any(slot is not None for _, slot in copy.tones):
+        return copy
+    # It will have a frequency of its own, at which the field is what it is at the first's.
+    coils = tuple(
+        c if c.frequency_hz is None else replace(c, frequency_hz=_above(c.frequency_hz))
+        for c in copy.coils
+    )
+    return replace(copy, frequency_hz=_above(copy.frequency_hz), coils=coils)
+
+
+def _above(frequency_hz: float) -> float:
+    return float(np.nextafter(frequency_hz, np.inf))
 
 
 def _quantile(sigma: Array, share: float) -> float:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magfusion.estimation.integrity.separation import Separation, protection_levels
+from magfusion.model.audibility import owned_at
 from magfusion.model.field import model_error_cov
 from magfusion.model.noise import alike_beside, model_error, paired_whitening, sensors_at
 from magfusion.model.parameters import PHASE, Block, Calibration, linearize_channels
@@ -98,11 +99,14 @@ def whitened(
     noise = variance[:, None, None] * np.eye(3)
     sensor_world = sensors_at(site, rotation, position_world)
     error = model_error(site, sensor_world)
+    each = [owned_at(site, place).channels for place in np.swapaxes(sensor_world, 0, 1)]
+    owned = np.concatenate(each, axis=1)
     if site.platform.further:
-        error = error * np.sqrt(alike_beside(site, np.ones(phasor.shape[:2], dtype=bool)))
+        error = error * np.sqrt(alike_beside(site, owned))
     cov = noise + model_error_cov(phasor, error)
-    sqrt_information = paired_whitening(cov, np.ones(cov.shape[:2], dtype=bool))
+    sqrt_information = paired_whitening(cov, owned)
     strong = np.linalg.norm(value, axis=2) > DETECTION_CHI_SQUARE * np.sqrt(variance)
+    strong &= owned
     owner = site.owner
     owners = owner == np.arange(len(site.beacons))[:, None]
     detected = np.sum((strong[:, None] & owners).any(axis=2), axis=1)

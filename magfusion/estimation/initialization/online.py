@@ -7,6 +7,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.initialization.among_many import among_all
 from magfusion.estimation.initialization.handover import last_state
 from magfusion.estimation.integrity.judge import judged
 from magfusion.estimation.integrity.score import Score, score_of
@@ -129,6 +130,9 @@ def find_online_start(
         honest, trust = judged(result, log)
         score = score_of(result, imu)
         state = last_state(result, result.considered)
+        if result.calibration.site.unheard:
+            known = (*result.blocks, *result.considered)
+            state = among_all(state, known, site, settings)
     except (EstimationError, InputError) as error:
         return NoStart(f"{error}.")
     except (RuntimeError, np.linalg.LinAlgError):

@@ -14,7 +14,7 @@ from magfusion.estimation.ekf import measured_rows
 from magfusion.estimation.integrity.judgement import Judgement
 from magfusion.estimation.integrity.separation import LEAST, Separation, protection_levels, radii
 from magfusion.estimation.measurements.measurement import Measurement
-from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.measurements.phasors import FieldPhasors, leaves_out
 from magfusion.estimation.propagation import Propagated
 from magfusion.estimation.state import MOTION, State, between
 from magfusion.model.parameters import Block
@@ -102,6 +102,9 @@ class SubsetBank:
             part[:, :, :MOTION] = part @ motion.T
             part += noise
         error, jacobian, owner = self._rows(measurements, predicted.state)
+        if leaves_out(measurements):
+            kept = np.any(jacobian, axis=1)
+            error, jacobian, owner = error[kept], jacobian[kept], owner[kept]
         taken = self._taken(jacobian, owner)
         crossed = taken @ cov
         gain = self._gains(taken, crossed)

@@ -15,9 +15,11 @@ from magfusion.estimation.integrity.separation import (
 )
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.estimation.snapshot.many import by_beacon, parts_heard, some_fixes, whole_fixes
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA, State, epochs_of
-from magfusion.estimation.snapshot.refine import rows_at
-from magfusion.model.parameters import Calibration
+from magfusion.estimation.snapshot.refine import joined, rows_at
+from magfusion.model.audibility import are_many
+from magfusion.model.parameters import Calibration, channels_of
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict
 from magfusion.units import DEGREE, Array, BoolArray, IntArray
@@ -142,6 +144,12 @@ def separate_fixes(
     """
     risk = Risk() if risk is None else risk
     how = _How(samples, calibration, gravity, survey_error, free, gain_sigma)
+    if are_many(calibration.site) and len(samples):
+        return _among_many(how, fixes, risk)
+    return _separated(how, fixes, risk)
+
+
+def _separated(how: _How, fixes: Fixes, risk: Risk) -> SeparatedFixes:
     found = _separation(how, fixes)
     prior, excess = found.prior(risk), found.excess(risk)
     first = _levels(found, fixes, risk, prior)
@@ -169,6 +177,30 @@ def separate_fixes(
         ),
     )
     return SeparatedFixes(result.fixes, states, excess, found.shift[..., 1])
+
+
+def _among_many(how: _How, fixes: Fixes, risk: Risk) -> SeparatedFixes:
+    """Compare the fixes of each stretch with those without each beacon that it hears."""
+    site, parts, found = how.calibration.site, [], []
+    for rows, beacons, some, known, up in parts_heard(how.samples, how.calibration, how.gravity):
+        channels = channels_of(site, beacons)
+        own = some_fixes(fixes, rows, channels)
+        here = replace(how, samples=some, calibration=known, gravity=up)
+        part = _separated(here, own, risk)
+        parts.append(whole_fixes(part.fixes, how.calibration, channels))
+        found.append((part, beacons))
+    states, count = [part.states for part, _ in found], len(site.beacons)
+    return SeparatedFixes(
+        joined(parts),
+        StateTrust(
+            tuple(verdict for state in states for verdict in state.verdict),
+            np.concatenate([state.protection_level_m for state in states]),
+            np.concatenate([state.protection_level_deg for state in states]),
+            tuple(names for state in states for names in state.excluded),
+        ),
+        by_beacon([(part.excess, beacons) for part, beacons in found], count),
+        by_beacon([(part.shift_m, beacons) for part, beacons in found], count),
+    )
 
 
 def _leave_out(

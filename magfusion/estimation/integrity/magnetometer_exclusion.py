@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.hearing import heard_site
 from magfusion.estimation.integrity.magnetometers import without_magnetometer
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
 from magfusion.model.samples import Log
@@ -63,7 +64,7 @@ def agreed(
             findings.append(_undecided(names, worst))
             break
         which = int(order[0])
-        log, site = without_magnetometer(log, site, which)
+        log, site = heard_site(*without_magnetometer(log, site, which))
         result = solve(log, site)
         findings.append(_excluded(sensors[which].name, names, worst))
     return Agreed(log, site, result, tuple(findings))

@@ -9,6 +9,7 @@ of a whole log, at the cost of one more product of matrices.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -16,7 +17,13 @@ from magfusion.estimation.integrity.held import COVERED, Freed, finding_of, free
 from magfusion.estimation.integrity.judgement import Judgement
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.statistics import SURE
-from magfusion.estimation.integrity.suspects import Inertial, Stream, held_blocks, suspects
+from magfusion.estimation.integrity.suspects import (
+    Inertial,
+    Stream,
+    Suspect,
+    held_blocks,
+    suspects,
+)
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.state import MOTION, State, states_of
 from magfusion.model.parameters import Block, dimension, prior_sigma
@@ -73,11 +80,6 @@ class OnlineScore:
         steady: bool,
     ) -> None:
         self.site, self.held = site, held_blocks(site, estimated, steady=steady)
-        self.suspects = tuple(suspects(site, self.held))
-        most = max((one.combine.shape[1] for one in self.suspects), default=0)
-        self._combine = np.zeros((len(self.suspects), dimension(self.held), most))
-        for room, one in zip(self._combine, self.suspects, strict=True):
-            room[:, : one.combine.shape[1]] = one.combine
         self.unit, self.size = prior_sigma(self.held), MOTION + dimension(estimated)
         at = MOTION + dimension((*estimated, *considered))
         self.blocks = tuple(
@@ -87,6 +89,19 @@ class OnlineScore:
         self.asked, self.whole = (*estimated, *considered, *self.blocks), at
         self.spread = self._declared(considered)
         self._sums, self._asked_at, self._said = None, -np.inf, Judgement()
+
+    @cached_property
+    def suspects(self) -> tuple[Suspect, ...]:
+        """What one mistake would have wrong; of many beacons it takes gigabytes, so if asked."""
+        return tuple(suspects(self.site, self.held))
+
+    @cached_property
+    def _combine(self) -> Array:
+        most = max((one.combine.shape[1] for one in self.suspects), default=0)
+        every = np.zeros((len(self.suspects), dimension(self.held), most))
+        for room, one in zip(every, self.suspects, strict=True):
+            room[:, : one.combine.shape[1]] = one.combine
+        return every
 
     def _declared(self, considered: tuple[Block, ...]) -> Array:
         """Return a root of the covariance that the site declares of what is held."""

@@ -1,5 +1,6 @@
 """Phasors of the beacons as a measurement."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from typing import NamedTuple
@@ -8,6 +9,7 @@ import numpy as np
 
 from magfusion.estimation.measurements.measurement import Loss, Measurement, Rows
 from magfusion.estimation.state import States
+from magfusion.model.audibility import are_many
 from magfusion.model.field import skew
 from magfusion.model.noise import (
     measurement_cov,
@@ -59,6 +61,8 @@ class FieldPhasors(Measurement):
     excess : ndarray, shape (n, channels), optional
         Variance with which it is weighed, since epochs close by have the same model error, in
         units of that of an epoch alone.
+    heard : bool ndarray, shape (n, channels), optional
+        Those that are predicted; None for all.
     predicted : Predictions
         Shared by all that differ from this in their weights alone.
     """
@@ -73,6 +77,7 @@ class FieldPhasors(Measurement):
     ahead: Array | None = None
     robust: str | None = None
     excess: Array | None = None
+    heard: BoolArray | None = None
     predicted: "Predictions" = field(default_factory=lambda: Predictions(), compare=False)
 
     @property
@@ -130,7 +135,7 @@ class FieldPhasors(Measurement):
             )
         else:
             value, by_pose, by_calibration = linearize_channels(
-                calibration, blocks, self.time, *place
+                calibration, blocks, self.time, *place, self.heard
             )
         value += lag[:, None, None] * self.by_time_offset
         if np.any(calibration.clock_offsets):
@@ -302,7 +307,13 @@ def field_phasors(
         moving=np.ones(len(epoch), dtype=bool) if standing is None else ~standing,
         ahead=samples.ahead,
         excess=excess,
+        heard=samples.valid if are_many(site) else None,
     )
+
+
+def leaves_out(measurements: Sequence[Measurement]) -> bool:
+    """Return whether some channels are not predicted, their rows zero."""
+    return any(isinstance(m, FieldPhasors) and m.heard is not None for m in measurements)
 
 
 def alone(measurement: Measurement) -> Measurement:

@@ -12,9 +12,11 @@ from scipy.spatial.transform import Rotation
 from magfusion.estimation.snapshot.axis_starts import mirrored, starts_on_grid, with_least_roll
 from magfusion.estimation.snapshot.candidates import attitudes, positions
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
+from magfusion.estimation.snapshot.many import fix_parts, parts_heard
 from magfusion.estimation.snapshot.place import outside
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA, Epochs, Problem, State, epochs_of
 from magfusion.estimation.snapshot.refine import Solved, as_fixes, cost, joined, solved_from
+from magfusion.model.audibility import are_many
 from magfusion.model.channel_effects import of_all_sensors
 from magfusion.model.coil_field import is_sized
 from magfusion.model.parameters import Calibration, seen_by, without_response
@@ -62,6 +64,27 @@ def fix_epochs(
     EstimationError
         Where there is no epoch.
     """
+    if are_many(calibration.site) and prior is None and len(samples):
+
+        def fixed(
+            _rows: slice, some: FieldSamples, known: Calibration, up: Gravity | None
+        ) -> Fixes:
+            return joined(
+                [
+                    _solve(epochs)
+                    for epochs in epochs_of(
+                        some,
+                        known,
+                        gravity=up,
+                        prior=None,
+                        survey_error=survey_error,
+                        free=free,
+                        gain_sigma=gain_sigma,
+                    )
+                ]
+            )
+
+        return fix_parts(parts_heard(samples, calibration, gravity), calibration, fixed)
     parts = epochs_of(
         samples,
         calibration,

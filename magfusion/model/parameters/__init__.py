@@ -40,6 +40,12 @@ from magfusion.model.parameters.platform import SENSOR_ROTATION as SENSOR_ROTATI
 from magfusion.model.parameters.platform import STRENGTH as STRENGTH
 from magfusion.model.parameters.platform import TIME_OFFSET as TIME_OFFSET
 from magfusion.model.parameters.platform import MagnetometerParameter as MagnetometerParameter
+from magfusion.model.parameters.subset import beacons_of as beacons_of
+from magfusion.model.parameters.subset import channels_of as channels_of
+from magfusion.model.parameters.subset import of_beacons as of_beacons
+from magfusion.model.parameters.subset import samples_of as samples_of
+from magfusion.model.parameters.subset import stretches as stretches
+from magfusion.model.parameters.subset import with_unheard as with_unheard
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.units import Array, ComplexArray

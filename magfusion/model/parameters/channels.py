@@ -12,10 +12,12 @@ import numpy as np
 from magfusion.model.channel_effects import axis_factors
 from magfusion.model.coil_field import Sources, alone, side_by_side
 from magfusion.model.field import observe, observe_from, predict
+from magfusion.model.parameters.beacon import BeaconParameter
 from magfusion.model.parameters.parameter import Block, Calibration, PhasorView, dimension
+from magfusion.model.parameters.subset import channels_of, of_beacons, stretches
 from magfusion.model.receive_coils import Observation
 from magfusion.model.site import Beacon, Site
-from magfusion.units import Array, ComplexArray
+from magfusion.units import Array, BoolArray, ComplexArray
 
 
 class _Group(NamedTuple):
@@ -91,6 +93,7 @@ def linearize_channels(
     world_from_body: Array,
     position_world: Array,
     twist_body: Array | None = None,
+    heard: BoolArray | None = None,
 ) -> tuple[Array, Array, Array]:
     """Predict every channel as real numbers, with the Jacobian by pose and calibration.
 
@@ -103,6 +106,8 @@ def linearize_channels(
     position_world : ndarray, shape (n, 3)
     twist_body : ndarray, shape (n, 6), optional
         Needed where the time offset is among the blocks.
+    heard : bool ndarray, shape (n, channels), optional
+        What is asked for: beacons of which nothing is, at epochs close by, are zero.
 
     Returns
     -------
@@ -111,6 +116,10 @@ def linearize_channels(
     by_pose : ndarray, shape (n, channels, 6, 6)
     by_calibration : ndarray, shape (n, channels, 6, dimension)
     """
+    if heard is not None:
+        return _linearize_heard(
+            calibration, blocks, time, world_from_body, position_world, twist_body, heard
+        )
     phase, site, n = calibration.drive_phase(time), calibration.site, len(time)
     channels = len(site.channels)
     value = np.empty((n, channels, 6))
@@ -155,6 +164,53 @@ def _answered(stacked: Array, factors: ComplexArray) -> Array:
     real, imaginary = stacked[..., :3, :], stacked[..., 3:, :]
     a, b = factors.real[:, :, None], factors.imag[:, :, None]
     return np.concatenate([a * real - b * imaginary, b * real + a * imaginary], axis=-2)
+
+
+def _linearize_heard(
+    calibration: Calibration,
+    blocks: tuple[Block, ...],
+    time: Array,
+    world_from_body: Array,
+    position_world: Array,
+    twist_body: Array | None,
+    heard: BoolArray,
+) -> tuple[Array, Array, Array]:
+    """Predict the channels of the beacons that are heard, as `linearize_channels`."""
+    site, n, channels = calibration.site, len(time), len(calibration.site.channels)
+    value, by_pose = np.zeros((n, channels, 6)), np.zeros((n, channels, 6, 6))
+    by_calibration = np.zeros((n, channels, 6, dimension(blocks)))
+    for rows, beacons in stretches(site, heard):
+        if not len(beacons):
+            continue
+        some = of_beacons(calibration, beacons)
+        own, columns = _own_blocks(blocks, some.site)
+        found = linearize_channels(
+            some,
+            own,
+            time[rows],
+            world_from_body[rows],
+            position_world[rows],
+            None if twist_body is None else twist_body[rows],
+        )
+        into = channels_of(site, beacons)
+        value[rows, into], by_pose[rows, into] = found[:2]
+        spread = np.zeros((*found[2].shape[:-1], by_calibration.shape[-1]))
+        spread[..., columns] = found[2]
+        by_calibration[rows, into] = spread
+    return value, by_pose, by_calibration
+
+
+def _own_blocks(blocks: tuple[Block, ...], site: Site) -> tuple[tuple[Block, ...], list[int]]:
+    """Return the blocks that have a bearing on the beacons of a site, and their columns."""
+    names = {beacon.name for beacon in site.beacons}
+    own: list[Block] = []
+    columns: list[int] = []
+    for block in blocks:
+        if not isinstance(block.parameter, BeaconParameter) or block.owner in names:
+            start, width = len(columns), len(block.sigma)
+            own.append(block._replace(columns=slice(start, start + width)))
+            columns += range(block.columns.start, block.columns.stop)
+    return tuple(own), columns
 
 
 def _stacked(block: ComplexArray) -> Array:

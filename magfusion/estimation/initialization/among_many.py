@@ -1,0 +1,65 @@
+"""A start that was made of the beacons that are heard, as one of the whole site."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.settings import EstimatorSettings
+from magfusion.estimation.state import MOTION, State
+from magfusion.model.parameters import (
+    Block,
+    Calibration,
+    channels_of,
+    dimension,
+    initial_calibration,
+    placed,
+)
+from magfusion.model.prior import prior_sqrt_covariance
+from magfusion.model.site import Site
+from magfusion.units import IntArray
+
+
+def among_all(
+    state: State, known: tuple[Block, ...], site: Site, settings: EstimatorSettings
+) -> State:
+    """Return a state in the tangent of a whole site; what was not heard is as declared.
+
+    Parameters
+    ----------
+    known : tuple of Block
+        Of its tangent, one after the other.
+    """
+    estimated, considered = settings.blocks(site)
+    blocks = (*estimated, *placed(considered, dimension(estimated)))
+    root = np.zeros((dimension(blocks),) * 2)
+    for some, start in ((estimated, 0), (considered, dimension(estimated))):
+        if some:
+            rows = slice(start, start + dimension(some))
+            root[rows, rows] = prior_sqrt_covariance(site, some)
+    cov = np.zeros((MOTION + len(root),) * 2)
+    cov[MOTION:, MOTION:] = root @ root.T
+    own = np.concatenate([np.arange(MOTION), MOTION + _columns(blocks, known)])
+    cov[own] = cov[:, own] = 0.0
+    cov[np.ix_(own, own)] = state.cov
+    return replace(state, calibration=_whole(state, site), cov=cov)
+
+
+def _columns(blocks: tuple[Block, ...], known: tuple[Block, ...]) -> IntArray:
+    """Return where the columns of known blocks are among all."""
+    place = {block.key: block.columns for block in blocks}
+    found = [np.arange(place[b.key].start, place[b.key].stop) for b in known]
+    return np.concatenate([np.zeros(0, dtype=np.int64), *found])
+
+
+def _whole(state: State, site: Site) -> Calibration:
+    """Return the calibration with the beacons that were not heard as the site declares them."""
+    heard, part = state.calibration, state.calibration.site
+    every = initial_calibration(site, heard.reference_time, heard.imu_begin)
+    names = {beacon.name: beacon for beacon in part.beacons}
+    beacons = np.array([k for k, beacon in enumerate(site.beacons) if beacon.name in names])
+    channels = channels_of(site, beacons)
+    phase, drift, log_gain = every.phase.copy(), every.drift.copy(), every.log_gain.copy()
+    phase[channels], log_gain[channels] = heard.phase, heard.log_gain
+    drift[beacons] = heard.drift
+    whole = replace(part, beacons=tuple(names.get(b.name, b) for b in site.beacons), unheard=())
+    return replace(heard, site=whole, phase=phase, drift=drift, log_gain=log_gain)

@@ -1,0 +1,57 @@
+"""What of a site's beacons is predicted, sample by sample: of many those alone that are felt."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.model.audibility import are_many, largest_fields, phasor_sigma
+from magfusion.model.noise import sensor_positions
+from magfusion.model.parameters import Calibration, beacons_of, of_beacons, with_unheard
+from magfusion.model.trajectory import Trajectory
+
+AT_ONCE = 1 << 14  # samples that are predicted at once: what is made of them fits the cache
+AMONG_MANY = 1 << 11  # the same where the beacons that are felt change with the place
+FAINT = 0.3  # sigmas of a phasor: what is never so loud is not felt
+SEEN_EVERY = 64  # samples; in fewer nobody comes nearer by much
+
+
+@dataclass(frozen=True, eq=False)
+class Sending:
+    """The beacons that send.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        Of all, heard or not.
+    least : float, optional
+        Field of one that is felt (T); None where all are predicted.
+    """
+
+    calibration: Calibration
+    least: float | None = None
+
+    @staticmethod
+    def of(calibration: Calibration, window: float) -> "Sending":
+        """Return the beacons of a site for windows of a length (s)."""
+        every = with_unheard(calibration)
+        if not are_many(every.site) or any(b.unknown for b in every.site.beacons):
+            return Sending(calibration)
+        return Sending(every, FAINT * phasor_sigma(every.site, window))
+
+    @property
+    def at_once(self) -> int:
+        """How many samples are predicted at once."""
+        return AT_ONCE if self.least is None else AMONG_MANY
+
+    def along(self, motion: Trajectory) -> Calibration:
+        """Return the calibration of those that are felt along a motion."""
+        if self.least is None:
+            return self.calibration
+        site, few = self.calibration.site, len(motion) <= SEEN_EVERY
+        some = slice(None, None, 1 if few else SEEN_EVERY)
+        poses = Trajectory(
+            motion.time[some], motion.world_from_body[some], motion.position_world[some]
+        )
+        largest = np.max(largest_fields(site, sensor_positions(site, poses)[:, 0]), axis=0)
+        beacons = beacons_of(site, largest > self.least)
+        return of_beacons(self.calibration, beacons if len(beacons) else np.arange(1))

@@ -1,0 +1,80 @@
+"""Fixes among many beacons: each stretch of epochs with those alone that it hears."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from magfusion.estimation.snapshot.fix import Fixes, Gravity
+from magfusion.estimation.snapshot.refine import joined
+from magfusion.model.parameters import Calibration, channels_of, of_beacons, samples_of, stretches
+from magfusion.model.samples import FieldSamples
+from magfusion.units import Array, IntArray
+
+Part = tuple[slice, IntArray, FieldSamples, Calibration, Gravity | None]
+
+
+def parts_heard(
+    samples: FieldSamples, calibration: Calibration, gravity: Gravity | None
+) -> list[Part]:
+    """Return stretches of epochs: rows, beacons, and what is left of the arguments."""
+    site, out = calibration.site, []
+    for rows, heard in stretches(site, samples.valid):
+        beacons = heard if len(heard) else np.zeros(1, dtype=np.int64)
+        some = samples_of(samples.rows(rows), channels_of(site, beacons))
+        known = of_beacons(calibration, beacons)
+        out.append((rows, beacons, some, known, None if gravity is None else gravity.rows(rows)))
+    return out
+
+
+def fix_parts(
+    parts: list[Part],
+    calibration: Calibration,
+    fixed: Callable[[slice, FieldSamples, Calibration, Gravity | None], Fixes],
+) -> Fixes:
+    """Return the fixes of all stretches, with all channels of the site."""
+    site, found = calibration.site, []
+    for rows, beacons, some, known, up in parts:
+        found.append(
+            whole_fixes(fixed(rows, some, known, up), calibration, channels_of(site, beacons))
+        )
+    most = max(fixes.cost.shape[1] for fixes in found)
+    return joined([_with_hypotheses(fixes, most) for fixes in found])
+
+
+def whole_fixes(fixes: Fixes, calibration: Calibration, channels: IntArray) -> Fixes:
+    """Return fixes of some channels as those of all: others are as declared."""
+    values = dict(vars(fixes))
+    for name in ("phase", "log_gain"):
+        every = np.zeros((*fixes.cost.shape, len(calibration.site.channels)))
+        every[..., channels] = getattr(fixes, name)
+        values[name] = every
+    return Fixes(**values)
+
+
+def some_fixes(fixes: Fixes, rows: slice, channels: IntArray) -> Fixes:
+    """Return the fixes of a stretch, of some channels."""
+    values = dict(vars(fixes.rows(rows)))
+    for name in ("phase", "log_gain"):
+        values[name] = values[name][..., channels]
+    return Fixes(**values)
+
+
+def by_beacon(found: list[tuple[Array, IntArray]], beacons: int) -> Array:
+    """Return what is of some beacons at each stretch as of all, zero of others, (n, beacons)."""
+    out = []
+    for own, numbers in found:
+        every = np.zeros((len(own), beacons))
+        every[:, numbers] = own
+        out.append(every)
+    return np.concatenate(out)
+
+
+def _with_hypotheses(fixes: Fixes, count: int) -> Fixes:
+    """Return fixes with more hypotheses, the last repeated at no chance."""
+    known = fixes.cost.shape[1]
+    if known == count:
+        return fixes
+    chosen = np.minimum(np.arange(count), known - 1)
+    values = {k: v if v.ndim == 1 else v[:, chosen] for k, v in vars(fixes).items()}
+    values["cost"][:, known:] = np.inf
+    return Fixes(**values)

@@ -1,0 +1,144 @@
+"""Which beacons are heard where, and what of it is whose where several send on one frequency.
+
+A frequency may be used again where the beacons do not hear each other.  A receiver then finds one
+phasor for all of them: it is taken for that of the loudest, and nobody's where another is heard
+beside it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.model.channel_effects import tone_frequencies
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Beacon, Site
+from magfusion.units import MU0_OVER_4PI, Array, BoolArray, IntArray
+
+MANY = 24  # beacons; of more a job asks which are heard at all
+DROWNED = 0.5  # of a beacon's field: what others on its frequency may add to its phasor
+NEAREST = 0.1  # m; within which no field is foreseen
+
+
+@dataclass(frozen=True, eq=False)
+class Tones:
+    """The frequencies that are sent, each once.
+
+    Parameters
+    ----------
+    frequencies_hz : ndarray, shape (tones,)
+        In the order in which channels name them.
+    of_channel : int ndarray, shape (channels of a magnetometer,)
+    """
+
+    frequencies_hz: Array
+    of_channel: IntArray
+
+    @property
+    def reused(self) -> bool:
+        """Whether any is sent by several beacons."""
+        return len(self.frequencies_hz) < len(self.of_channel)
+
+
+def are_many(site: Site) -> bool:
+    """Return whether a site has so many beacons that those alone are calculated that are heard.
+
+    Of several magnetometers all are calculated at every epoch.
+    """
+    return len(site.beacons) > MANY and not site.platform.further
+
+
+def tones_of(site: Site) -> Tones:
+    """Return the tones of a site; those of time slots are told apart by when they are sent."""
+    frequencies = tone_frequencies(site)
+    if any(slot is not None for beacon in site.beacons for _, slot in beacon.tones):
+        return Tones(frequencies, np.arange(len(frequencies)))
+    _, first, of_channel = np.unique(frequencies, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return Tones(frequencies[first[order]], rank[of_channel])
+
+
+def phasor_sigma(site: Site, window: float) -> float:
+    """Return the noise of a phasor's component in a window (s), as declared (T)."""
+    return float(site.platform.magnetometer.noise_density / np.sqrt(window))
+
+
+def largest_fields(site: Site, sensor_world: Array, margin: Array | float = 0.0) -> Array:
+    """Return what each phasor of a magnetometer does not exceed, shape (n, channels) (T).
+
+    Parameters
+    ----------
+    sensor_world : ndarray, shape (n, 3)
+        (m)
+    margin : ndarray, shape (n, 1), or float
+        How much nearer the beacons may be (m); negative for farther.
+    """
+    places = np.array([beacon.position_world for beacon in site.beacons])
+    owner = [i for i, beacon in enumerate(site.beacons) for _ in beacon.tones]
+    moment = np.concatenate([beacon.tone_moments for beacon in site.beacons])
+    distance = np.linalg.norm(sensor_world[:, None] - places, axis=-1)
+    distance = np.maximum(distance - margin, NEAREST)[:, owner]
+    return np.asarray(2.0 * MU0_OVER_4PI * moment / distance**3)
+
+
+def unheard_by_each_other(a: Beacon, b: Beacon, sigma: float) -> bool:
+    """Return whether neither of two beacons is heard where the other stands, above a noise (T)."""
+    distance = float(np.linalg.norm(a.position_world - b.position_world))
+    moment = max(float(np.max(beacon.tone_moments)) for beacon in (a, b))
+    return 2.0 * MU0_OVER_4PI * moment / max(distance, NEAREST) ** 3 < sigma
+
+
+@dataclass(frozen=True, eq=False)
+class Owned:
+    """Whose the phasors of a tone are.
+
+    Parameters
+    ----------
+    channels : bool ndarray, shape (n, channels)
+        Of the loudest on its frequency, where it drowns the others.
+    others : ndarray, shape (n, channels)
+        What the others on the frequency do to its phasor at most (T).
+    """
+
+    channels: BoolArray
+    others: Array
+
+
+def owned_at(
+    site: Site, sensor_world: Array, margin: Array | float = 0.0, unknown: Array | float = 1.0
+) -> Owned:
+    """Return whose the phasors of a magnetometer are where it is.
+
+    Parameters
+    ----------
+    sensor_world : ndarray, shape (n, 3)
+        (m)
+    margin : ndarray, shape (n, 1), or float
+        By how much those places may be wrong (m).
+    unknown : ndarray, shape (n, channels), or float
+        Share of each one's field that is not foreseen, where what is foreseen was taken off; those
+        that are not heard at the end.
+    """
+    count = len(tone_frequencies(site))
+    site = replace(site, beacons=(*site.beacons, *(b for _, b in site.unheard)), unheard=())
+    tones = tones_of(site)
+    near, far = (largest_fields(site, sensor_world, sign * margin) for sign in (1.0, -1.0))
+    missed = np.broadcast_to(unknown, near.shape) * near
+    of_tone = np.eye(len(tones.frequencies_hz))[tones.of_channel]
+    shared = np.sum(of_tone, axis=0)[tones.of_channel] > 1.0
+    beside = np.where(shared, (near @ of_tone)[:, tones.of_channel] - near, 0.0)
+    others = np.where(shared, (missed @ of_tone)[:, tones.of_channel] - missed, 0.0)
+    # A coil's field is half as strong across its axis as along it.
+    channels = beside <= DROWNED * 0.5 * far
+    return Owned(channels[:, :count], others[:, :count])
+
+
+def only_owned(samples: FieldSamples, owned: Owned) -> FieldSamples:
+    """Return phasors with those missing that are not of one beacon."""
+    added = np.where(owned.channels, owned.others, 0.0) ** 2 / 3.0
+    return replace(
+        samples,
+        phasor_sensor=np.where(owned.channels[..., None], samples.phasor_sensor, np.nan),
+        phasor_cov=samples.phasor_cov + added[..., None, None] * np.eye(3),
+    )

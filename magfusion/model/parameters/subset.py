@@ -1,0 +1,81 @@
+"""A calibration of some of a site's beacons: what many others are need not be calculated."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.model.parameters.parameter import Calibration
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.units import Array, BoolArray, IntArray
+
+TOGETHER = 32  # epochs whose beacons are evaluated at once
+
+
+def channels_of(site: Site, beacons: IntArray) -> IntArray:
+    """Return the channels of some beacons, by their numbers in the site."""
+    return np.flatnonzero(np.isin(site.owner, beacons))
+
+
+def beacons_of(site: Site, channels: BoolArray) -> IntArray:
+    """Return the beacons of which some channel is heard, shape (channels,)."""
+    return np.unique(site.owner[channels])
+
+
+def of_beacons(calibration: Calibration, beacons: IntArray) -> Calibration:
+    """Return the calibration of some beacons alone, in the order of the site."""
+    site, channels = calibration.site, channels_of(calibration.site, beacons)
+    return replace(
+        calibration,
+        site=replace(site, beacons=tuple(site.beacons[k] for k in beacons.tolist())),
+        phase=calibration.phase[..., channels],
+        drift=calibration.drift[beacons],
+        log_gain=calibration.log_gain[..., channels],
+    )
+
+
+def with_unheard(calibration: Calibration) -> Calibration:
+    """Return the calibration with the beacons that are not heard, as the site declares them.
+
+    Of one magnetometer.
+    """
+    site = calibration.site
+    if not site.unheard:
+        return calibration
+    others = tuple(beacon for _, beacon in site.unheard)
+    tones = sum(len(beacon.tones) for beacon in others)
+
+    def longer(values: Array, more: int) -> Array:
+        return np.concatenate([values, np.zeros((*values.shape[:-1], more))], axis=-1)
+
+    return replace(
+        calibration,
+        site=replace(site, beacons=(*site.beacons, *others), unheard=()),
+        phase=longer(calibration.phase, tones),
+        drift=longer(calibration.drift, len(others)),
+        log_gain=longer(calibration.log_gain, tones),
+    )
+
+
+def samples_of(samples: FieldSamples, channels: IntArray) -> FieldSamples:
+    """Return the phasors of some channels."""
+    return replace(
+        samples,
+        channels=tuple(samples.channels[k] for k in channels.tolist()),
+        phasor_sensor=samples.phasor_sensor[:, channels],
+        phasor_cov=samples.phasor_cov[:, channels],
+        ahead=None if samples.ahead is None else samples.ahead[:, channels],
+    )
+
+
+def stretches(site: Site, heard: BoolArray) -> Iterator[tuple[slice, IntArray]]:
+    """Yield epochs that follow each other, with the beacons that are heard at any of them.
+
+    Parameters
+    ----------
+    heard : bool ndarray, shape (n, channels)
+    """
+    for begin in range(0, len(heard), TOGETHER):
+        rows = slice(begin, begin + TOGETHER)
+        yield rows, beacons_of(site, np.asarray(np.any(heard[rows], axis=0)))
