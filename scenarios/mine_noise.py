@@ -37,7 +37,7 @@ class Config:
     seed: int = 0
 
 
-def none(time: Array, rng: np.random.Generator) -> Array:  # noqa: ARG001
+def none(time: Array, _: np.random.Generator) -> Array:
     """Return nothing: white noise is all there is."""
     return np.zeros((len(time), 3))
 

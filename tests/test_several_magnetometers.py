@@ -26,6 +26,7 @@ from magfusion.files.fields import (
 from magfusion.files.site import load_site, save_site
 from magfusion.files.table import Span
 from magfusion.model.parameters import (
+    Block,
     Calibration,
     choose_blocks,
     dimension,
@@ -133,9 +134,9 @@ def test_the_jacobian_is_the_derivative_of_the_prediction() -> None:
         if block.owner == "imu":
             continue
 
-        def moved(step: np.ndarray, block: object = block) -> np.ndarray:
+        def moved(step: np.ndarray, block: Block = block) -> np.ndarray:
             whole = np.zeros(dimension(blocks))
-            whole[block.columns] = step  # type: ignore[attr-defined]
+            whole[block.columns] = step
             return seen(retract(start, blocks, whole), np.zeros(6))
 
         expected = central_difference(moved, len(block.sigma), 1e-6)
