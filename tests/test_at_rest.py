@@ -62,6 +62,7 @@ def test_the_error_is_the_least_there_can_be_and_the_covariance_is_true(
         drift = None if synchronised else rng.normal(0.0, 2e-5, 4)
         rested = at_rest(noisy_log(site, rng, phasor, drift), site)
         assert rested.heard.all()
+        assert [f.code for f in rested.findings] == ["few_data"]  # no IMU tells that it rests
         hertz = np.array([b.frequency_hz for b in site.beacons])
         turns = 0.0 if drift is None else hertz * drift * rested.fields.time[0]
         error = rested.fields.phasor_sensor[0] - phasor * np.exp(2j * np.pi * turns)[..., None] * 1

@@ -14,6 +14,7 @@ from magfusion.errors import InputError
 from magfusion.estimation.demodulated_apart import demodulated_apart, of_site
 from magfusion.estimation.demodulation import phasors
 from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.estimation.warming import at_reference
 from magfusion.files.fields import by_own_clocks, order_channels
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import save_site
@@ -24,8 +25,9 @@ from magfusion.jobs.inputs import Job
 from magfusion.jobs.replay import ReplaySettings
 from magfusion.jobs.replay import run as replay
 from magfusion.model.parameters import initial_calibration, predict_channels
-from magfusion.model.samples import Log
+from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
+from magfusion.model.temperature import SensorWarming
 from magfusion.receiver.windows import LockinSettings, default_settings
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log
@@ -234,3 +236,12 @@ def test_check_judges_each_by_its_name(directory: Path, walk: SimulatedLog) -> N
     assert "Of right:" in json.dumps(dict(found))
     (directory / "site.yaml").unlink()
     assert run_check(CheckSettings(log=directory))["right_gaps"] == 1
+
+
+def test_what_temperature_does_to_one_of_several_is_refused(site: Site) -> None:
+    first = site.platform.magnetometers[0]
+    warm = replace(first, warming=SensorWarming(1e-3 * np.eye(3), np.zeros(3), 20.0))
+    sensors = (warm, *site.platform.further)
+    site = replace(site, platform=site.platform.carrying(sensors))
+    with pytest.raises(InputError, match=f"{first.name}: warming of several magnetometers"):
+        at_reference(Log("warm", 0, "test", ImuSamples.empty()), site)

@@ -155,7 +155,7 @@ def at_rest(
     fields = FieldSamples.joined([part.fields for part in parts])
     chance = np.stack([part.chance for part in parts])
     heard = chance < false_alarm
-    findings = _unheard(fields, heard, site, false_alarm)
+    findings = (*_believed(log), *_unheard(fields, heard, site, false_alarm))
     gain = None
     if log.reference is not None:
         gain = np.array([[tone.gain for tone in part.tones] for part in parts])
@@ -340,6 +340,17 @@ def _chances(single: list[Integrated], site: Site, searches: Mapping[str, Search
         for c in tones:
             own[c] = together
     return np.array(own)
+
+
+def _believed(log: Log) -> tuple[Finding, ...]:
+    """Return that nothing in the log says that the platform rests."""
+    if log.inertial:
+        return ()
+    text = (
+        "The log has no IMU: all of it is taken for one rest. If the platform moved, cut the log"
+        " (--start, --end), or record an IMU beside it."
+    )
+    return (Finding("few_data", text, Verdict.TRUSTWORTHY),)
 
 
 def _unheard(

@@ -8,6 +8,7 @@ from magfusion.estimation.demodulation import phasors
 from magfusion.estimation.drive_reference import referred
 from magfusion.estimation.integrity.mending import mended
 from magfusion.estimation.integrity.recording import passed_on
+from magfusion.estimation.warming import refuse_warm
 from magfusion.files.fields import side_by_side
 from magfusion.model.samples import FieldSamples, Log, Waveform
 from magfusion.model.site import Site
@@ -100,12 +101,7 @@ def demodulated_apart(log: Log, site: Site, lockin: LockinSettings | None = None
     InputError
         Where no window of one is usable, or its temperature matters.
     """
-    warm = [s.name for s in site.platform.magnetometers if s.warming is not None]
-    if warm:
-        raise InputError(
-            f"magnetometer {', '.join(warm)}: warming: is not yet taken off the samples of several"
-            " magnetometers; leave it out of the site"
-        )
+    refuse_warm(site)
     if not has_schedule(site):
         lockin = replace(usual_lockin(site) if lockin is None else lockin, origin=0.0)
     parts: dict[str, FieldSamples] = {}

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from magfusion.errors import InputError
 from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Magnetometer, Site
 from magfusion.model.temperature import MAGNETOMETER, Temperatures
@@ -23,7 +24,13 @@ def at_reference(log: Log, site: Site) -> tuple[Log, Site]:
 
     A site that declares what a temperature changes and a log without it are noticed: the reference
     is taken for it.
+
+    Raises
+    ------
+    InputError
+        As `refuse_warm`.
     """
+    refuse_warm(site)
     known = Temperatures() if log.temperatures is None else log.temperatures
     log = replace(log, noticed=(*log.noticed, *_missing(known, site)))
     site = replace(site, temperatures=known)
@@ -38,6 +45,22 @@ def at_reference(log: Log, site: Site) -> tuple[Log, Site]:
     beacons = known.without(MAGNETOMETER)
     log = replace(log, waveform=wave, fields=fields, temperatures=beacons)
     return log, replace(site, temperatures=beacons)
+
+
+def refuse_warm(site: Site) -> None:
+    """Refuse what temperature does to one of several magnetometers: no record says which it is of.
+
+    Raises
+    ------
+    InputError
+    """
+    several = site.platform.magnetometers if site.platform.further else ()
+    warm = [sensor.name for sensor in several if sensor.warming is not None]
+    if warm:
+        raise InputError(
+            f"platform.magnetometers: {', '.join(warm)}: warming of several magnetometers is not"
+            " taken into account yet; leave it out of the site"
+        )
 
 
 def _missing(known: Temperatures, site: Site) -> Iterator[Finding]:
