@@ -105,7 +105,11 @@ class AtRest:
 
 
 def at_rest(
-    log: Log, site: Site, lockin: LockinSettings | None = None, false_alarm: float = 1e-3
+    log: Log,
+    site: Site,
+    lockin: LockinSettings | None = None,
+    false_alarm: float = 1e-3,
+    least: int = 1,
 ) -> AtRest:
     """Return the rests of a log with a waveform, an epoch each.
 
@@ -115,6 +119,8 @@ def at_rest(
         Length of the pieces, and the mains; chosen by the tones where there is none.
     false_alarm : float
         Probability that a rest without a beacon is taken for one with it.
+    least : int
+        So many epochs are made: where there are fewer rests, each is divided.
 
     Raises
     ------
@@ -135,12 +141,17 @@ def at_rest(
     longest = _coherent(site)
     dropped = Counter[str]()
     parts: list[_Rest] = []
-    for span in rests(log, site):
-        length = _piece(site, usual, lockin, span[1] - span[0])
+    found = rests(log, site)
+    divided = -(-least // max(len(found), 1))
+    for span in found:
+        duration = span[1] - span[0]
+        length, parted = _piece(site, usual, lockin, duration / divided), divided
+        if length is None:
+            length, parted = _piece(site, usual, lockin, duration), 1
         if length is None:
             dropped[TOO_SHORT] += 1
             continue
-        count = int(np.ceil((span[1] - span[0]) / longest))
+        count = max(int(np.ceil(duration / longest)), parted)
         ends = np.linspace(*span, count + 1)
         for begin, end in itertools.pairwise(ends):
             one = (float(begin), float(end))

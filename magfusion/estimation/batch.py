@@ -173,7 +173,7 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
     tuning = settings.tune and log.fixes is None
     time, motion = states.time, log.declared.site.platform.motion
     calm = quiet_before(log.imu, time - calibration.imu_offset(time), motion)
-    standing = np.zeros(len(time), dtype=bool)
+    standing = log.samples.at_rest(time)
     by_waveform = log.fixes is None and log.demodulation.log.waveform is not None
     iterations, done, settled = 0, 0, False
     tuned: tuple[Tuned, ...] = ()

@@ -19,6 +19,7 @@ from magfusion.estimation.measurements.earth import earth_measurement, unheld
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.estimation.measurements.pose_fix import pose_fixes
+from magfusion.estimation.measurements.zero_rate import zero_rate
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.motion_compensation import MotionCompensated
 from magfusion.estimation.preintegration import low_passed_rate_at
@@ -109,6 +110,19 @@ class PreparedLog:
         motion = self.declared.site.platform.motion
         return zero_velocity(np.flatnonzero(standing), motion.rest_speed_sigma)
 
+    def zero_rates(
+        self, standing: BoolArray, time: Array, calibration: Calibration
+    ) -> list[Measurement]:
+        """Return what the gyroscope shows at the epochs of whole rests (s), where there are any."""
+        chosen = np.flatnonzero(standing & self.samples.at_rest(time))
+        if not len(chosen) or not self.declared.site.platform.inertial:
+            return []
+        offset = calibration.imu_offset(time[chosen])
+        noise = self.declared.site.platform.imu.gyro_noise
+        within = self.samples.rest_about(time[chosen])
+        found = zero_rate(chosen, time[chosen], within, self.imu, offset, noise)
+        return [] if found is None else [found]
+
 
 def graph_of(
     log: PreparedLog,
@@ -133,6 +147,7 @@ def graph_of(
     ]
     if standing is not None and np.any(standing):
         measurements.append(log.rests(standing))
+        measurements += log.zero_rates(standing, states.time, calibration)
     if log.fixes is not None:
         measurements.append(_fixes(log, log.fixes))
     else:
@@ -223,6 +238,8 @@ def overlap(samples: FieldSamples) -> float:
         names = dict.fromkeys(samples.magnetometers)
         each = [samples.of_magnetometer(name) for name in names]
         return max((overlap(own) for own in each if len(own) > 1), default=1.0)
+    if samples.of_rests:
+        return 1.0
     return max(1.0, float(np.median(samples.window)) / _step(samples))
 
 

@@ -8,7 +8,12 @@ from magfusion.errors import EstimationError
 from magfusion.estimation.bridged_log import bridged
 from magfusion.estimation.demodulation import Demodulation, demodulated
 from magfusion.estimation.initialization.chain import Start
-from magfusion.estimation.initialization.offline import begin, carried, with_rest_bias
+from magfusion.estimation.initialization.offline import (
+    begin,
+    carried,
+    unbiased,
+    with_rest_bias,
+)
 from magfusion.estimation.integrity.detection import detected, only
 from magfusion.estimation.likeliest import likeliest
 from magfusion.estimation.log_graph import PreparedLog
@@ -78,20 +83,24 @@ def prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) -
     heard = _demodulated(log, site, settings)
     report("finding a start", 1, settings.passes + 3)
     imu, offset = heard.log.imu, heard.calibration.time_offset
+    beginnings = begin(heard.samples, heard.steady, heard.log, heard.calibration)
+    imu = unbiased(imu, heard.samples, offset)
     starts = [
         _with_start(
             heard,
             settings,
             Begun(
                 with_rest_bias(
-                    carried(beginning.states, imu, offset, heard.time), imu, heard.calibration
+                    carried(beginning.states, imu, offset, heard.time),
+                    heard.log.imu,
+                    heard.calibration,
                 ),
                 beginning.declared,
                 beginning.start,
             ),
             beginning.fixes,
         )
-        for beginning in begin(heard.samples, heard.steady, heard.log, heard.calibration)
+        for beginning in beginnings
     ]
     return bridged(likeliest(starts))
 
@@ -125,7 +134,7 @@ def _demodulated(log: Log, site: Site, settings: SmootherSettings) -> _Demodulat
     log = replace(log, imu=calibration.on_log_rate(log.imu))
     if settings.earth:
         steady, samples = demodulation.steady(calibration), only(samples, detected(samples))
-    between = _in_gaps(samples.time, log.imu, calibration.time_offset, site.platform.motion)
+    between = _in_gaps(samples, log.imu, calibration.time_offset, site.platform.motion)
     others = [time for time, _ in settings.measurements]
     time = np.unique(np.concatenate([samples.time, between, *others]))
     return _Demodulated(log, demodulation, samples, steady, time, calibration)
@@ -154,18 +163,22 @@ def _with_start(
     )
 
 
-def _in_gaps(time: Array, imu: ImuSamples, time_offset: float, motion: MotionModel) -> Array:
+def _in_gaps(
+    samples: FieldSamples, imu: ImuSamples, time_offset: float, motion: MotionModel
+) -> Array:
     """Return when states are made where no field comes (s), more of them where the IMU is quiet.
 
     Parameters
     ----------
-    time : ndarray, shape (n,)
-        Of the fields (s).
+    samples : FieldSamples
+        What comes; between whole rests, and in them, nothing does.
     time_offset : float
         (s)
     """
+    time = samples.time
     step, out = np.diff(time), [np.zeros(0)]
-    for k in np.flatnonzero(step > max(LONGEST_STEP, SPARSE * float(np.median(step)))):
+    usual = 0.0 if samples.of_rests else SPARSE * float(np.median(step))
+    for k in np.flatnonzero(step > max(LONGEST_STEP, usual)):
         inner = np.linspace(time[k], time[k + 1], int(np.ceil(step[k] / REST_STEP)) + 1)[1:-1]
         every = np.arange(1, len(inner) + 1) % int(LONGEST_STEP / REST_STEP) == 0
         out.append(inner[every | quiet_before(imu, inner - time_offset, motion)])

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magfusion.errors import InputError
-from magfusion.jobs.settings import Command, LogSettings, RestSettings, WindowSettings
+from magfusion.jobs.rest_settings import RestSettings
+from magfusion.jobs.settings import Command, LogSettings, WindowSettings
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figure, Figures, heading
 

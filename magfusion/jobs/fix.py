@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Literal
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.jobs.region import RegionSettings
-from magfusion.jobs.settings import Command, RestSettings, RiskSettings, WindowSettings, option
+from magfusion.jobs.rest_settings import RestSettings
+from magfusion.jobs.settings import Command, RiskSettings, WindowSettings, option
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figure, Figures, heading
 

@@ -17,10 +17,7 @@ from magfusion.errors import InputError
 from magfusion.model.groups import GROUPS
 
 if TYPE_CHECKING:
-    from magfusion.estimation.at_rest import AtRest
     from magfusion.jobs.inputs import Job
-    from magfusion.model.samples import Log
-    from magfusion.model.site import Site
     from magfusion.model.trust import Risk
     from magfusion.receiver.windows import LockinSettings
 
@@ -299,35 +296,6 @@ class WindowSettings(Settings):
                 f" 60 s; got {distance:g}"
             )
         return LockinSettings(length, distance, self.mains_hz)
-
-
-@dataclass(frozen=True, kw_only=True)
-class RestSettings(Settings):
-    """Whether whole rests are integrated."""
-
-    at_rest: bool = option(
-        False, "Make one epoch of each rest, however long, of beacons far below the noise"
-    )
-    false_alarm: float = option(
-        1e-3,
-        "Of --at-rest: probability, a rest and beacon, that noise is taken for it",
-        least=1e-9,
-        most=0.1,
-    )
-
-    def integrated(self, log: Log, site: Site, lockin: LockinSettings | None) -> AtRest | None:
-        """Return the rests of a log as they are asked for; None where they are not.
-
-        Raises
-        ------
-        InputError
-            As `magfusion.estimation.at_rest.at_rest`.
-        """
-        if not self.at_rest:
-            return None
-        from magfusion.estimation.at_rest import at_rest
-
-        return at_rest(log, site, lockin, self.false_alarm)
 
 
 @dataclass(frozen=True, kw_only=True)

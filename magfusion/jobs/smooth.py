@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from magfusion.errors import EstimationError, InputError
 from magfusion.jobs.rates import RateSettings
 from magfusion.jobs.region import RegionSettings
+from magfusion.jobs.rest_settings import RestSettings
 from magfusion.jobs.settings import (
     Command,
     EarthSettings,
@@ -23,6 +24,7 @@ from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figure, Figures, Section, heading
 
 if TYPE_CHECKING:
+    from magfusion.estimation.at_rest import AtRest
     from magfusion.estimation.batch import Smoothed, SmootherSettings
     from magfusion.jobs.inputs import Job
     from magfusion.model.samples import Log
@@ -39,6 +41,7 @@ class SmoothSettings(
     LogsSettings,
     RegionSettings,
     WindowSettings,
+    RestSettings,
     EarthSettings,
     EstimateSettings,
     RiskSettings,
@@ -65,6 +68,16 @@ class SmoothSettings(
             raise InputError("--earth needs the phasors themselves; leave --coupling loose out")
         if self.free not in (None, "gain"):
             raise InputError(f"--free {self.free!r}: smooth frees gain alone; write --free gain")
+        if self.at_rest and self.more:
+            raise InputError(
+                "--at-rest integrates one log; make phasors of each with magfusion demodulate"
+                " --at-rest, and smooth these together"
+            )
+        if self.at_rest and (self.earth or self.free):
+            raise InputError(
+                "--at-rest gives phasors of whole rests, which know nothing of the Earth field nor"
+                " of a common gain; leave --earth and --free out"
+            )
         if self.free and self.more:
             raise InputError("--free gain is found in one log; smooth the logs one by one")
 
@@ -96,7 +109,8 @@ def run(settings: SmoothSettings, output: Path, report: Report = quiet) -> Figur
         parts = settings, smoother, output, report
         return run_joint("smooth", *parts, rate=settings.rates, risk=settings.risks)
     gain, rate, risk = settings.free is not None, settings.rates, settings.risks
-    return run_smooth(job, smoother, rate=rate, risk=risk, free_gain=gain, report=report)
+    rest = settings if settings.at_rest else None
+    return run_smooth(job, smoother, rate=rate, risk=risk, free_gain=gain, rest=rest, report=report)
 
 
 def run_smooth(
@@ -106,6 +120,7 @@ def run_smooth(
     rate: Rate = "field",
     risk: Risk | None = None,
     free_gain: bool = False,
+    rest: RestSettings | None = None,
     report: Report = quiet,
 ) -> Figures:
     """Smooth a log: trajectory, refined site, report and recording.
@@ -119,12 +134,15 @@ def run_smooth(
         What the protection levels promise.
     free_gain : bool
         Whether the gain of a receiver of one axis is begun where single epochs find it.
+    rest : RestSettings, optional
+        By which whole rests are integrated, in place of windows.
 
     Raises
     ------
     InputError, EstimationError
         In the latter case the single-epoch fixes have been saved in the output directory.
     """
+    from magfusion.estimation.integrity.recording import beyond
     from magfusion.estimation.self_survey import smooth_and_place
     from magfusion.estimation.solve.memory import give_back_memory
     from magfusion.jobs.failure import reason_of
@@ -132,11 +150,23 @@ def run_smooth(
     from magfusion.jobs.rates import refuse_rate
     from magfusion.jobs.smooth_result import finished, with_errors, write_finished
     from magfusion.results.report import FAILED
+    from magfusion.results.rest_figures import rest_figures
 
     claimed = claim(job.output, "smooth", "fix")
     log, site = read_job(
-        job, unknown=True, fewer=True, several=True, lockin=settings.lockin, report=report
+        job,
+        unknown=True,
+        fewer=rest is None,
+        several=True,
+        lockin=settings.lockin,
+        reference=rest is not None,
+        heard=rest is None,
+        report=report,
     )
+    rested, recording = None, log
+    if rest is not None:
+        rested = _rested(job, log, site, rest, settings)
+        log = rested.log(log)
     refuse_rate(job.log_path, log, rate)
     if free_gain:
         site = _with_gain(job, log, site, settings)
@@ -160,14 +190,39 @@ def run_smooth(
             f"{job.log_path}: {told}; the single-epoch fixes were saved in {job.output / FAILED}"
         ) from error
     give_back_memory()
+    if rested is not None:
+        said += beyond(recording, log, site)
     done = finished(log, site, settings, result, risk, said=said)
     elapsed = Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     done = replace(done, figures=done.figures | elapsed)
+    if rested is not None:
+        done = replace(done, figures=done.figures | rest_figures(rested))
     done = with_errors(done, log, placed, (site, settings))
     with claimed as whole:
         write_finished(whole, log, done, rate=rate)
     refuse_failed(job.log_path, output=job.output, trust=done.trust)
     return done.figures
+
+
+def _rested(
+    job: Job, log: Log, site: Site, rest: RestSettings, settings: SmootherSettings
+) -> AtRest:
+    """Return the rests of a log, of which at least one beacon is heard in any."""
+    import numpy as np
+
+    from magfusion.jobs.inputs import named
+
+    if site.platform.further:
+        raise InputError(
+            f"{job.declared_path}: --at-rest integrates the samples of one magnetometer; leave it"
+            " out, or give a site of the one to integrate"
+        )
+    with named(job.log_path):
+        rested = rest.integrated(log, site, settings.lockin, least=2)
+    assert rested is not None
+    if not np.any(rested.heard):
+        raise EstimationError(f"{job.log_path}: {rested.findings[-1].text}")
+    return rested
 
 
 def _with_gain(job: Job, log: Log, site: Site, settings: SmootherSettings) -> Site:

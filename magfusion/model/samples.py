@@ -14,6 +14,8 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
+LONGEST_IN_MOTION = 5.0  # s; of a window, unless the platform rests
+
 
 @dataclass(frozen=True, eq=False)
 class ImuSamples:
@@ -121,6 +123,27 @@ class FieldSamples:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @property
+    def of_rests(self) -> bool:
+        """Whether each epoch is a whole rest: long, and without a part of any other."""
+        if len(self) == 0 or float(np.max(self.window)) <= LONGEST_IN_MOTION:
+            return False
+        end, begin = self.time + 0.5 * self.window, self.time - 0.5 * self.window
+        return bool(np.all(begin[1:] >= end[:-1] - 1e-6))
+
+    def at_rest(self, time: Array) -> BoolArray:
+        """Tell which times lie in a whole rest that is an epoch, shape (n,)."""
+        if not self.of_rests:
+            return np.zeros(len(time), dtype=bool)
+        begin, end = self.rest_about(time)
+        return np.asarray((time >= begin - 1e-6) & (time <= end + 1e-6))
+
+    def rest_about(self, time: Array) -> tuple[Array, Array]:
+        """Return beginning and end of the whole rest that is nearest after times, or last (s)."""
+        end = self.time + 0.5 * self.window
+        at = np.minimum(np.searchsorted(end, time - 1e-6), len(self) - 1)
+        return end[at] - self.window[at], end[at]
 
     @staticmethod
     def empty(channels: tuple[tuple[str, int], ...]) -> "FieldSamples":

@@ -20,6 +20,7 @@ from magfusion.estimation.initialization.chain import (
 )
 from magfusion.estimation.initialization.search import Found, can_search, search
 from magfusion.estimation.integrity.fix_separation import separate_fixes
+from magfusion.estimation.measurements.zero_rate import freed_of_bias
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.parameters import Calibration
@@ -81,7 +82,8 @@ def begin(
     fixes = fix_epochs(epochs, calibration, gravity=gravity)
     # A beacon that fell silent, or is false, would lead the chain astray.
     fixes = separate_fixes(epochs, calibration, fixes, gravity=gravity).fixes
-    imu, offset = log.imu, calibration.time_offset
+    offset = calibration.time_offset
+    imu = unbiased(log.imu, samples, offset)
     chains = choose_chains(fixes, imu, offset, calibration.site)
     everywhere = len(fixes) == len(samples)
     out = []
@@ -94,6 +96,14 @@ def begin(
         for found in search(epochs, fixes, still, calibration):
             out.append(_tracked(found, fixes, imu, calibration, samples.time))
     return out
+
+
+def unbiased(imu: ImuSamples, samples: FieldSamples, time_offset: float) -> ImuSamples:
+    """Return an inertial stream without the rate that it shows in whole rests, where those are."""
+    if not samples.of_rests:
+        return imu
+    half, stamps = 0.5 * samples.window, samples.time - time_offset
+    return freed_of_bias(imu, stamps - half, stamps + half)
 
 
 def _doubtful(chains: tuple[Start, ...]) -> bool:

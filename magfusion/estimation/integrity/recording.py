@@ -121,6 +121,12 @@ def beginning(log: Log, span: float = LONGEST) -> Log:
     return log
 
 
+def beyond(recording: Log, used: Log, site: Site) -> tuple[Finding, ...]:
+    """Return what a recording says against itself that is not seen in what was made of it."""
+    known = recorded(used, site, BRIDGED)
+    return tuple(f for f in recorded(recording, site, BRIDGED) if f not in known)
+
+
 def passed_on(log: Log, site: Site) -> Trust:
     """Return what is to be said of a log whose fields are only put in another form.
 

@@ -1,0 +1,104 @@
+"""Zero rate: in a whole rest the gyroscope shows nothing but its bias.
+
+Between two epochs that are hours apart nothing else tells a bias from a turn.  The same noise is in
+the inertial stream between the states: what it claims of the turn within a rest is too much, never
+too little.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.estimation.measurements.measurement import Measurement, Rows
+from magfusion.estimation.state import States
+from magfusion.model.parameters import Block, Calibration
+from magfusion.model.samples import ImuSamples
+from magfusion.units import Array, IntArray
+
+LONGEST_MEAN = 2.0  # s
+
+
+@dataclass(frozen=True, eq=False)
+class ZeroRate(Measurement):
+    """The gyroscope's bias is what it shows.
+
+    Parameters
+    ----------
+    measured_body : ndarray, shape (n, 3)
+        (rad/s)
+    sigma : ndarray, shape (n,)
+        (rad/s)
+    """
+
+    measured_body: Array
+    sigma: Array
+
+    def linearize(
+        self,
+        states: States,
+        calibration: Calibration,
+        blocks: tuple[Block, ...],
+    ) -> Rows:
+        """Return the rows at an estimate, one group of three."""
+        weight = 1.0 / self.sigma[:, None, None]
+        error = weight * (states.read_bias()[:, 3:] - self.measured_body)[:, None]
+        by_bias = np.zeros((len(self.sigma), 1, 3, 6))
+        by_bias[..., 3:] = weight[..., None] * np.eye(3)
+        return Rows(error=error, by_bias=by_bias)
+
+
+def zero_rate(
+    epoch: IntArray,
+    time: Array,
+    within: tuple[Array, Array],
+    imu: ImuSamples,
+    time_offset: Array,
+    noise: float,
+) -> ZeroRate | None:
+    """Return what a gyroscope shows about some epochs of rests; None where it is silent.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Of the epochs, increasing (s).
+    within : tuple of ndarray, shape (n,)
+        Beginning and end of the rest that each lies in (s).
+    time_offset : ndarray, shape (n,)
+        Of the IMU's stamps then (s).
+    noise : float
+        Density of the gyroscope's noise (rad/s/sqrt(Hz)).
+    """
+    if len(time) == 0 or len(imu) == 0:
+        return None
+    gap = np.diff(time, prepend=-np.inf, append=np.inf)
+    half = 0.5 * np.minimum(LONGEST_MEAN, np.minimum(gap[:-1], gap[1:]))
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.gyro_body, axis=0)])
+    begin, end = np.maximum(time - half, within[0]), np.minimum(time + half, within[1])
+    first, last = (np.searchsorted(imu.time, one - time_offset) for one in (begin, end))
+    some = last > first
+    if not np.any(some):
+        return None
+    count = (last - first)[some]
+    mean = (total[last] - total[first])[some] / count[:, None]
+    step = float(np.median(np.diff(imu.time))) if len(imu) > 1 else LONGEST_MEAN
+    return ZeroRate(epoch[some], mean, noise / np.sqrt(count * step))
+
+
+def freed_of_bias(imu: ImuSamples, begin: Array, end: Array) -> ImuSamples:
+    """Return inertial samples whose mean rate is zero in each of some rests, and goes between.
+
+    Parameters
+    ----------
+    begin, end : ndarray, shape (rests,)
+        By the IMU's stamps (s).
+    """
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(imu.gyro_body, axis=0)])
+    first, last = np.searchsorted(imu.time, begin), np.searchsorted(imu.time, end)
+    some = last > first
+    if not np.any(some):
+        return imu
+    mean = (total[last] - total[first])[some] / (last - first)[some, None]
+    edge = np.stack([begin[some], end[some]], axis=1).ravel()
+    each = np.repeat(mean, 2, axis=0)
+    bias = np.stack([np.interp(imu.time, edge, value) for value in each.T], axis=1)
+    return ImuSamples(imu.time, imu.gyro_body - bias, imu.accel_body)

@@ -1,0 +1,50 @@
+"""Options of the jobs that integrate whole rests."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from magfusion.jobs.settings import Settings, option
+
+if TYPE_CHECKING:
+    from magfusion.estimation.at_rest import AtRest
+    from magfusion.model.samples import Log
+    from magfusion.model.site import Site
+    from magfusion.receiver.windows import LockinSettings
+
+
+@dataclass(frozen=True, kw_only=True)
+class RestSettings(Settings):
+    """Whether whole rests are integrated."""
+
+    at_rest: bool = option(
+        False, "Make one epoch of each rest, however long, of beacons far below the noise"
+    )
+    false_alarm: float = option(
+        1e-3,
+        "Of --at-rest: probability, a rest and beacon, that noise is taken for it",
+        least=1e-9,
+        most=0.1,
+    )
+
+    def integrated(
+        self, log: Log, site: Site, lockin: LockinSettings | None, least: int = 1
+    ) -> AtRest | None:
+        """Return the rests of a log as they are asked for; None where they are not.
+
+        Parameters
+        ----------
+        least : int
+            So many epochs are made, at the least.
+
+        Raises
+        ------
+        InputError
+            As `magfusion.estimation.at_rest.at_rest`.
+        """
+        if not self.at_rest:
+            return None
+        from magfusion.estimation.at_rest import at_rest
+
+        return at_rest(log, site, lockin, self.false_alarm, least)
