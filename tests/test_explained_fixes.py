@@ -5,13 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from test_gain_spread import error, scaled
+from tracker_site import body_poses, tracker_site
 
 from magfusion.estimation.integrity.explained_fixes import ExplainedFixes, explained_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Verdict
+from magfusion.simulation.log import simulate_fields
 from magfusion.simulation.worlds import S0, draw_world, ring
 
 TARGETS = 40
@@ -104,3 +107,18 @@ def test_a_survey_that_gains_do_not_explain_stays_in_doubt_without_them(
 def test_too_few_epochs_free_nothing(room: tuple[Site, FieldSamples, np.ndarray]) -> None:
     site, samples, _ = room
     assert explained(site, scattered(samples).rows(slice(0, 6))).gain_spread == 0.0
+
+
+def test_the_gain_of_a_lone_beacon_is_its_range_and_stays_held() -> None:
+    rng = np.random.default_rng(4)
+    site = tracker_site(rng, gain=0.0, tilt=0.0, centre=0.0)
+    turn, place = body_poses(site, TARGETS, rng)
+    samples = simulate_fields(site, Trajectory(np.arange(float(TARGETS)), turn, place), 1e-12, rng)
+    coupling = 0.03 * np.abs(samples.phasor_sensor).max(axis=(1, 2), keepdims=True)
+    false = samples.phasor_sensor + coupling * rng.standard_normal(samples.phasor_sensor.shape)
+    found = explained(site, replace(samples, phasor_sensor=false))
+    assert "field_residuals" in codes(found)
+    assert found.gain_spread == 0.0
+    away = np.linalg.norm(found.fixes.position_world - place[:, None], axis=2)
+    # Of the mirrors the nearer: a lone beacon has both.
+    assert np.sqrt(np.mean(np.min(away, axis=1) ** 2)) < 0.02

@@ -396,3 +396,21 @@ def test_a_foreign_table_brings_the_slot_beside_its_samples(tmp_path: Path) -> N
     assert found.marks is not None
     assert found.marks.slot.tolist() == [0, 1, SILENT, 2]
     assert len(found) == 40
+
+
+def test_what_hum_leaves_of_pulses_is_in_their_covariance() -> None:
+    marks = _marks(1.0)
+    waveform = _waveform(marks, 1.0, 0.0)
+    rng = np.random.default_rng(17)
+    # A line that nobody foretells: its phase walks within a few cycles.
+    phase = 2.0 * np.pi * 170.0 * waveform.time
+    phase += np.cumsum(0.05 * rng.standard_normal(len(phase)))
+    line = 2e-8 * np.cos(phase)[:, None] * [0.6, 0.0, 0.8]
+    for beside in (0.0, 1.0):
+        wave = replace(waveform, measured_sensor=waveform.measured_sensor + beside * line)
+        found, _ = received(wave, _still(2.0), _site(0.0))
+        channel, rows = np.argmax(found.valid, axis=1), np.arange(len(found))
+        error = (found.phasor_sensor[rows, channel] - COUPLING[channel]).real
+        cov = found.phasor_cov[rows, channel]
+        nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(cov), error)
+        assert 1.5 < np.mean(nees) < 6.0

@@ -148,8 +148,10 @@ def test_a_site_keeps_the_axes_of_its_receiver(log: Path, tmp_path: Path) -> Non
 
 
 def test_other_jobs_refuse_it_in_a_sentence(log: Path, tmp_path: Path, refuse: Refuse) -> None:
+    said = refuse("demodulate", log, "-o", tmp_path / "run")
+    assert said
     said = refuse("smooth", log, "-o", tmp_path / "run")
-    assert "amplitudes without sign are located by fix alone" in said
+    assert "platform.motion_prior" in said
 
 
 def test_amplitudes_of_two_axes_are_refused_in_a_sentence(

@@ -18,6 +18,7 @@ from magfusion.estimation.measurements.field_error import field_errors
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors, alone
 from magfusion.estimation.measurements.pose_fix import survey_response
+from magfusion.estimation.measurements.signs import count_open
 from magfusion.estimation.measurements.zero_velocity import may_stand, quiet_before
 from magfusion.estimation.noise_tuning import Tuned, as_declared, noise_of, plausible, with_noise
 from magfusion.estimation.noise_tuning import settled as same_noise
@@ -26,7 +27,6 @@ from magfusion.estimation.relaxation import Step, part_of_the_way
 from magfusion.estimation.settings import SmootherSettings as SmootherSettings
 from magfusion.estimation.solve.bordered import Optimised, eliminate, marginal, optimise
 from magfusion.estimation.solve.memory import give_back_memory
-from magfusion.model.noise import twice
 from magfusion.model.parameters import Block, Calibration, placed
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import FieldSamples, Log
@@ -92,6 +92,8 @@ class Smoothed:
         What one sigma of the survey does to every pose alike, with loose coupling.
     noise : tuple of Tuned
         What was found of noise and model error; the site of ``calibration`` has it.
+    open_signs : int
+        Amplitudes that the last pass left out, since their sign was open.
     standing : bool ndarray, shape (states,)
         Where the platform stands.
     """
@@ -121,6 +123,7 @@ class Smoothed:
     earth_disturbed: BoolArray | None = None
     fix_response: Array | None = None
     noise: tuple[Tuned, ...] = ()
+    open_signs: int = 0
     field_errors: tuple[Block, ...] = ()
     calibration_response: Array = field(default_factory=lambda: np.zeros((0, 0)))
     standing: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
@@ -170,7 +173,7 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
     states, calibration, wave = log.states, log.declared, None
     segments: tuple[Calibration, ...] = ()
     declared = log.declared.site
-    tuning = settings.tune and log.fixes is None
+    tuning = settings.tune and log.fixes is None and log.samples.signed
     time, motion = states.time, log.declared.site.platform.motion
     calm = quiet_before(log.imu, time - calibration.imu_offset(time), motion)
     standing = log.samples.at_rest(time)
@@ -182,6 +185,8 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
         report(f"pass {done + 1}", done + 2, settings.passes + 3)
         if done > 0 and by_waveform:
             wave = log.compensated(calibration, states)
+        elif not log.samples.signed:
+            wave = log.with_signs(calibration, states, first=done == 0)
         graph, gaps = graph_of(log, states, calibration, wave, standing)
         found = optimise(graph, initial_estimate(states, calibration, segments))
         after = read_states(found.estimate.values, time)
@@ -299,7 +304,7 @@ def posterior(
         pose_cov = pose_cov + response @ np.swapaxes(response, 1, 2)
     left = {type(m): graph.residual(m, estimate) for m in map(alone, graph.measurements)}
     error = left.get(FieldPhasors, np.nan)
-    residual = np.where(twice(samples.there), error, np.full(6, np.nan))
+    residual = np.where(samples.told, error, np.nan)
     earth_field = next((m for m in graph.measurements if isinstance(m, EarthField)), None)
     earth = None if earth_field is None else left[EarthField][:, 0]
     return Smoothed(
@@ -318,6 +323,7 @@ def posterior(
         rival_chi_square=log.rival_chi_square,
         rival=log.rival,
         dropped=log.demodulation.dropped,
+        open_signs=count_open(log.samples, samples),
         bridged=gaps,
         cost=found.cost,
         passes=1,

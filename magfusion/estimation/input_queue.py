@@ -15,6 +15,7 @@ from magfusion.estimation.measurements.earth import EarthField, earth_measuremen
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.model_error import alike_online
 from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
+from magfusion.estimation.measurements.signs import OPEN_SIGN, count_open, with_signs
 from magfusion.estimation.measurements.zero_velocity import (
     REACH,
     may_stand,
@@ -94,6 +95,8 @@ class Arrivals:
         When fields were last measured (s).
     unseen : int
         Windows in which the inertial stream is silent.
+    open_signs : int
+        Amplitudes that were left out because nothing tells their sign.
     frozen : int
         Inertial samples that were left out because the IMU hung.
     stand_in : StandIn
@@ -112,6 +115,7 @@ class Arrivals:
     _heard_by: dict[str, float]  # when each of several magnetometers was last heard (s)
     last_epoch: float
     unseen: int
+    open_signs: int
     frozen: int
     stand_in: StandIn
     _gyro: Freeze
@@ -134,7 +138,7 @@ class Arrivals:
         self.usual = self._window = None
         self.last_epoch = -np.inf
         self._detection = DetectionFilter()
-        self.unseen, self.stand_in = 0, StandIn()
+        self.unseen, self.stand_in, self.open_signs = 0, StandIn(), 0
         self.frozen, self._gyro, self._accel = 0, Freeze(), Freeze()
         self._noise, self._noise_unseen = [], False
         self._heard_by = {}
@@ -255,6 +259,7 @@ class Arrivals:
         frozen = {"imu sample of a sensor that hung": self.frozen} if self.frozen else {}
         late = {f"{b.name} sample too late": b.late for b in (self.imu, self.waveform) if b.late}
         unseen = {"window without inertial samples": self.unseen} if self.unseen else {}
+        unseen |= {OPEN_SIGN: self.open_signs} if self.open_signs else {}
         return {
             **{f"window: {k}": v for k, v in self.receiver.dropped.items()},
             **unseen,
@@ -417,6 +422,10 @@ class Arrivals:
             samples, steady, by_offset = wave.fields, wave.steady, wave.by_time_offset
         own = step if not samples.magnetometers else self._own_step(samples)
         samples = self._detection.of(samples, own)
+        if not samples.signed:
+            here, found = as_trajectory([predicted]), samples
+            samples = with_signs(samples, here, predicted.calibration)
+            self.open_signs += count_open(found, samples)
         if not np.any(samples.valid) and not (earth and steady is not None):
             return None
         self.last_epoch = time

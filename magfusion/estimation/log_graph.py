@@ -19,6 +19,7 @@ from magfusion.estimation.measurements.earth import earth_measurement, unheld
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.estimation.measurements.pose_fix import pose_fixes
+from magfusion.estimation.measurements.signs import with_signs
 from magfusion.estimation.measurements.zero_rate import zero_rate
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.motion_compensation import MotionCompensated
@@ -104,6 +105,13 @@ class PreparedLog:
         if hidden is not None and np.any(hidden):
             heard = heard | hidden & above_noise(wave.fields, DETECTION_CHI_SQUARE_ONLINE)
         return replace(wave, fields=only(wave.fields, heard))
+
+    def with_signs(
+        self, calibration: Calibration, states: Trajectory, *, first: bool
+    ) -> MotionCompensated:
+        """Return amplitudes with the signs that states give them, as if motion were taken off."""
+        here = self.at_fields(states)
+        return MotionCompensated.of_slots(with_signs(self.samples, here, calibration, first=first))
 
     def rests(self, standing: BoolArray) -> Measurement:
         """Return the zero velocities of some epochs."""
@@ -205,6 +213,8 @@ def _fields(
     """Return the phasors, and the Earth field where it is measured."""
     samples = log.samples if wave is None else wave.fields
     here, site = log.at_fields(states), calibration.site
+    if not samples.signed:
+        samples = with_signs(samples, here, calibration, every=wave is None)
     assert here.gyro_bias_body is not None
     imu = calibration.on_log_rate(corrected_imu(calibration, log.blocks, log.imu))
     rate_body = low_passed_rate_at(imu, calibration.time_offset, samples.time)

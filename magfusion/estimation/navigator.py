@@ -27,6 +27,7 @@ from magfusion.estimation.integrity.resets import Resets
 from magfusion.estimation.integrity.summary import Summary
 from magfusion.estimation.measurements.earth import check_earth
 from magfusion.estimation.measurements.measurement import Measurement
+from magfusion.estimation.measurements.signs import along_axis
 from magfusion.estimation.navigator_data import navigator_rules
 from magfusion.estimation.navigator_settings import NavigatorSettings as NavigatorSettings
 from magfusion.estimation.process_noise import calibration_process_noise
@@ -209,6 +210,7 @@ class Navigator:
             Where the clock jumped.
         """
         known, sensor = self.site.temperatures, self.site.platform.magnetometer
+        samples = along_axis(samples, self.site)
         if sensor.lacking:
             phasor = samples.phasor_sensor.copy()
             phasor[..., sensor.lacking] = np.nan

@@ -410,6 +410,8 @@ def fields_content(samples: FieldSamples) -> dict[str, Any]:
     """Return the phasors of one window as a record, each with its covariance."""
     if samples.magnetometers:
         raise InputError("the pipe takes fields of one magnetometer; navigate the log itself")
+    if not samples.signed:
+        raise InputError("the pipe takes phasors, and no amplitudes; navigate the log itself")
     phasors: dict[str, list[Any]] = {}
     covariance: dict[str, list[Any]] = {}
     tones: dict[str, dict[int, int]] = {}

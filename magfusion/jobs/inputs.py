@@ -14,6 +14,7 @@ from magfusion.estimation.drive_reference import turning_currents, with_drives
 from magfusion.estimation.hearing import heard_site
 from magfusion.estimation.integrity.magnetometers import without_silent
 from magfusion.estimation.integrity.mending import mended
+from magfusion.estimation.measurements.signs import along_axis
 from magfusion.estimation.warming import at_reference
 from magfusion.files.atomic import (
     abandoned_pattern,
@@ -326,7 +327,7 @@ def read_job(
         log, site = without_silent(replace(found.log, noticed=noticed), site)
     elif log.fields is not None:
         with named(job.log_path):
-            log = replace(log, fields=order_channels(log.fields, site))
+            log = replace(log, fields=along_axis(order_channels(log.fields, site), site))
         log, site = without_silent(log, site)
     with named(job.log_path):
         if not rotor:
@@ -388,8 +389,8 @@ def _check_axes(job: Job, log: Log, site: Site, *, fewer: bool, amplitudes: bool
         three_axes(site, job.declared_path)
     if fields is not None and not fields.signed and not amplitudes:
         raise InputError(
-            f"{job.log_path}: amplitudes without sign are located by fix alone; run magfusion fix,"
-            " or give phasors (re and im)"
+            f"{job.log_path}: amplitudes without sign are taken by fix, smooth and navigate alone;"
+            " run one of these, or give phasors (re and im)"
         )
 
 

@@ -220,7 +220,13 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
             claim_checkpoint(path)
     # As of a stream: which beacons will be heard is not known beforehand.
     log, site = read_job(
-        job, fewer=True, several=True, lockin=navigator.lockin, heard=False, report=report
+        job,
+        fewer=True,
+        amplitudes=True,
+        several=True,
+        lockin=navigator.lockin,
+        heard=False,
+        report=report,
     )
     refuse_rate(job.log_path, log, settings.rates)
     with named(job.log_path):

@@ -157,6 +157,7 @@ def run_smooth(
         job,
         unknown=True,
         fewer=rest is None,
+        amplitudes=rest is None,
         several=True,
         lockin=settings.lockin,
         reference=rest is not None,

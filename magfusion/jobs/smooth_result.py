@@ -24,7 +24,7 @@ from magfusion.jobs.failure import reason_of
 from magfusion.jobs.inputs import found_in
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
-from magfusion.model.trust import Finding, Risk, StateTrust, Trust
+from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict
 from magfusion.results.errors import TrajectoryErrors, trajectory_errors
 from magfusion.results.figures import Column, Figure, Figures, Section, heading
 from magfusion.results.page_motion import Motion
@@ -83,6 +83,7 @@ def finished(
     """
     separated = separated_smooth(result, risk)
     result, trust = judged(separated.result, log)
+    trust |= Trust(open_signs(result))
     if excess > 1.0 and result.states.pose_cov is not None:
         wider = excess * result.states.pose_cov
         result = replace(result, states=replace(result.states, pose_cov=wider))
@@ -95,6 +96,18 @@ def finished(
     )
     figures |= smoothed_figures(result) | level_figures(by_state)
     return Finished(result, trust, by_state, figures, None)
+
+
+def open_signs(result: Smoothed) -> tuple[Finding, ...]:
+    """Return what is to be said of amplitudes that were left out."""
+    if not result.open_signs:
+        return ()
+    given = result.open_signs + int(np.sum(result.fields.valid))
+    text = (
+        f"{result.open_signs} of {given} amplitudes are too near zero where the trajectory passes"
+        " for their sign to be known; they were left out."
+    )
+    return (Finding("sign_open", text, Verdict.TRUSTWORTHY),)
 
 
 def with_errors(

@@ -95,7 +95,8 @@ class FieldSamples:
     axes : str
         Components that the receiver has; the others are NaN.
     signed : bool
-        False of amplitudes without sign and phase: real, of the one axis.
+        False of amplitudes, whose sign and phase, if any, are those of a prediction: of the one
+        axis.
     magnetometers : tuple of str
         Name of the one that measures each channel; empty where there are not several.
     """
@@ -227,7 +228,16 @@ class FieldSamples:
     @property
     def numbers(self) -> IntArray:
         """How many real numbers of each channel each row holds, shape (n, channels)."""
-        return 2 * np.sum(self.there, axis=2)
+        return (2 if self.signed else 1) * np.sum(self.there, axis=2)
+
+    @property
+    def told(self) -> BoolArray:
+        """Which real, then imaginary, parts each row tells, shape (n, channels, 6).
+
+        An amplitude tells one part, in the place of the real one.
+        """
+        there = self.there
+        return np.concatenate([there, there & self.signed], axis=2)
 
 
 @dataclass(frozen=True, eq=False)

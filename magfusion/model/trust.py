@@ -111,6 +111,7 @@ CODES = {
     "samples_lost": "samples are missing, one or a few at a time",
     "saturated": "samples stop at a limit of the instrument's range",
     "separation": "leaving a beacon out moves the pose by more than noise and survey explain",
+    "sign_open": "amplitudes near zero, whose sign nothing tells, were left out",
     "silent_beacon": "a beacon is not heard, at all or for a while",
     "streams_apart": "inertial sensor and magnetometer were not recorded at the same time",
     "stuck_axis": "an axis stands still",

@@ -205,6 +205,7 @@ def _uneven(
     index = np.clip(first, 0, len(silent) - number)[:, None] + np.arange(number)
     elapsed = silent[index] - driven[:, None]
     near = np.abs(elapsed) <= np.maximum(FARTHEST, FARTHEST_BURSTS * driven_length)[:, None]
+    near &= elapsed != 0.0  # a silent burst that is asked of tells nothing of itself
     span = np.max(np.abs(elapsed) * near, axis=1, keepdims=True)
     ramp = np.where(np.sum(near, axis=1, keepdims=True) > 1, elapsed / np.maximum(span, 1e-9), 0.0)
     columns = [np.ones_like(elapsed), ramp]

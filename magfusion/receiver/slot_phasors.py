@@ -15,6 +15,7 @@ from magfusion.model.samples import FieldSamples, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.admission import Windows
 from magfusion.receiver.ambient import ambient_weights, removed, uneven_weights
+from magfusion.receiver.ambient_left import left_by_ambient
 from magfusion.receiver.noise import smoothed_over_windows
 from magfusion.receiver.slots import (
     NOISE_CYCLES,
@@ -163,8 +164,8 @@ def demodulate_slots(
     -------
     samples : FieldSamples
         A row for each driven slot with silent ones beside it, at the mean time of its samples, with
-        one channel.  The covariance holds the noise of the slot and of what was taken off, not what
-        hum leaves.
+        one channel.  The covariance holds the noise of the slot and of what was taken off; what
+        hum leaves beside that of marked pulses alone, whose silences tell it.
     number : int ndarray, shape (n,)
         The slot of each row.
     """
@@ -182,7 +183,12 @@ def demodulate_slots(
     variance = values.variance[kept] * (1.0 + np.maximum(np.sum(weight**2, axis=1), shared))
     phasor = _applied(turn[kept], value[usable])
     found = _rows(site, values.time[kept], values.length[kept], owner[place[kept]], phasor)
-    cov = variance[:, None, None] * (turn[kept] @ noise[kept] @ np.swapaxes(turn[kept], 1, 2))
+    still_cov = variance[:, None, None] * noise[kept]
+    if is_marked(site) and is_pulsed(site) and settings.removal != "none":
+        hum = _hum(values.rows(silent), still[silent], noise[silent], site, settings)
+        beside = np.clip(np.searchsorted(silent, kept), 0, max(len(silent) - 1, 0))
+        still_cov += (1.0 + np.sum(weight**2, axis=1))[:, None, None] * hum[beside]
+    cov = turn[kept] @ still_cov @ np.swapaxes(turn[kept], 1, 2)
     found.phasor_cov[np.arange(len(kept)), owner[place[kept]]] = cov
     return found, values.number[kept]
 
@@ -207,6 +213,16 @@ def _ambient(
         cycles=settings.cycles,
         mains_turns=mains_hz * slots.duration,
     )
+
+
+def _hum(
+    silent: SlotValues, still: ComplexArray, noise: Array, site: Site, settings: SlotSettings
+) -> Array:
+    """Return the covariance of what each silent burst holds that its neighbours do not tell."""
+    own = silent.variance[:, None, None] * noise
+    state = settings.cycles, settings.mains_hz
+    spread = LONGEST_PAUSE, NOISE_CYCLES * places(site)
+    return left_by_ambient(silent.time, silent.length, still, own, state, spread)
 
 
 @dataclass(frozen=True, eq=False)

@@ -88,10 +88,12 @@ def begin(
     everywhere = len(fixes) == len(samples)
     out = []
     for start in chains:
-        declared = start_phases(calibration, fixes.time, start.phase)
+        declared = calibration
+        if some.signed:  # of amplitudes any phase is as good
+            declared = start_phases(calibration, fixes.time, start.phase)
         whole = start if everywhere else _carried(start, imu, offset, samples.time)
         out.append(OfflineStart(whole, whole.states, declared, fixes))
-    if _doubtful(chains) and can_search(epochs):
+    if epochs.signed and _doubtful(chains) and can_search(epochs):
         still = replace(imu, gyro_body=imu.gyro_body - _rest_bias(imu, calibration))
         for found in search(epochs, fixes, still, calibration):
             out.append(_tracked(found, fixes, imu, calibration, samples.time))

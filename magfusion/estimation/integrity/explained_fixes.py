@@ -20,6 +20,7 @@ from magfusion.model.parameters import Calibration
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trust import Risk, StateTrust, Trust, Verdict
+from magfusion.units import IntArray
 
 OF_FIELDS = ("field_residuals", "separation")  # codes of what the fields say against the site
 
@@ -59,7 +60,8 @@ def explained_fixes(
     """Fix every epoch on its own, without false beacons, gains free where nothing less explains it.
 
     A spread of gains is asked for where the fixes that hold them, without the one beacon that is
-    false, still contradict the fields; it is taken where with it nothing does.
+    false, still contradict the fields; it is taken where with it nothing does.  Where most epochs
+    hear one beacon it is not: its gain is its range, and whatever errs would pass for a place.
 
     Parameters
     ----------
@@ -82,7 +84,11 @@ def explained_fixes(
     fixes = how.fixed(held, 0.0)
     report("fixing without each beacon", 2, 3)
     found = None if asked else how.judged(fixes, held, 0.0)
-    if found is not None and (_explained(found.trust) or np.sum(fixes.determined[:, 0]) < FEWEST):
+    if found is not None and (
+        _explained(found.trust)
+        or np.sum(fixes.determined[:, 0]) < FEWEST
+        or np.median(_beacons_heard(samples, calibration)) < 2
+    ):
         return found
     spread = gain_spread(
         samples, calibration, fixes, gravity=gravity, survey_error=survey_error, free=held
@@ -135,6 +141,13 @@ class _How:
         if spread:
             trust |= Trust(tuple(gains_of(final, site, spread)))
         return ExplainedFixes(final, states, trust, spread)
+
+
+def _beacons_heard(samples: FieldSamples, calibration: Calibration) -> IntArray:
+    """Return how many beacons each epoch holds, shape (n,)."""
+    site = calibration.site
+    each = [np.any(samples.valid[:, site.owner == k], axis=1) for k in range(len(site.beacons))]
+    return np.sum(each, axis=0)
 
 
 def _said(trust: Trust) -> list[str]:

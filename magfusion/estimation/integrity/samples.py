@@ -174,11 +174,14 @@ def frozen_rows(stream: Stream) -> IntArray:
 def repeated_samples(log: Log, site: Site | None) -> Iterator[Finding]:
     """Yield the instruments that are read faster than they measure."""
     for stream in streams(log):
-        same, still = np.all(stream.value[1:] == stream.value[:-1], axis=1), _all_frozen(stream)
+        same, still = stream.value[1:] == stream.value[:-1], _all_frozen(stream)
         for first, last in zip(still.first, still.last, strict=True):
             same[first:last] = False
-        share = float(np.mean(same))
-        if share < HELD or share > 0.98:
+        share = float(np.mean(np.all(same, axis=1)))
+        # Coarse steps repeat by chance, each axis for itself.
+        by_chance = float(np.prod(np.mean(same, axis=0))) if same.shape[1] > 1 else 0.0
+        held = (share - by_chance) / (1.0 - by_chance) if by_chance < 1.0 else 1.0
+        if held < HELD or share > 0.98:
             continue
         rate_hz = 1.0 / float(np.median(np.diff(stream.time)))
         own = (1.0 - share) * rate_hz

@@ -22,7 +22,6 @@ from magfusion.estimation.measurements.measurement import Rows
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.solve.bordered import eliminate_partial
 from magfusion.estimation.state import MOTION
-from magfusion.model.noise import twice
 from magfusion.model.parameters import Block, Calibration, dimension, prior_sigma, retract
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.samples import ImuSamples
@@ -224,7 +223,7 @@ def field_residual(result: Smoothed, estimate: Estimate, *, raw: bool = False) -
     alone = fields.alone()
     loss = None if raw else alone.loss
     error = Rows(graph.residual(alone, estimate)).weighed(loss)[0].error
-    return np.where(twice(result.fields.there), error, np.nan)
+    return np.where(result.fields.told, error, np.nan)
 
 
 def _first_inertial(graph: Graph) -> int:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.estimation.measurements.measurement import Loss, Measurement, Rows
+from magfusion.estimation.measurements.signs import whitened_along
 from magfusion.estimation.state import States
 from magfusion.model.audibility import are_many
 from magfusion.model.field import skew
@@ -300,7 +301,7 @@ def field_phasors(
         epoch=epoch,
         time=samples.time,
         measured=stacked(phasor),
-        sqrt_information=paired_whitening(cov, samples.there),
+        sqrt_information=whitened_along(paired_whitening(cov, samples.there), samples),
         rate_body=rate_body,
         by_time_offset=stacked(by),
         applied_offset=applied_offset,

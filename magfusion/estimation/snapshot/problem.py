@@ -187,7 +187,7 @@ def epochs_of(
         raise EstimationError("no epoch to fix: every window was dropped")
     if not set(free) <= set(FREE):
         raise ValueError(f"free must be among {FREE}; got {sorted(set(free) - set(FREE))}")
-    if "phase" in free:
+    if "phase" in free or not samples.signed:  # any phase is as good as any sign
         site = calibration.site
         loose = tuple(replace(b, synchronised=False) for b in site.beacons)
         calibration = replace(calibration, site=replace(site, beacons=loose))

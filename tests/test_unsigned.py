@@ -1,0 +1,120 @@
+"""Amplitudes without sign in estimators that follow the motion."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import unsigned_amplitudes as scenario
+from conftest import Refuse
+from scipy.spatial.transform import Rotation
+
+from magfusion.errors import InputError
+from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
+from magfusion.estimation.measurements.signs import along_axis, count_open, with_signs
+from magfusion.estimation.state import States
+from magfusion.files.log import write_log
+from magfusion.files.site import save_site
+from magfusion.model.parameters import Calibration, initial_calibration, predict_channels
+from magfusion.model.samples import FieldSamples, ImuSamples, Log
+from magfusion.model.trajectory import Trajectory
+
+COUNT, STEP = 5, 1e-6
+
+
+def poses() -> Trajectory:
+    rng = np.random.default_rng(2)
+    place = rng.uniform(*scenario.BOX, (COUNT, 3))
+    return Trajectory(0.1 * np.arange(COUNT), Rotation.random(COUNT, rng).as_matrix(), place)
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    return initial_calibration(scenario.floor(), 0.0)
+
+
+def amplitudes(calibration: Calibration, truth: Trajectory, sigma: float) -> FieldSamples:
+    site = calibration.site
+    seen = predict_channels(calibration, truth.time, truth.world_from_body, truth.position_world)
+    phasor = np.full_like(seen, np.nan)
+    phasor[..., 0] = np.abs(seen[..., 2])
+    cov = np.broadcast_to(sigma**2 * np.eye(3), (*phasor.shape, 3)).copy()
+    window, channels = np.full(COUNT, 0.1), site.channels
+    found = FieldSamples(truth.time, window, channels, phasor, cov, axes="x", signed=False)
+    return along_axis(found, site)
+
+
+def measured(calibration: Calibration, samples: FieldSamples, truth: Trajectory) -> FieldPhasors:
+    none, zero = np.zeros(COUNT), np.zeros((COUNT, 3))
+    own = with_signs(samples, truth, calibration)
+    return field_phasors(calibration.site, own, np.arange(COUNT), truth, zero, none, 1.0)
+
+
+def states(rotation: np.ndarray, position: np.ndarray) -> States:
+    zero = np.zeros((COUNT, 3))
+    return States(rotation, position, zero, lambda: np.zeros((COUNT, 6)))
+
+
+def test_the_rows_are_the_derivatives_of_amplitudes(calibration: Calibration) -> None:
+    truth = poses()
+    samples = amplitudes(calibration, truth, 1e-10)
+    phasors = measured(calibration, samples, truth)
+    rows = phasors.linearize(states(truth.world_from_body, truth.position_world), calibration, ())
+    np.testing.assert_allclose(rows.error, 0.0, atol=1e-6)
+    assert rows.by_pose is not None
+    heard = np.any(phasors.sqrt_information != 0.0, axis=(2, 3))
+    root = np.sqrt(np.sum(phasors.sqrt_information**2, axis=(2, 3)))
+    assert np.array_equal(np.linalg.matrix_rank(phasors.sqrt_information), heard.astype(int))
+    for axis in range(6):
+        sides = []
+        for sign in (1.0, -1.0):
+            step = np.zeros(6)
+            step[axis] = sign * STEP
+            turn = truth.world_from_body @ Rotation.from_rotvec(step[:3]).as_matrix()
+            place = truth.position_world + truth.world_from_body @ step[3:]
+            seen = predict_channels(calibration, truth.time, turn, place)
+            sides.append(np.abs(seen[..., 2]))
+        slope = root * (sides[0] - sides[1]) / (2.0 * STEP)
+        found = np.sum(rows.by_pose[..., axis], axis=2)
+        np.testing.assert_allclose(found[heard], slope[heard], rtol=1e-4, atol=1e-3 * root.max())
+
+
+def test_what_is_predicted_near_zero_is_left_out_and_counted(calibration: Calibration) -> None:
+    truth = poses()
+    samples = amplitudes(calibration, truth, 3e-9)
+    seen = predict_channels(calibration, truth.time, truth.world_from_body, truth.position_world)
+    found = with_signs(samples, truth, calibration)
+    size = np.abs(seen[..., 2])
+    assert count_open(samples, found) == np.sum(~found.valid) > 0
+    assert not found.valid[size < 4.0 * 3e-9].any()
+    assert found.valid[size > 6.0 * 3e-9].all()
+    kept = found.valid
+    np.testing.assert_allclose(found.phasor_sensor[kept, 2], seen[kept, 2], rtol=1e-9)
+    wide = replace(truth, pose_cov=np.tile(0.1**2 * np.eye(6), (COUNT, 1, 1)))
+    assert np.sum(with_signs(samples, wide, calibration).valid) < np.sum(kept)
+    assert np.all(found.numbers == found.valid)
+    assert np.array_equal(np.sum(found.told, axis=2), found.valid)
+
+
+def test_amplitudes_are_of_one_axis(calibration: Calibration) -> None:
+    site, samples = calibration.site, amplitudes(calibration, poses(), 1e-10)
+    assert samples.axes == "z"
+    sensor = replace(site.platform.magnetometer, axes="xyz")
+    whole = replace(site, platform=replace(site.platform, magnetometer=sensor))
+    with pytest.raises(InputError, match="amplitudes, which are of a receiver of one axis"):
+        along_axis(samples, whole)
+
+
+def test_jobs_that_take_no_amplitudes_say_so(
+    calibration: Calibration, tmp_path: Path, refuse: Refuse
+) -> None:
+    fields = amplitudes(calibration, poses(), 1e-10)
+    write_log(Log("few", 0, "test", ImuSamples.empty(), fields=fields), tmp_path / "log")
+    save_site(calibration.site, tmp_path / "log" / "site.yaml")
+    said = refuse("check", tmp_path / "log")
+    assert "amplitudes without sign are taken by fix, smooth and navigate alone" in said
+
+
+@pytest.mark.slow
+def test_amplitudes_are_worth_what_phasors_are() -> None:
+    assert not scenario.faults_of(scenario.rows_of(1, 8.0))
