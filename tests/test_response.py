@@ -94,12 +94,15 @@ def test_simulated_samples_are_what_such_a_magnetometer_reads(
         assert np.min(off) > 0.05 if differs else np.max(off) < 0.003
 
 
-def test_samples_of_axes_that_answer_apart_are_to_be_demodulated_first() -> None:
+def test_samples_of_axes_that_answer_apart_are_followed_along_a_motion() -> None:
     site = apart(demo_site())
     config = SimulationConfig(DEMO_BOX_WORLD, duration=6.0, perturb=False)
-    log = simulate_log(site, config, np.random.default_rng(3)).log
-    with pytest.raises(InputError, match="axis_responses: raw samples of axes"):
-        smooth(log, site, SmootherSettings(tune=False))
+    walk = simulate_log(site, config, np.random.default_rng(3))
+    found = smooth(walk.log, site, SmootherSettings(tune=False)).states
+    errors = trajectory_errors(found, walk.motion.trajectory(found.time))
+    assert errors.ate < 0.01
+    assert errors.nees is not None
+    assert np.mean(errors.nees) < 12.0  # of six degrees of freedom, of states that err alike
 
 
 def test_a_site_keeps_the_response(tmp_path: Path) -> None:

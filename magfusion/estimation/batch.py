@@ -177,7 +177,7 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
     time, motion = states.time, log.declared.site.platform.motion
     calm = quiet_before(log.imu, time - calibration.imu_offset(time), motion)
     standing = log.samples.at_rest(time)
-    by_waveform = log.fixes is None and log.demodulation.log.waveform is not None
+    by_waveform = log.fixes is None and log.demodulation.anew
     iterations, done, settled = 0, 0, False
     tuned: tuple[Tuned, ...] = ()
     step: Step | None = None

@@ -25,7 +25,8 @@ class Apart:
     Parameters
     ----------
     log : Log
-        With phasors by the log's clock, in the site's order, in place of the samples.
+        With phasors by the log's clock, in the site's order, in place of the samples, or beside
+        them as they were mended.
     dropped : mapping
         Reason, with the magnetometer's name, to number of windows.
     noticed : tuple of Finding
@@ -91,10 +92,17 @@ def each_recorded(log: Log, site: Site | None) -> Iterator[tuple[str, Log, Site 
         yield name, replace(log, waveform=wave, waveforms={}), None
 
 
-def demodulated_apart(log: Log, site: Site, lockin: LockinSettings | None = None) -> Apart:
+def demodulated_apart(
+    log: Log, site: Site, lockin: LockinSettings | None = None, *, anew: bool = False
+) -> Apart:
     """Demodulate each magnetometer by its own mounting, matrix and response, at its own stamps.
 
     Windows are at the same times of the log's clock, so that they are one epoch.
+
+    Parameters
+    ----------
+    anew : bool
+        Whether the samples are kept, to be demodulated again once the motion is known.
 
     Raises
     ------
@@ -107,9 +115,12 @@ def demodulated_apart(log: Log, site: Site, lockin: LockinSettings | None = None
     parts: dict[str, FieldSamples] = {}
     dropped: dict[str, int] = {}
     said: dict[str, tuple[Finding, ...]] = {}
-    imu = log.imu
+    imu, waves = log.imu, dict[str, Waveform]()
+    late = {sensor.name: sensor.clock_offset for sensor in site.platform.magnetometers}
     for name, one, alone in each_alone(log, site):
         one = mended(one, alone)
+        assert one.waveform is not None
+        waves[name] = replace(one.waveform, time=one.waveform.time - late[name])
         imu, said[name] = one.imu, passed_on(one, alone).findings
         try:
             samples, lost = phasors(one, alone, lockin)
@@ -121,8 +132,9 @@ def demodulated_apart(log: Log, site: Site, lockin: LockinSettings | None = None
     names = [sensor.name for sensor in site.platform.magnetometers]
     fields = side_by_side([parts.get(name, FieldSamples.empty(own)) for name in names], site)
     missing = [name for name in names if name not in parts]
-    noticed = (*by_name(said), _how(list(parts), missing))
-    return Apart(replace(log, imu=imu, waveforms={}, fields=fields), dropped, noticed)
+    noticed = (*by_name(said), *_how(list(parts), missing, anew=anew))
+    log = replace(log, imu=imu, waveforms=waves if anew else {}, fields=fields)
+    return Apart(log, dropped, noticed)
 
 
 def by_name(said: Mapping[str, tuple[Finding, ...]]) -> Iterator[Finding]:
@@ -135,12 +147,14 @@ def by_name(said: Mapping[str, tuple[Finding, ...]]) -> Iterator[Finding]:
                 yield replace(finding, text=f"Of {name}: {finding.text}")
 
 
-def _how(names: list[str], missing: list[str]) -> Finding:
-    text = (
-        f"The samples of {', '.join(names)} were demodulated each by itself, as magfusion"
-        " demodulate does, before anything else: of the motion inside a window only the turns that"
-        " the IMU tells are taken off."
-    )
-    if missing:
-        text += f" Of {', '.join(missing)} there are no samples."
-    return Finding("demodulated_apart", text, Verdict.TRUSTWORTHY)
+def _how(names: list[str], missing: list[str], *, anew: bool) -> Iterator[Finding]:
+    text = "" if not missing else f"Of {', '.join(missing)} there are no samples."
+    if not anew:
+        how = (
+            f"The samples of {', '.join(names)} were demodulated each by itself, as magfusion"
+            " demodulate does, before anything else: of the motion inside a window only the turns"
+            " that the IMU tells are taken off."
+        )
+        text = f"{how} {text}".rstrip()
+    if text:
+        yield Finding("demodulated_apart", text, Verdict.TRUSTWORTHY)

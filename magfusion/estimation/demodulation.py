@@ -61,6 +61,11 @@ class Demodulation:
     blind: BoolArray | None = None
     without_turn: Windows = field(default_factory=Windows.none)
 
+    @property
+    def anew(self) -> bool:
+        """Whether there are samples to demodulate again, once the motion is known."""
+        return self.log.waveform is not None
+
     def steady(self, calibration: Calibration) -> SteadyFields:
         """Return the Earth field and the offset before anything is known of the motion.
 

@@ -103,7 +103,7 @@ def solve_round(
     )
     segments = every if len(every) > 1 else ()
     calibration = every[len(every) // 2]
-    by_waveform = ready.demodulation.log.waveform is not None
+    by_waveform = ready.demodulation.anew
     wave = ready.compensated(calibration, states) if by_waveform else None
     graph, gaps = graph_of(ready, states, calibration, wave, kept.standing)
     start = initial_estimate(states, calibration, segments)

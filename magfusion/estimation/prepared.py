@@ -19,6 +19,7 @@ from magfusion.estimation.likeliest import likeliest
 from magfusion.estimation.log_graph import PreparedLog
 from magfusion.estimation.measurements.zero_velocity import quiet_before
 from magfusion.estimation.settings import SmootherSettings
+from magfusion.estimation.several_demodulation import demodulated_several
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.parameters import Calibration, initial_calibration
 from magfusion.model.progress import Report
@@ -120,7 +121,9 @@ def prepared_again(log: Log, site: Site, settings: SmootherSettings, known: Begu
 
 
 def _demodulated(log: Log, site: Site, settings: SmootherSettings) -> _Demodulated:
-    loose, demodulation = settings.coupling == "loose", demodulated(log, site, settings.lockin)
+    loose = settings.coupling == "loose"
+    heard = demodulated_several if log.waveforms else demodulated
+    demodulation = heard(log, site, settings.lockin)
     samples = demodulation.fields
     if loose and has_schedule(site):
         samples = whole_cycles(samples, log.imu, site)

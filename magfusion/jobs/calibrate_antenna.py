@@ -95,7 +95,8 @@ def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
         tracker,
     )
     from magfusion.jobs.antenna_trust import judged
-    from magfusion.jobs.inputs import claim, found_in, named, refuse_failed, three_axes
+    from magfusion.jobs.inputs import claim, found_in, named, refuse_failed
+    from magfusion.jobs.receiver_axes import three_axes
     from magfusion.model.antenna import antenna_from_vector, antenna_of
     from magfusion.results.figures import (
         Figure,

@@ -63,7 +63,8 @@ def run_calibrate_beacon(settings: BeaconSettings, output: Path, report: Report 
     """
     from magfusion.files.site import load_site, save_site
     from magfusion.files.survey import read_survey
-    from magfusion.jobs.inputs import claim, found_in, named, refuse_failed, three_axes
+    from magfusion.jobs.inputs import claim, found_in, named, refuse_failed
+    from magfusion.jobs.receiver_axes import three_axes
     from magfusion.model.trust import Trust
     from magfusion.results.plots.beacon import write_beacon_plot
     from magfusion.results.report import write_report

@@ -129,7 +129,7 @@ def _survey_path(path: Path) -> Path | None:
 def _from_survey(settings: MapSettings, path: Path) -> tuple[Site, MapPoints, Figures]:
     from magfusion.files.site import load_site
     from magfusion.files.survey import read_survey
-    from magfusion.jobs.inputs import three_axes
+    from magfusion.jobs.receiver_axes import three_axes
     from magfusion.results.figures import Figures
 
     if settings.trajectory is not None:

@@ -56,7 +56,8 @@ def run_coverage(settings: CoverageSettings, output: Path) -> Figures:
         Where the site cannot be read, the settings do not fit, or ``output`` is in the way.
     """
     from magfusion.files.site import load_site
-    from magfusion.jobs.inputs import claim, three_axes
+    from magfusion.jobs.inputs import claim
+    from magfusion.jobs.receiver_axes import three_axes
     from magfusion.results.coverage import best_extra_beacon, coverage, usual_box, volume
     from magfusion.results.plots.coverage import write_plot
     from magfusion.results.recording_coverage import write_coverage_recording

@@ -142,7 +142,8 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
     from magfusion.files.site import load_site, save_site
     from magfusion.jobs.design_figures import design_figures
     from magfusion.jobs.design_motion import run_motion
-    from magfusion.jobs.inputs import claim, three_axes
+    from magfusion.jobs.inputs import claim
+    from magfusion.jobs.receiver_axes import three_axes
     from magfusion.results.coverage import coverage
     from magfusion.results.design.planning import designed
     from magfusion.results.plots.design import Panel, write_plot

@@ -28,6 +28,7 @@ from magfusion.files.open import open_log
 from magfusion.files.site import load_site
 from magfusion.files.trajectory_table import read_trajectory
 from magfusion.files.tum import read_tum
+from magfusion.jobs.receiver_axes import check_axes
 from magfusion.jobs.region import ANYWHERE, Where
 from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.progress import Report, quiet
@@ -37,7 +38,6 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.model.without_imu import logged
 from magfusion.receiver.receiver import Receiver
-from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 from magfusion.results.page import PAGE
 from magfusion.results.report import FAILED
@@ -267,6 +267,7 @@ def read_job(
     rotor: bool = False,
     several: bool = False,
     raw: bool = False,
+    anew: bool = False,
     lockin: LockinSettings | None = None,
     heard: bool = True,
     report: Report = quiet,
@@ -291,6 +292,8 @@ def read_job(
         Whether it can do with several magnetometers.
     raw : bool
         Whether it demodulates the samples of several itself.
+    anew : bool
+        Whether it demodulates them again, once the motion is known.
     lockin : LockinSettings, optional
         By which the samples of several are demodulated.
     heard : bool
@@ -303,7 +306,7 @@ def read_job(
     """
     site = read_site(job, unknown=unknown, without=without, several=several)
     log = _as_known(job, _open(job, report), site)
-    _check_axes(job, log, site, fewer=fewer, amplitudes=amplitudes)
+    check_axes(job.declared_path, job.log_path, log, site, fewer=fewer, amplitudes=amplitudes)
     if site.platform.magnetometer.casing is not None and not rotor:
         raise InputError(
             f"{job.declared_path}: platform.magnetometer.casing: through steel a sensor is ranged"
@@ -322,7 +325,7 @@ def read_job(
         log = mended(log, site)
     if log.waveforms and not raw:
         with named(job.log_path):
-            found = demodulated_apart(log, site, lockin)
+            found = demodulated_apart(log, site, lockin, anew=anew)
         noticed = (*log.noticed, *found.noticed)
         log, site = without_silent(replace(found.log, noticed=noticed), site)
     elif log.fields is not None:
@@ -354,62 +357,6 @@ def _as_known(job: Job, log: Log, site: Site) -> Log:
             " add a column magnetometer with its name to magnetometer.parquet"
         )
     return replace(log, waveform=None, fields=None if log.waveforms else log.fields)
-
-
-def _check_axes(job: Job, log: Log, site: Site, *, fewer: bool, amplitudes: bool) -> None:
-    """Refuse components that are not those of the site's receiver, or that a job cannot take."""
-    sensor, fields, wave = site.platform.magnetometer, log.fields, log.waveform
-    declared = sensor.axes
-    key = f"{job.declared_path}: platform.magnetometer.axes:"
-    whole = fields is None or (fields.axes == "xyz" and fields.signed)
-    if declared == "xyz" and whole and (wave is None or wave.axes == "xyz"):
-        return
-    if len(declared) < 3 and (sensor.warming is not None or sensor.coil_kappa != 0.0):
-        raise InputError(
-            f"{key} of a receiver of fewer than three axes neither warming nor coil_kappa_m2 is"
-            " taken into account; leave them out"
-        )
-    if len(declared) < 3 and has_schedule(site):
-        raise InputError(
-            f"{key} coils in time slots are not yet told apart by a receiver of fewer than three"
-            " axes; drive them by tones at once"
-        )
-    for stream, found in (
-        ("fields", None if fields is None else fields.axes if fields.signed else declared),
-        ("magnetometer", None if wave is None else wave.axes),
-    ):
-        one = fields is not None and not fields.signed and stream == "fields"
-        if found is not None and (found != declared or (one and len(declared) != 1)):
-            has = "one amplitude" if one else ", ".join(found)
-            raise InputError(
-                f"{key} is [{', '.join(declared)}], and the {stream} of {job.log_path} have {has};"
-                " declare the axes that the receiver has"
-            )
-    if not fewer:
-        three_axes(site, job.declared_path)
-    if fields is not None and not fields.signed and not amplitudes:
-        raise InputError(
-            f"{job.log_path}: amplitudes without sign are taken by fix, smooth and navigate alone;"
-            " run one of these, or give phasors (re and im)"
-        )
-
-
-def three_axes(site: Site, path: Path) -> Site:
-    """Return a site whose receiver has all three axes.
-
-    Raises
-    ------
-    InputError
-        Where it has fewer.
-    """
-    declared = site.platform.magnetometer.axes
-    if len(declared) < len("xyz"):
-        raise InputError(
-            f"{path}: platform.magnetometer.axes: is [{', '.join(declared)}], and this job needs"
-            " all three axes; of a receiver of fewer check, demodulate, fix, navigate and smooth"
-            " (of one log) make what can be known"
-        )
-    return site
 
 
 def require_imu(job: Job, log: Log, what: str) -> None:

@@ -159,6 +159,7 @@ def run_smooth(
         fewer=rest is None,
         amplitudes=rest is None,
         several=True,
+        anew=rest is None,
         lockin=settings.lockin,
         reference=rest is not None,
         heard=rest is None,

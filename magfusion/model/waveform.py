@@ -8,14 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.errors import InputError
-from magfusion.model.channel_effects import are_driven
+from magfusion.model.channel_effects import are_driven, axis_factors
 from magfusion.model.coil_field import side_by_side
 from magfusion.model.field import driven_field
 from magfusion.model.parameters import Calibration
 from magfusion.model.quaternion import cross
 from magfusion.model.receive_coils import is_apart, joined_samples, points_apart
-from magfusion.model.response import AxisResponses
 from magfusion.model.site import Magnetometer, Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import AnyArray, Array, ComplexArray
@@ -67,19 +65,28 @@ def predicted_waveform(
         (T), measured axes, without noise.
     ndarray, shape (n, 3)
         By what it changes with; zero where no change is given.
-
-    Raises
-    ------
-    InputError
-        If the axes of the magnetometer answer each in its own way.
     """
+    factors = axis_factors(calibration.site)
+    if factors is None:
+        return _read(motion, calibration, earth_field_world, carrier, change)
+    # What an axis answers is what all would, if its currents were those that it answers to.
+    read = [
+        _read(motion, calibration, earth_field_world, carrier * factors[:, axis], change)
+        for axis in range(3)
+    ]
+    field, by = (np.stack([read[k][i][:, k] for k in range(3)], axis=1) for i in range(2))
+    return field, by
+
+
+def _read(
+    motion: Trajectory,
+    calibration: Calibration,
+    earth_field_world: Array,
+    carrier: ComplexArray,
+    change: Motion | None,
+) -> tuple[Array, Array]:
+    """Return the samples of axes that answer alike, as `predicted_waveform`."""
     magnetometer = calibration.site.platform.magnetometer
-    if isinstance(magnetometer.response, AxisResponses):
-        raise InputError(
-            "platform.magnetometer.axis_responses: raw samples of axes that answer each in its own"
-            " way are not followed along a motion; demodulate the log first (magfusion demodulate),"
-            " and give this command the directory that it writes"
-        )
     currents = _currents(calibration, motion.time, carrier)
     if not is_apart(magnetometer):
         field, by = _at_point(

@@ -29,9 +29,13 @@ def first_magnetometer(log: Log, site: Site) -> tuple[Log, Site]:
 def _only(log: Log, site: Site, kept: list[int]) -> tuple[Log, Site]:
     sensors = tuple(site.platform.magnetometers[k] for k in kept)
     left = replace(site, platform=site.platform.carrying(sensors))
-    return replace(
-        log, fields=None if log.fields is None else of_sensors(log.fields, site, kept)
-    ), left
+    fields = None if log.fields is None else of_sensors(log.fields, site, kept)
+    waves = {s.name: log.waveforms[s.name] for s in sensors if s.name in log.waveforms}
+    if waves and len(kept) == 1:  # as a log of one has it, by the log's clock
+        wave = waves[sensors[0].name]
+        wave = replace(wave, time=wave.time + sensors[0].clock_offset)
+        return replace(log, fields=None, waveform=wave, waveforms={}), left
+    return replace(log, fields=fields, waveforms=waves), left
 
 
 def of_sensors(fields: FieldSamples, site: Site, kept: list[int]) -> FieldSamples:
