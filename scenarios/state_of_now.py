@@ -24,7 +24,8 @@ from magfusion.estimation.state import as_trajectory
 from magfusion.estimation.state_of_now import CarriedState
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site, save_site
-from magfusion.files.stream import imu_content, json_line, magnetometer_content
+from magfusion.files.stream import json_line
+from magfusion.files.stream_contents import imu_content, magnetometer_content
 from magfusion.jobs.replay import Replay
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import BeaconSigma, MagnetometerSigma, Site

@@ -22,10 +22,10 @@ from magfusion.files.stream import (
     FieldsRecord,
     Format,
     field_samples,
-    fields_content,
     json_line,
     read_records,
 )
+from magfusion.files.stream_contents import fields_content
 from magfusion.jobs.replay import Replay, feed, run_replay
 from magfusion.jobs.stream import StreamSettings, run_stream, state_content
 from magfusion.model.samples import FieldSamples, Log

@@ -18,7 +18,7 @@ from magfusion.estimation.orientation.remarks import remarks
 from magfusion.estimation.orientation.smoother import oriented, pieces
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
-from magfusion.files.stream import imu_content, magnetometer_content, write_record
+from magfusion.files.stream_contents import imu_content, magnetometer_content, write_record
 from magfusion.jobs.inputs import Job
 from magfusion.jobs.orientation import run_orientation, run_orientation_stream, without_beacons
 from magfusion.model.progress import quiet

@@ -22,8 +22,6 @@ from magfusion.jobs.check import CheckSettings, run_check
 from magfusion.jobs.demodulate import DemodulateSettings, run_demodulate
 from magfusion.jobs.fix import run_fix
 from magfusion.jobs.inputs import Job
-from magfusion.jobs.replay import ReplaySettings
-from magfusion.jobs.replay import run as replay
 from magfusion.model.parameters import initial_calibration, predict_channels
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
@@ -215,11 +213,6 @@ def test_currents_beside_are_refused(directory: Path) -> None:
 def test_rests_of_several_are_refused(directory: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--at-rest integrates the samples of one"):
         run_demodulate(DemodulateSettings(log=directory, at_rest=True), tmp_path / "out")
-
-
-def test_the_pipe_names_the_way(directory: Path) -> None:
-    with pytest.raises(InputError, match=r"left, right; run magfusion demodulate"):
-        replay(ReplaySettings(log=directory))
 
 
 def test_check_judges_each_by_its_name(directory: Path, walk: SimulatedLog) -> None:

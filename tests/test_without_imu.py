@@ -18,7 +18,7 @@ from magfusion.estimation.preintegration import cut_at_epochs, preintegrate
 from magfusion.estimation.state import as_trajectory
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import load_site, save_site
-from magfusion.files.stream import fields_content, write_record
+from magfusion.files.stream_contents import fields_content, write_record
 from magfusion.jobs.stream import StreamSettings, run_stream
 from magfusion.model.platform_motion import NO_IMU, MotionPrior
 from magfusion.model.samples import ImuSamples, Log

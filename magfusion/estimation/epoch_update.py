@@ -9,7 +9,7 @@ from magfusion.errors import EstimationError
 from magfusion.estimation.ekf import ErrorStateFilter
 from magfusion.estimation.fixed_lag import SlidingWindow
 from magfusion.estimation.initialization.online import OnlineStart
-from magfusion.estimation.input_queue import Arrivals, Measured
+from magfusion.estimation.input_queue import Arrivals
 from magfusion.estimation.integrity.bank import SubsetBank
 from magfusion.estimation.integrity.gate import Gate
 from magfusion.estimation.integrity.judgement import Judgement
@@ -28,6 +28,7 @@ from magfusion.estimation.integrity.recovery import (
     restarted,
 )
 from magfusion.estimation.integrity.score_online import OnlineScore
+from magfusion.estimation.measured import Measured
 from magfusion.estimation.measurements.earth import EarthField, EarthWeight, speed_sigma
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors

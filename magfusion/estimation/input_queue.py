@@ -4,17 +4,18 @@ How far all of it goes, and what of it was measured at an epoch.
 """
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from magfusion.estimation.initialization.online import OnlineStart
+from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
 from magfusion.estimation.integrity.detection import DetectionFilter
 from magfusion.estimation.integrity.freeze import Freeze
-from magfusion.estimation.measurements.earth import EarthField, earth_measurement
+from magfusion.estimation.measured import Measured
+from magfusion.estimation.measurements.earth import earth_measurement
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.model_error import alike_online
-from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
+from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.estimation.measurements.signs import OPEN_SIGN, count_open, with_signs
 from magfusion.estimation.measurements.zero_velocity import (
     REACH,
@@ -23,12 +24,15 @@ from magfusion.estimation.measurements.zero_velocity import (
 )
 from magfusion.estimation.motion_compensation import MotionCompensated, demodulate_predicted
 from magfusion.estimation.preintegration import RATE_SPAN
+from magfusion.estimation.settings import EstimatorSettings
 from magfusion.estimation.stand_in import StandIn
 from magfusion.estimation.state import MOTION, VELOCITY, State, as_trajectory
 from magfusion.estimation.stream_buffer import Buffer, check_clock
+from magfusion.files.named_records import magnetometer_number
 from magfusion.model.marks import Marks
 from magfusion.model.parameters import CLOCK_RATE, TIME_OFFSET, Block
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
+from magfusion.model.trust import Finding
 from magfusion.receiver.receiver import LockinReceiver, Receiver
 from magfusion.units import Array, IntArray
 
@@ -36,35 +40,6 @@ LONGEST_WAIT = 5.0  # s; the fields go on without an IMU that is silent for long
 OFFSET_STALE = 1e-4  # s; at a radian a second, six thousandths of a degree
 SHORTEST_STEP = 1e-6  # s; of epochs of one magnetometer
 MARGIN = 0.1  # s; of inertial samples about a window
-
-
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """What an epoch holds.
-
-    Parameters
-    ----------
-    samples : FieldSamples
-        Without the beacons that are not detected.
-    earth : EarthField, optional
-        The steady field as a measurement, where it is one.
-    steady : SteadyFields, optional
-        It as it was measured, where there is a waveform.
-    repeats : float
-        How many epochs hold each sample of overlapping windows.
-    """
-
-    samples: FieldSamples
-    phasors: FieldPhasors
-    earth: EarthField | None
-    steady: SteadyFields | None
-    repeats: float
-
-    @property
-    def heard(self) -> tuple[str, ...]:
-        """The beacons that are detected."""
-        channels = zip(self.samples.channels, self.samples.valid[0], strict=True)
-        return tuple(dict.fromkeys(name for (name, _), valid in channels if valid))
 
 
 class Arrivals:
@@ -157,8 +132,11 @@ class Arrivals:
             for after, until in instrument.stretches(stamps, own):
                 self.frozen += self.imu.leave_out(after, until)
 
-    def add_magnetometer(self, time: Array, measured_sensor: Array) -> None:
+    def add_magnetometer(
+        self, time: Array, measured_sensor: Array, magnetometer: str | None = None
+    ) -> None:
         """Take raw samples of the magnetometer, as `Navigator.add_magnetometer`."""
+        magnetometer_number(self.receiver.site, magnetometer, "samples")
         stamps = np.atleast_1d(time)
         check_clock("magnetometer", stamps, self._newest)
         self.waveform.add(stamps, np.atleast_2d(measured_sensor))
@@ -253,6 +231,15 @@ class Arrivals:
         """Until when the inertial samples have come, or are not waited for any more (s)."""
         return max(self.inertial, self._newest_field - LONGEST_WAIT)
 
+    def due(self, inertial: float) -> bool:
+        """Return whether fields may be taken in that came, up to a time of the IMU (s)."""
+        return bool(self.fields) and bool(self.fields[0].time[0] <= inertial)
+
+    @property
+    def remarks(self) -> tuple[Finding, ...]:
+        """What is to be said of the streams; nothing of those of one magnetometer."""
+        return ()
+
     @property
     def losses(self) -> dict[str, int]:
         """What was of no use, with the reason: windows, samples."""
@@ -268,6 +255,38 @@ class Arrivals:
         }
 
     # How it goes on
+
+    def settle(self) -> None:
+        """Put what came last into its order, as a checkpoint holds it."""
+        self.imu.rows()
+        self.waveform.rows()
+
+    def gathered(self, delay: float, span: float) -> float | None:
+        """Return until when a first state is looked for (s); None as long as that is too early.
+
+        Parameters
+        ----------
+        delay : float
+            As of `receive` (s).
+        span : float
+            Of the data that it takes (s).
+        """
+        reached = self.reached - delay
+        return reached if reached - self.first >= span else None
+
+    def first_state(self, until: float, settings: EstimatorSettings) -> OnlineStart | NoStart:
+        """Return the first state that what has come leads to, or why there is none."""
+        steady = list(self.steady.values())
+        return find_online_start(
+            self.receiver.site,
+            self.inertial_samples(),
+            self.waveform,
+            self.fields,
+            steady,
+            until,
+            settings,
+            self.receiver.marks,
+        )
 
     def forget_before_start(self, kept: float) -> None:
         """Keep no more than so long (s), whatever it is."""

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.as_heard import fields_heard, samples_heard
 from magfusion.estimation.carried import Departure
 from magfusion.estimation.drive_reference import drive_findings
 from magfusion.estimation.ekf import ErrorStateFilter
 from magfusion.estimation.epoch_update import EpochUpdate, Estimator
 from magfusion.estimation.fixed_lag import SlidingWindow
 from magfusion.estimation.initialization.early import first_try, is_clear, next_try, open_start
-from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
+from magfusion.estimation.initialization.online import NoStart, OnlineStart
 from magfusion.estimation.input_queue import Arrivals
 from magfusion.estimation.integrity.bank import SubsetBank
 from magfusion.estimation.integrity.freeze import imu_remarks
@@ -27,15 +28,14 @@ from magfusion.estimation.integrity.resets import Resets
 from magfusion.estimation.integrity.summary import Summary
 from magfusion.estimation.measurements.earth import check_earth
 from magfusion.estimation.measurements.measurement import Measurement
-from magfusion.estimation.measurements.signs import along_axis
 from magfusion.estimation.navigator_data import navigator_rules
 from magfusion.estimation.navigator_settings import NavigatorSettings as NavigatorSettings
 from magfusion.estimation.process_noise import calibration_process_noise
 from magfusion.estimation.propagation import Propagated, propagate
+from magfusion.estimation.several_arrivals import arrivals_of
 from magfusion.estimation.state import State
 from magfusion.estimation.state_of_now import CarriedState, Said, StateOfNow
 from magfusion.estimation.still_samples import StillSamples
-from magfusion.estimation.warming import heard_at_reference, heard_fields_at_reference
 from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
 from magfusion.model.drive import DriveSamples, DriveShares
 from magfusion.model.marks import Marks
@@ -47,7 +47,6 @@ from magfusion.model.temperature import Temperatures
 from magfusion.model.trust import Finding
 from magfusion.model.without_imu import on_motion_prior, require_motion_prior
 from magfusion.receiver.drive import DriveReceiver
-from magfusion.receiver.receiver import Receiver
 from magfusion.units import Array, IntArray
 
 
@@ -103,8 +102,7 @@ class Navigator:
             bank = SubsetBank(site, self.blocks, self._considered, risk)
         self._update = EpochUpdate(site, estimated, self.blocks, self.settings.earth, bank)
         self._process_noise = calibration_process_noise(site, self.blocks, self._considered)
-        receiver = Receiver.of(site, self.settings.lockin)
-        self._arrived = Arrivals(receiver, site.platform.imu.time_offset)
+        self._arrived = arrivals_of(site, self.settings.lockin)
         self._estimator: Estimator | None = None
         self._next_start = first_try(self.site, self.settings.start_duration)
         imu = site.platform.imu
@@ -141,24 +139,25 @@ class Navigator:
         self._arrived.add_imu(time, gyro_body, accel_body)
         self._now.reach(self._arrived)
 
-    def add_magnetometer(self, time: Array, measured_sensor: Array) -> None:
-        """Take raw samples of the magnetometer: times (k,), fields (k, 3) (T).
+    def add_magnetometer(
+        self, time: Array, measured_sensor: Array, magnetometer: str | None = None
+    ) -> None:
+        """Take raw samples of a magnetometer: times (k,), fields (k, 3) (T).
 
         What stands in the columns of axes that the site does not declare is not looked at.
+
+        Parameters
+        ----------
+        magnetometer : str, optional
+            Which of several took them, by its own stamps.
 
         Raises
         ------
         InputError
-            Where a number is not finite or the clock jumped.
+            Where a number is not finite or the clock jumped, or the site has no such magnetometer.
         """
-        if self.site.platform.further:
-            raise InputError("magnetometer: samples of several are not taken; give their phasors")
-        known, sensor = self.site.temperatures, self.site.platform.magnetometer
-        if sensor.lacking:
-            measured_sensor = np.array(measured_sensor, dtype=np.float64)
-            measured_sensor[..., sensor.lacking] = 0.0
-        samples = heard_at_reference(known, sensor, time, measured_sensor)
-        self._arrived.add_magnetometer(time, samples)
+        samples = samples_heard(self.site, time, measured_sensor)
+        self._arrived.add_magnetometer(time, samples, magnetometer)
         self._stand_still(np.atleast_1d(time), raw=True)
         self.advance()
 
@@ -209,13 +208,7 @@ class Navigator:
         InputError
             Where the clock jumped.
         """
-        known, sensor = self.site.temperatures, self.site.platform.magnetometer
-        samples = along_axis(samples, self.site)
-        if sensor.lacking:
-            phasor = samples.phasor_sensor.copy()
-            phasor[..., sensor.lacking] = np.nan
-            samples = replace(samples, phasor_sensor=phasor, axes=sensor.axes)
-        samples = heard_fields_at_reference(known, sensor, samples)
+        samples = fields_heard(self.site, samples)
         after = -np.inf if self._estimator is None else self._estimator.state.time
         late = self._arrived.add_fields(samples, steady if self.settings.earth else None, after)
         if late:
@@ -340,8 +333,7 @@ class Navigator:
     def checkpoint(self) -> dict[str, Any]:
         """Return everything needed to go on as plain data: `restored` makes a navigator of it."""
         rules = navigator_rules(self.site, self.blocks)
-        self._arrived.imu.rows()
-        self._arrived.waveform.rows()
+        self._arrived.settle()
         return {"parts": to_plain(self, rules), "estimator": to_plain(self._estimator, rules)}
 
     def go_on_from(self, data: Any, rules: Rules) -> None:
@@ -386,19 +378,10 @@ class Navigator:
     def _begin(self) -> bool:
         """Find the first state, once enough has come."""
         arrived = self._arrived
-        reached = arrived.reached - self.settings.delay
-        if not reached - arrived.first >= self._next_start:
+        until = arrived.gathered(self.settings.delay, self._next_start)
+        if until is None:
             return False
-        start = find_online_start(
-            self.site,
-            arrived.inertial_samples(),
-            arrived.waveform,
-            arrived.fields,
-            list(arrived.steady.values()),
-            reached,
-            self.settings,
-            arrived.receiver.marks,
-        )
+        start = arrived.first_state(until, self.settings)
         longest = 4.0 * self.settings.start_duration
         if self._next_start < self.settings.start_duration and not is_clear(start):
             if isinstance(start, OnlineStart) and start.ambiguous:
@@ -448,7 +431,7 @@ class Navigator:
         if centre is not None:
             self._step_window(centre)
             return True
-        if arrived.fields and arrived.fields[0].time[0] <= inertial:
+        if arrived.due(inertial):
             return self._step_fields(arrived.fields.pop(0))
         if arrived.window_to_come:
             return False
@@ -482,6 +465,7 @@ class Navigator:
         judgement = self._update.take_in(self._estimator, self._arrived, predicted, samples)
         hung_since, bridged = self._arrived.hung_since, predicted.bridged
         judgement = judgement.beside(*imu_remarks(hung_since, before, time, bridged=bridged))
+        judgement = judgement.beside(*self._arrived.remarks)
         state, counts = self._estimator.state, self.counts
         restarts = counts["lost and found again"]
         if self.site.platform.inertial:  # a motion prior may be wide, and a fix its rule

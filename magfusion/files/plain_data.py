@@ -157,9 +157,11 @@ class _Reader:
             kinds = (types.GenericAlias(tuple, (*inner, int)[:2]),) * len(data)
         if len(data) != len(kinds):
             raise _refusal(place, f"has {len(data)} parts, not {len(kinds)}")
+        # Running parts take their state in their place.
+        parts = like if isinstance(like, list) and len(like) == len(data) else [None] * len(data)
         found = [
-            self.value(kind, part, f"{place}[{k}]")
-            for k, (kind, part) in enumerate(zip(kinds, data, strict=True))
+            self.value(kind, part, f"{place}[{k}]", own)
+            for k, (kind, part, own) in enumerate(zip(kinds, data, parts, strict=True))
         ]
         if origin is deque:
             return deque(found, like.maxlen if isinstance(like, deque) else None)

@@ -13,14 +13,14 @@ from pydantic import ConfigDict, Field, PlainValidator, ValidationError, model_v
 from pydantic_core import PydanticCustomError
 
 from magfusion.errors import InputError
-from magfusion.files.drive_columns import beacon_of, column_of
+from magfusion.files.drive_columns import beacon_of
 from magfusion.files.marks_table import is_slot, slots_of
 from magfusion.files.site_warming import COLDEST, HOTTEST
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS
 from magfusion.files.yaml_files import StrictModel, sentence
 from magfusion.model.drive import DriveSamples
-from magfusion.model.marks import UNTOLD, Marks
-from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
+from magfusion.model.marks import UNTOLD
+from magfusion.model.samples import FieldSamples
 from magfusion.units import AnyArray, Array, ComplexArray, IntArray
 
 Format = Literal["json", "msgpack"]
@@ -134,12 +134,14 @@ class ImuRecord(_Arrays):
 class MagnetometerRecord(_Arrays):
     """Raw samples of the magnetometer: stamps (k,), fields (k, 3) (T); NaN where missing.
 
-    ``slot`` is that of the coil that is driven: -1 where none is, null where nothing is said.
+    ``slot`` is that of the coil that is driven: -1 where none is, null where nothing is said;
+    ``magnetometer`` the name of the one of several that took them.
     """
 
     time: Annotated[Array, PlainValidator(_times)]
     field: Annotated[Array, PlainValidator(_vectors)]
     slot: Annotated[IntArray, PlainValidator(_slots)] | None = None
+    magnetometer: str | None = None
 
     @model_validator(mode="after")
     def _alike(self) -> "MagnetometerRecord":
@@ -153,7 +155,8 @@ class FieldsRecord(_Arrays):
     """Phasors of one window; of every detected beacon, its tones.
 
     ``sigma`` (T) is the standard deviation of each component's real and imaginary part;
-    ``covariance`` takes its place where the axes differ.
+    ``covariance`` takes its place where the axes differ; ``magnetometer`` is the name of the one of
+    several that measured them.
     """
 
     time: float = Field(ge=-LATEST, le=LATEST)
@@ -161,6 +164,7 @@ class FieldsRecord(_Arrays):
     phasors: dict[str, Annotated[ComplexArray, PlainValidator(_phasor)]]
     sigma: float | None = Field(default=None, ge=1e-30, le=1.0)
     covariance: dict[str, Annotated[Array, PlainValidator(_covariance)]] | None = None
+    magnetometer: str | None = None
 
     @model_validator(mode="after")
     def _one_noise(self) -> "FieldsRecord":
@@ -350,53 +354,9 @@ def _checked(number: int, read: Callable[[], Record]) -> Numbered:
         return Numbered(number, None, sentence(error, Record, "record"))
 
 
-def write_record(content: dict[str, Any], stream: BinaryIO, form: Format) -> None:
-    """Write one record."""
-    if form == "json":
-        stream.write(json_line(content))
-    else:
-        stream.write(msgpack.packb(content))
-
-
 def json_line(content: dict[str, Any]) -> bytes:
     """Return plain values as one line of JSON."""
     return json.dumps(content, allow_nan=False).encode() + b"\n"
-
-
-def imu_content(samples: ImuSamples) -> dict[str, Any]:
-    """Return inertial samples as a record."""
-    gyro, accel = samples.gyro_body.tolist(), samples.accel_body.tolist()
-    return {"imu": {"time": samples.time.tolist(), "gyro": gyro, "accel": accel}}
-
-
-def magnetometer_content(waveform: Waveform) -> dict[str, Any]:
-    """Return raw samples of the magnetometer as a record."""
-    measured = waveform.measured_sensor.copy()
-    measured[:, [axis not in waveform.axes for axis in "xyz"]] = np.nan
-    field = [_or_none(row) for row in measured]
-    return {"magnetometer": {"time": waveform.time.tolist(), "field": field}}
-
-
-def marks_content(marks: Marks) -> dict[str, Any]:
-    """Return bursts as a record."""
-    start, end = marks.begin.tolist(), marks.end.tolist()
-    return {"marks": {"start": start, "end": end, "slot": marks.slot.tolist()}}
-
-
-def _or_none(row: Array) -> list[float | None]:
-    """Return numbers as JSON has them: None where one is missing."""
-    return [value if np.isfinite(value) else None for value in row.tolist()]
-
-
-def temperature_content(time: float, part: str, degc: float) -> dict[str, Any]:
-    """Return a temperature as a record."""
-    return {"temperature": {"time": time, "degc": {part: degc}}}
-
-
-def drive_content(drive: DriveSamples) -> dict[str, Any]:
-    """Return currents of coils as a record."""
-    current = {column_of(name): values.tolist() for name, values in drive.current.items()}
-    return {"drive": {"time": drive.time.tolist(), "current": current}}
 
 
 def drive_samples(entry: DriveRecord) -> DriveSamples:
@@ -404,32 +364,3 @@ def drive_samples(entry: DriveRecord) -> DriveSamples:
     kept = np.all([np.isfinite(values) for values in entry.current.values()], axis=0)
     own = {beacon_of(name): values[kept] for name, values in entry.current.items()}
     return DriveSamples(entry.time[kept], own)
-
-
-def fields_content(samples: FieldSamples) -> dict[str, Any]:
-    """Return the phasors of one window as a record, each with its covariance."""
-    if samples.magnetometers:
-        raise InputError("the pipe takes fields of one magnetometer; navigate the log itself")
-    if not samples.signed:
-        raise InputError("the pipe takes phasors, and no amplitudes; navigate the log itself")
-    phasors: dict[str, list[Any]] = {}
-    covariance: dict[str, list[Any]] = {}
-    tones: dict[str, dict[int, int]] = {}
-    for row, (name, tone) in enumerate(samples.channels):
-        tones.setdefault(name, {})[tone] = row
-    valid = samples.valid[0]
-    for name, rows in tones.items():
-        if not any(valid[row] for row in rows.values()):
-            continue
-        phasors[name], covariance[name] = [], []
-        for tone in range(max(rows) + 1):
-            if tone in rows and valid[rows[tone]]:
-                value = samples.phasor_sensor[0, rows[tone]]
-                phasors[name].append([_or_none(value.real), _or_none(value.imag)])
-                covariance[name].append(samples.phasor_cov[0, rows[tone]].tolist())
-            else:
-                phasors[name].append(None)
-                covariance[name].append(np.eye(3).tolist())
-    time, window = float(samples.time[0]), float(samples.window[0])
-    content = {"time": time, "window": window, "phasors": phasors, "covariance": covariance}
-    return {"fields": content}

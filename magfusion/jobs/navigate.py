@@ -170,7 +170,7 @@ def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
             "--output, --start, --end, --topics, --realtime and --json belong to a log; leave them"
             " out with -"
         )
-    site = load_site(settings.site, without=True)
+    site = load_site(settings.site, without=True, several=True)
     if not site.beacons:
         from magfusion.jobs.orientation import run_orientation_stream
 
@@ -224,10 +224,13 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
         fewer=True,
         amplitudes=True,
         several=True,
+        anew=True,
         lockin=navigator.lockin,
         heard=False,
         report=report,
     )
+    if log.waveforms:  # of which the navigator makes phasors, as it does of a stream
+        log = replace(log, fields=None)
     refuse_rate(job.log_path, log, settings.rates)
     with named(job.log_path):
         require_motion_prior(site)
@@ -343,7 +346,8 @@ def _open_run(
     from magfusion.jobs.navigate_results import row_columns
     from magfusion.jobs.replay import PIECE, Replay
 
-    streams = [s for s in (log.imu, log.waveform, log.fields) if s is not None]
+    known = (log.imu, log.waveform, log.fields, *log.waveforms.values())
+    streams = [stream for stream in known if stream is not None]
     key = run_key("navigate", site, navigator, PIECE, log.epoch_ns, streams)
     begun = begin(place, key, site, navigator, Kept(), resume=settings.resume)
     return NavigateRun(

@@ -6,11 +6,10 @@ import time
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from magfusion.errors import InputError
 from magfusion.jobs.settings import Command, PartSettings, ReplayedSettings
 from magfusion.units import Array, IntArray
 
@@ -36,12 +35,22 @@ class Piece:
         When all of it has been measured (s).
     fields : tuple of FieldSamples
         One epoch each.
+    waveforms : tuple of (str, Waveform)
+        Of several magnetometers, those that have samples or marks in it.
     """
 
     arrival: float
     imu: ImuSamples
     waveform: Waveform | None
     fields: tuple[FieldSamples, ...]
+    waveforms: tuple[tuple[str, Waveform], ...] = ()
+
+    @property
+    def waves(self) -> Iterator[tuple[str | None, Waveform]]:
+        """The samples with the name of their magnetometer, None of the only one."""
+        if self.waveform is not None:
+            yield None, self.waveform
+        yield from self.waveforms
 
 
 class Replay:
@@ -58,6 +67,7 @@ class Replay:
         self._field_arrival = _field_arrival(log.fields)
         streams = [log.imu.time, self._field_arrival]
         streams += [] if log.waveform is None else [log.waveform.time]
+        streams += [wave.time for wave in log.waveforms.values()]
         known = [s for s in streams if len(s)]
         first = min(float(s[0]) for s in known)
         last = max(float(s[-1]) for s in known)
@@ -66,6 +76,7 @@ class Replay:
         self._imu = _places(log.imu.time, self._edges)
         none = np.empty(0)
         self._waveform = _places(none if log.waveform is None else log.waveform.time, self._edges)
+        self._each = {n: _places(w.time, self._edges) for n, w in log.waveforms.items()}
         self._fields = _places(self._field_arrival, self._edges)
 
     def __len__(self) -> int:
@@ -84,13 +95,22 @@ class Replay:
             imu=ImuSamples(imu.time[own], imu.gyro_body[own], imu.accel_body[own]),
             waveform=None
             if waveform is None
-            else replace(waveform.rows(part), marks=self._marks(k)),
+            else replace(waveform.rows(part), marks=self._marks(waveform, k)),
             fields=() if fields is None else tuple(fields.rows(slice(i, i + 1)) for i in rows),
+            waveforms=self._of_several(k),
         )
 
-    def _marks(self, k: int) -> Marks | None:
+    def _of_several(self, k: int) -> tuple[tuple[str, Waveform], ...]:
+        """Return what each of several magnetometers took; the first has the marks."""
+        found: list[tuple[str, Waveform]] = []
+        for name, wave in self.log.waveforms.items():
+            marks = None if found else self._marks(wave, k)
+            part = wave.rows(slice(*self._each[name][k : k + 2]))
+            found.append((name, replace(part, marks=marks)))
+        return tuple(found)
+
+    def _marks(self, waveform: Waveform | None, k: int) -> Marks | None:
         """Return the bursts that have ended since the piece before."""
-        waveform = self.log.waveform
         if waveform is None or waveform.marks is None:
             return None
         first, last = _places(waveform.marks.end, self._edges[k : k + 2]).tolist()
@@ -106,10 +126,11 @@ def feed(navigator: Navigator, piece: Piece) -> None:
     """Give a piece to a navigator."""
     if len(piece.imu) and navigator.site.platform.inertial:
         navigator.add_imu(piece.imu.time, piece.imu.gyro_body, piece.imu.accel_body)
-    if piece.waveform is not None and piece.waveform.marks:
-        navigator.add_marks(piece.waveform.marks)
-    if piece.waveform is not None and len(piece.waveform):
-        navigator.add_magnetometer(piece.waveform.time, piece.waveform.measured_sensor)
+    for name, wave in piece.waves:
+        if wave.marks:
+            navigator.add_marks(wave.marks)
+        if len(wave):
+            navigator.add_magnetometer(wave.time, wave.measured_sensor, name)
     for samples in piece.fields:
         navigator.add_fields(samples)
 
@@ -171,18 +192,30 @@ def _currents(log: Log | LongLog) -> DriveSamples | None:
     return cosines(log.rotation)
 
 
-def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool) -> None:
-    """Write a log as the records of a stream, in the order of their arrival."""
-    from magfusion.files.long_log import LongLog
-    from magfusion.files.stream import (
-        drive_content,
-        fields_content,
+def _contents(piece: Piece) -> Iterator[dict[str, Any]]:
+    """Yield a piece as records."""
+    from magfusion.files.stream_contents import (
+        fields_contents,
         imu_content,
         magnetometer_content,
         marks_content,
-        temperature_content,
-        write_record,
     )
+
+    if len(piece.imu):
+        yield imu_content(piece.imu)
+    for name, wave in piece.waves:
+        if wave.marks:
+            yield marks_content(wave.marks)
+        if len(wave):
+            yield magnetometer_content(wave, name)
+    for samples in piece.fields:
+        yield from fields_contents(samples)
+
+
+def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool) -> None:
+    """Write a log as the records of a stream, in the order of their arrival."""
+    from magfusion.files.long_log import LongLog
+    from magfusion.files.stream_contents import drive_content, temperature_content, write_record
     from magfusion.model.temperature import Temperatures
 
     pieces = _of_long(log) if isinstance(log, LongLog) else Replay(log).pieces()
@@ -197,14 +230,8 @@ def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool)
             if due:
                 write_record(drive_content(currents.rows(slice(0, due))), sink, form)
             currents = currents.rows(slice(due, None))
-        if len(piece.imu):
-            write_record(imu_content(piece.imu), sink, form)
-        if piece.waveform is not None and piece.waveform.marks:
-            write_record(marks_content(piece.waveform.marks), sink, form)
-        if piece.waveform is not None and len(piece.waveform):
-            write_record(magnetometer_content(piece.waveform), sink, form)
-        for samples in piece.fields:
-            write_record(fields_content(samples), sink, form)
+        for content in _contents(piece):
+            write_record(content, sink, form)
         if realtime:
             sink.flush()
     sink.flush()
@@ -217,7 +244,7 @@ class ReplaySettings(PartSettings, ReplayedSettings):
 
 def run(settings: ReplaySettings) -> None:
     """Print a log as records; see `run_replay`."""
-    from magfusion.files.long_log import LongLog, long_log
+    from magfusion.files.long_log import long_log
     from magfusion.files.open import open_log
     from magfusion.files.standard_streams import binary_output, until_closed
     from magfusion.jobs.inputs import topics_option
@@ -225,11 +252,6 @@ def run(settings: ReplaySettings) -> None:
     sink = binary_output()
     part, topics = (settings.start, settings.end), topics_option(settings.topics)
     found = long_log(settings.log, *part) or open_log(settings.log, *part, topics)
-    if not isinstance(found, LongLog) and found.waveforms:
-        raise InputError(
-            f"{settings.log}: the pipe takes the samples of one magnetometer, and these are of"
-            f" {', '.join(found.waveforms)}; run magfusion demodulate and navigate what it writes"
-        )
     with until_closed():
         run_replay(found, sink, settings.form, settings.realtime)
 

@@ -14,13 +14,13 @@ from magfusion.estimation.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
 from magfusion.estimation.state_of_now import CarriedState
 from magfusion.files.checkpoint import run_key
+from magfusion.files.named_records import site_fields
 from magfusion.files.site import load_site
 from magfusion.files.stream import (
     Format,
     Numbered,
     Record,
     drive_samples,
-    field_samples,
     json_line,
     read_records,
     whole_rows,
@@ -92,7 +92,7 @@ def run_stream(
     InputError
         Where the site cannot be read, or a record is none and ``keep_going`` is not set.
     """
-    site = settings.where.bounded(load_site(site_path))
+    site = settings.where.bounded(load_site(site_path, several=True))
     with state_sinks(settings.live, site, 0, messages) as sinks:
         return _navigate(site, settings, source, sink, messages, sinks)
 
@@ -194,11 +194,11 @@ def _take_in(
         own[:, site.platform.magnetometer.lacking] = 0.0
         time, field = whole_rows(record.magnetometer.time, own)
         if len(time):
-            navigator.add_magnetometer(time, field)
+            navigator.add_magnetometer(time, field, record.magnetometer.magnetometer)
         missing += Counter(magnetometer=len(record.magnetometer.time) - len(time))
         newest = max(newest, _last(time))
     if record.fields is not None:
-        navigator.add_fields(field_samples(record.fields, site.channels))
+        navigator.add_fields(site_fields(record.fields, site))
         newest = max(newest, record.fields.time)
     return newest
 

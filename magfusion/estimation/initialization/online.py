@@ -1,5 +1,6 @@
 """The first state of an online estimator: the smoother over the data gathered so far."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from dataclasses import fields as fields_of
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.demodulated_apart import each_alone
 from magfusion.estimation.initialization.among_many import among_all
 from magfusion.estimation.initialization.handover import last_state
 from magfusion.estimation.integrity.judge import judged
@@ -14,8 +16,10 @@ from magfusion.estimation.integrity.score import Score, score_of
 from magfusion.estimation.integrity.spectrum import beside_lines
 from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.settings import EstimatorSettings
+from magfusion.estimation.several_demodulation import demodulated_several, same_windows
 from magfusion.estimation.state import POSITION, ROTATION, State
 from magfusion.estimation.stream_buffer import Buffer
+from magfusion.model.audibility import are_many
 from magfusion.model.marks import Marks
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
 from magfusion.model.site import Site
@@ -45,6 +49,8 @@ class OnlineStart:
         Of what the smoothed beginning holds.
     beside : LockinSettings, optional
         How the receiver goes on where lines are to be fitted that the site does not declare.
+    lines : mapping
+        The same of several magnetometers, by their names.
     turn, shift : float
         By how much more attitude (rad) and position (m) may be off for it, one sigma an axis.
     """
@@ -57,6 +63,7 @@ class OnlineStart:
     turn: float = 0.0
     shift: float = 0.0
     beside: LockinSettings | None = None
+    lines: Mapping[str, LockinSettings] = field(default_factory=dict)
 
     @property
     def ambiguous(self) -> bool:
@@ -90,6 +97,7 @@ def find_online_start(
     until: float,
     settings: EstimatorSettings,
     marks: Marks | None = None,
+    waveforms: Mapping[str, Waveform] | None = None,
 ) -> OnlineStart | NoStart:
     """Return the state at the last epoch before a time; or why the data lead to none.
 
@@ -103,7 +111,10 @@ def find_online_start(
         (s)
     marks : Marks, optional
         When which coil was driven, where the site's slots are marked.
+    waveforms : mapping, optional
+        The samples of several magnetometers until then, each by its own stamps.
     """
+    several = {} if waveforms is None else waveforms
     wave = Waveform(*waveform.rows(), marks, site.platform.magnetometer.axes)
     if not fields:
         receiver = Receiver.of(site, settings.lockin)
@@ -116,14 +127,17 @@ def find_online_start(
         epoch_ns=0,
         source="online",
         imu=imu,
-        waveform=None if fields else wave.rows(wave.time <= until),
+        waveform=None if fields or several else wave.rows(wave.time <= until),
         fields=FieldSamples.joined(whole) if whole else None,
         steady=_joined_steady(steady, whole) if whole and steady else None,
         inertial=site.platform.inertial,
+        waveforms=several,
     )
     asked = {f.name: getattr(settings, f.name) for f in fields_of(EstimatorSettings)}
     heard = log
     try:
+        if several and are_many(site):  # by what is heard they are chosen
+            log = replace(log, fields=demodulated_several(log, site, settings.lockin).fields)
         if log.waveform is not None and has_schedule(site) and joins(site, log.waveform.marks):
             log = _of_cycles(log, log.waveform, site, settings)
         result = smooth(log, site, SmootherSettings(loss="huber", **asked))
@@ -150,7 +164,18 @@ def find_online_start(
         score,
         *_wider(result, honest),
         None if beside is given else beside,
+        _lines_of_each(log, site, given) if several else {},
     )
+
+
+def _lines_of_each(log: Log, site: Site, given: LockinSettings | None) -> dict[str, LockinSettings]:
+    """Return how the receivers of several magnetometers go on that have lines to be fitted."""
+    lockin, found = same_windows(site, given), dict[str, LockinSettings]()
+    for name, own, alone in each_alone(log, site):
+        lined = beside_lines(own, alone, lockin)
+        if lined is not None and lined is not lockin:
+            found[name] = lined
+    return found
 
 
 def _of_cycles(log: Log, waveform: Waveform, site: Site, settings: EstimatorSettings) -> Log:

@@ -146,6 +146,10 @@ def check_earth(site: Site) -> None:
     InputError
     """
     field, gravity = site.earth_field_world, site.gravity
+    if site.platform.further:
+        raise InputError(
+            "--earth measures by one magnetometer; leave it out, or give a site of the one"
+        )
     if field is None:
         raise InputError(
             "the site has no Earth field to measure against; give earth_field_t or a location in"

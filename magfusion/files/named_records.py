@@ -1,0 +1,51 @@
+"""Which of several magnetometers what comes through a pipe is of."""
+
+from dataclasses import replace
+
+from magfusion.errors import InputError
+from magfusion.files.fields import on_log_clock, side_by_side
+from magfusion.files.stream import FieldsRecord, field_samples
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+
+
+def magnetometer_number(site: Site, name: str | None, what: str) -> int:
+    """Return which of the platform's magnetometers something is of.
+
+    Raises
+    ------
+    InputError
+        Where the site has none of that name, or several and no name is given.
+    """
+    names = [sensor.name for sensor in site.platform.magnetometers]
+    if name is None and len(names) == 1:
+        return 0
+    if name is None:
+        raise InputError(
+            f"the {what} do not say which of the site's magnetometers took them"
+            f" ({', '.join(names)}); add its name as magnetometer"
+        )
+    if name not in names:
+        raise InputError(
+            f"the {what} are of magnetometer {name}, which the site does not know (it has"
+            f" {', '.join(names)}); give the site in which the log was recorded"
+        )
+    return names.index(name)
+
+
+def site_fields(entry: FieldsRecord, site: Site) -> FieldSamples:
+    """Return the phasors of a record in the order of the site's channels, by the log's clock.
+
+    Raises
+    ------
+    InputError
+        As `magnetometer_number` and `field_samples`.
+    """
+    which = magnetometer_number(site, entry.magnetometer, "fields")
+    sensors = site.platform.magnetometers
+    if len(sensors) == 1:
+        return field_samples(entry, site.channels)
+    one = replace(site, platform=site.platform.carrying((sensors[which],)))
+    own = on_log_clock(field_samples(entry, one.channels), one)
+    none = FieldSamples.empty(one.channels)
+    return side_by_side([own if k == which else none for k in range(len(sensors))], site)

@@ -1,0 +1,99 @@
+"""What was recorded as records of a pipe; `magfusion.files.stream` reads them."""
+
+from collections.abc import Iterator
+from typing import Any, BinaryIO
+
+import msgpack
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.files.drive_columns import column_of
+from magfusion.files.stream import Format, json_line
+from magfusion.model.drive import DriveSamples
+from magfusion.model.marks import Marks
+from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
+from magfusion.units import Array
+
+
+def write_record(content: dict[str, Any], stream: BinaryIO, form: Format) -> None:
+    """Write one record."""
+    if form == "json":
+        stream.write(json_line(content))
+    else:
+        stream.write(msgpack.packb(content))
+
+
+def imu_content(samples: ImuSamples) -> dict[str, Any]:
+    """Return inertial samples as a record."""
+    gyro, accel = samples.gyro_body.tolist(), samples.accel_body.tolist()
+    return {"imu": {"time": samples.time.tolist(), "gyro": gyro, "accel": accel}}
+
+
+def magnetometer_content(waveform: Waveform, magnetometer: str | None = None) -> dict[str, Any]:
+    """Return raw samples of the magnetometer, or of one of several by its name, as a record."""
+    measured = waveform.measured_sensor.copy()
+    measured[:, [axis not in waveform.axes for axis in "xyz"]] = np.nan
+    field = [_or_none(row) for row in measured]
+    named = {} if magnetometer is None else {"magnetometer": magnetometer}
+    return {"magnetometer": {**named, "time": waveform.time.tolist(), "field": field}}
+
+
+def marks_content(marks: Marks) -> dict[str, Any]:
+    """Return bursts as a record."""
+    start, end = marks.begin.tolist(), marks.end.tolist()
+    return {"marks": {"start": start, "end": end, "slot": marks.slot.tolist()}}
+
+
+def _or_none(row: Array) -> list[float | None]:
+    """Return numbers as JSON has them: None where one is missing."""
+    return [value if np.isfinite(value) else None for value in row.tolist()]
+
+
+def temperature_content(time: float, part: str, degc: float) -> dict[str, Any]:
+    """Return a temperature as a record."""
+    return {"temperature": {"time": time, "degc": {part: degc}}}
+
+
+def drive_content(drive: DriveSamples) -> dict[str, Any]:
+    """Return currents of coils as a record."""
+    current = {column_of(name): values.tolist() for name, values in drive.current.items()}
+    return {"drive": {"time": drive.time.tolist(), "current": current}}
+
+
+def fields_contents(samples: FieldSamples) -> Iterator[dict[str, Any]]:
+    """Yield the phasors of one window as records, one for each magnetometer that has any."""
+    if not samples.magnetometers:
+        yield fields_content(samples)
+    for name in dict.fromkeys(samples.magnetometers):
+        own = samples.of_magnetometer(name)
+        if len(own):
+            content = fields_content(own)
+            content["fields"]["magnetometer"] = name
+            yield content
+
+
+def fields_content(samples: FieldSamples) -> dict[str, Any]:
+    """Return the phasors of one window as a record, each with its covariance."""
+    if not samples.signed:
+        raise InputError("the pipe takes phasors, and no amplitudes; navigate the log itself")
+    phasors: dict[str, list[Any]] = {}
+    covariance: dict[str, list[Any]] = {}
+    tones: dict[str, dict[int, int]] = {}
+    for row, (name, tone) in enumerate(samples.channels):
+        tones.setdefault(name, {})[tone] = row
+    valid = samples.valid[0]
+    for name, rows in tones.items():
+        if not any(valid[row] for row in rows.values()):
+            continue
+        phasors[name], covariance[name] = [], []
+        for tone in range(max(rows) + 1):
+            if tone in rows and valid[rows[tone]]:
+                value = samples.phasor_sensor[0, rows[tone]]
+                phasors[name].append([_or_none(value.real), _or_none(value.imag)])
+                covariance[name].append(samples.phasor_cov[0, rows[tone]].tolist())
+            else:
+                phasors[name].append(None)
+                covariance[name].append(np.eye(3).tolist())
+    time, window = float(samples.time[0]), float(samples.window[0])
+    content = {"time": time, "window": window, "phasors": phasors, "covariance": covariance}
+    return {"fields": content}
