@@ -6,12 +6,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 from test_several_magnetometers import two_magnetometers
 
+from magfusion.errors import InputError
 from magfusion.estimation.demodulated_apart import demodulated_apart
-from magfusion.estimation.navigator import NavigatorSettings
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
 from magfusion.files.fields import by_own_clocks
 from magfusion.files.log import write_log
 from magfusion.files.open import open_log
@@ -19,7 +21,7 @@ from magfusion.files.site import save_site
 from magfusion.files.stream import json_line
 from magfusion.files.trajectory_table import read_trajectory
 from magfusion.jobs.navigate import NavigateSettings, run_navigate
-from magfusion.jobs.replay import run_replay
+from magfusion.jobs.replay import Replay, feed, run_replay
 from magfusion.jobs.stream import StreamSettings, run_stream
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
@@ -86,3 +88,179 @@ def test_a_log_and_its_records_lead_to_the_same_states(
     for name, values in (("time", expected.time), ("position", expected.position_world)):
         told = np.array([state[name] for state in found])
         np.testing.assert_allclose(told, values, rtol=0.0, atol=1e-7)
+
+
+def delayed(lines: list[dict[str, Any]], name: str, late: float) -> list[dict[str, Any]]:
+    """Return a stream in which what is of a magnetometer comes so much later (s)."""
+    due: list[tuple[float, dict[str, Any]]] = []
+    now = -np.inf
+    for line in lines:
+        kind = next(iter(line))
+        now = max(now, float(np.max(line[kind]["time"])))
+        due.append((now + late * (line[kind].get("magnetometer") == name), line))
+    return [line for _, line in sorted(due, key=lambda one: one[0])]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["raw", "demodulated"])
+def test_one_that_is_late_changes_no_state(
+    kind: str, site: Site, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    directory = written(request.getfixturevalue(kind), site, tmp_path)
+    lines = records(directory)
+    expected, found = piped(lines, directory), piped(delayed(lines, "right", 0.3), directory)
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        assert abs(one["time"] - other["time"]) < 1e-9
+        np.testing.assert_allclose(one["position"], other["position"], rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(
+            one["sigma"]["position"], other["sigma"]["position"], rtol=1e-6, atol=0.0
+        )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["raw", "demodulated"])
+def test_one_that_falls_silent_is_named_and_the_other_goes_on(
+    kind: str, site: Site, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    directory = written(request.getfixturevalue(kind), site, tmp_path)
+    lines = [
+        line
+        for line in records(directory)
+        if next(iter(line.values())).get("magnetometer") != "right"
+        or np.max(next(iter(line.values()))["time"]) < 6.5
+    ]
+    found = piped(lines, directory)
+    silent = [
+        state
+        for state in found
+        if any(r["code"] == "magnetometer_silent" for r in state["remarks"])
+    ]
+    assert silent
+    assert all("Magnetometer right has sent nothing" in str(state["remarks"]) for state in silent)
+    assert silent[0]["time"] > 6.0
+    assert found[-1]["time"] > 8.0
+    before = [state for state in found if state not in silent]
+    # With half of what was heard the position is known less.
+    assert max(silent[-1]["sigma"]["position"]) > max(before[-1]["sigma"]["position"])
+
+
+@pytest.mark.slow
+def test_one_that_comes_again_is_heard_again(site: Site, demodulated: Log, tmp_path: Path) -> None:
+    directory = written(demodulated, site, tmp_path)
+    lines = [
+        line
+        for line in records(directory)
+        if next(iter(line.values())).get("magnetometer") != "right"
+        or not 5.9 < np.max(next(iter(line.values()))["time"]) < 7.9
+    ]
+    found = piped(lines, directory)
+    named = [bool(state["remarks"]) for state in found]
+    assert any(named)
+    assert not named[-1]
+
+
+@pytest.mark.parametrize(
+    ("record", "sentence"),
+    [
+        (
+            {"magnetometer": {"time": 0.0, "field": [0.0, 0.0, 0.0], "magnetometer": "middle"}},
+            r"line 1: the samples are of magnetometer middle, which .*it has left, right",
+        ),
+        (
+            {"magnetometer": {"time": 0.0, "field": [0.0, 0.0, 0.0]}},
+            r"line 1: the samples do not say which .*left, right",
+        ),
+        (
+            {
+                "fields": {
+                    "time": 0.0,
+                    "window": 0.1,
+                    "phasors": {},
+                    "sigma": 1e-9,
+                    "magnetometer": "middle",
+                }
+            },
+            r"line 1: the fields are of magnetometer middle",
+        ),
+        (
+            {"fields": {"time": 0.0, "window": 0.1, "phasors": {}, "sigma": 1e-9}},
+            r"line 1: the fields do not say which",
+        ),
+        (
+            {
+                "magnetometer": {
+                    "time": 0.0,
+                    "field": [0.0, 0.0, 0.0],
+                    "magnetometer": "left",
+                    "slot": 1,
+                }
+            },
+            r"line 1: magnetometer: slot beside the samples of several",
+        ),
+    ],
+)
+def test_what_does_not_say_whose_it_is_is_refused(
+    record: dict[str, Any], sentence: str, site: Site, tmp_path: Path
+) -> None:
+    save_site(site, tmp_path / "site.yaml")
+    with pytest.raises(InputError, match=sentence):
+        piped([record], tmp_path)
+
+
+def test_samples_and_fields_in_one_stream_are_refused(site: Site, tmp_path: Path) -> None:
+    save_site(site, tmp_path / "site.yaml")
+    tones = [[[1e-7, 0.0, 0.0], [0.0, 0.0, 0.0]]]
+    fields = {"time": 0.0, "window": 0.1, "phasors": {"A": tones}, "sigma": 1e-9}
+    samples = {"time": 0.0, "field": [0.0, 0.0, 1e-5]}
+    lines: list[dict[str, Any]] = [
+        {"magnetometer": {**samples, "magnetometer": "left"}},
+        {"fields": {**fields, "magnetometer": "right"}},
+    ]
+    for order, said in ((lines, "fields: they come beside"), (lines[::-1], "come beside fields")):
+        with pytest.raises(InputError, match=said):
+            piped(order, tmp_path)
+
+
+def test_the_name_of_the_only_one_is_taken_and_another_refused(tmp_path: Path) -> None:
+    save_site(demo_site(), tmp_path / "site.yaml")
+    samples = {"time": 0.0, "field": [0.0, 0.0, 1e-5]}
+    assert piped([{"magnetometer": {**samples, "magnetometer": "magnetometer"}}], tmp_path) == []
+    with pytest.raises(InputError, match="of magnetometer left, which the site does not know"):
+        piped([{"magnetometer": {**samples, "magnetometer": "left"}}], tmp_path)
+
+
+def test_the_earth_field_of_several_is_refused(site: Site) -> None:
+    with pytest.raises(InputError, match="--earth measures by one magnetometer"):
+        Navigator(site, NavigatorSettings(earth=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["raw", "demodulated"])
+def test_a_stream_goes_on_from_its_checkpoint(
+    kind: str, site: Site, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    directory = written(request.getfixturevalue(kind), site, tmp_path)
+    lines = records(directory)
+    expected = piped(lines, directory)
+    kept = StreamSettings(EKF, checkpoint=tmp_path / "kept.bin", every=0.01)
+    # A checkpoint is left with the newest stamp there is: that of an inertial record.
+    cut = 1 + max(k for k in range(int(0.85 * len(lines))) if "imu" in lines[k])
+    before = piped(lines[:cut], directory, kept)
+    after = piped(lines[cut:], directory, replace(kept, resume=True))
+    assert before
+    assert after
+    assert [*before, *after] == expected
+
+
+@pytest.mark.slow
+def test_what_is_kept_does_not_grow(site: Site, raw: Log) -> None:
+    navigator, replayed = Navigator(site, EKF), Replay(raw)
+    sizes = []
+    for _, piece in replayed.pieces():
+        feed(navigator, piece)
+        navigator.take()
+        if navigator.started:
+            sizes.append(len(msgpack.packb(navigator.checkpoint(), default=lambda a: a.tobytes())))
+    half = len(sizes) // 2
+    assert max(sizes[half:]) < 1.1 * max(sizes[:half])

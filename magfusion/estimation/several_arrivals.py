@@ -161,14 +161,15 @@ class SeveralArrivals(Arrivals):
         """Until when all were heard, or are not waited for any more (s)."""
         if not np.isfinite(self.begun_at):
             return -np.inf
-        heard = self._heard_to().values()
-        given_up = max(heard) - SILENCE - self._longest
-        return max(min(heard), given_up, self.inertial - LONGEST_WAIT)
+        heard, silent = self._heard_to(), self._silent()
+        waited = min(to for name, to in heard.items() if name not in silent)
+        return max(waited, self.inertial - LONGEST_WAIT)
 
     def _silent(self) -> list[str]:
         """Return which magnetometers are not waited for."""
-        complete = self.complete
-        return [name for name, heard in self._heard_to().items() if heard < complete]
+        heard = self._heard_to()
+        newest = max(heard.values())
+        return [n for n, to in heard.items() if newest - to > SILENCE + self._longest]
 
     @property
     def _newest(self) -> float:
