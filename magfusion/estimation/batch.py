@@ -22,6 +22,7 @@ from magfusion.estimation.measurements.signs import count_open
 from magfusion.estimation.measurements.zero_velocity import may_stand, quiet_before
 from magfusion.estimation.noise_tuning import Tuned, as_declared, noise_of, plausible, with_noise
 from magfusion.estimation.noise_tuning import settled as same_noise
+from magfusion.estimation.passes import Passed, PassFile
 from magfusion.estimation.prepared import prepared
 from magfusion.estimation.relaxation import Step, part_of_the_way
 from magfusion.estimation.settings import SmootherSettings as SmootherSettings
@@ -135,7 +136,11 @@ class Smoothed:
 
 
 def smooth(
-    log: Log, site: Site, settings: SmootherSettings | None = None, report: Report = quiet
+    log: Log,
+    site: Site,
+    settings: SmootherSettings | None = None,
+    report: Report = quiet,
+    passes: PassFile | None = None,
 ) -> Smoothed:
     """Estimate the best trajectory of a log, with the calibration in the same solution.
 
@@ -145,6 +150,8 @@ def smooth(
         With a waveform, or with phasors in the site's channel order.
     report : callable, optional
         Called with stage, steps done and steps in all.
+    passes : PassFile, optional
+        Keeps where the passes are, and knows where those of a run that was stopped were.
 
     Raises
     ------
@@ -166,10 +173,12 @@ def smooth(
         check_earth(site)
     log, site = heard_site(log, site, settings.lockin)
     known = mended(log, site)
-    return _solved(prepared(known, site, settings, report), settings, report)
+    return _solved(prepared(known, site, settings, report), settings, report, passes)
 
 
-def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smoothed:
+def _solved(
+    log: PreparedLog, settings: SmootherSettings, report: Report, passes: PassFile | None = None
+) -> Smoothed:
     states, calibration, wave = log.states, log.declared, None
     segments: tuple[Calibration, ...] = ()
     declared = log.declared.site
@@ -181,10 +190,18 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
     iterations, done, settled = 0, 0, False
     tuned: tuple[Tuned, ...] = ()
     step: Step | None = None
+    first = log.declared
+    known = None if passes is None else passes.begun(log)
+    if known is not None:
+        log = replace(log, declared=known.declared)
+        states, calibration, segments = known.states, known.calibration, known.segments
+        standing, tuned, tuning, step = known.standing, known.tuned, known.tuning, known.step
+        iterations, done = known.iterations, known.done
     while done < settings.passes and not settled:
         report(f"pass {done + 1}", done + 2, settings.passes + 3)
         if done > 0 and by_waveform:
             wave = log.compensated(calibration, states)
+            give_back_memory()
         elif not log.samples.signed:
             wave = log.with_signs(calibration, states, first=done == 0)
         graph, gaps = graph_of(log, states, calibration, wave, standing)
@@ -219,7 +236,24 @@ def _solved(log: PreparedLog, settings: SmootherSettings, report: Report) -> Smo
             states, calibration = part_of_the_way(*moved, graph.blocks, step.share)
             del graph, found  # of a long log they are most of what there is
             give_back_memory()
+            if passes is not None:
+                passed = Passed(
+                    done=done,
+                    iterations=iterations,
+                    tuning=tuning,
+                    states=states,
+                    declared=log.declared,
+                    calibration=calibration,
+                    segments=segments,
+                    standing=standing,
+                    tuned=tuned,
+                    step=step,
+                )
+                passes.keep(passed, first, log.blocks)
     report("posterior", settings.passes + 2, settings.passes + 3)
+    # What the receiver keeps for another pass is not needed any more.
+    log = replace(log, demodulation=replace(log.demodulation, receiver=None))
+    give_back_memory()
     fields = log.samples if wave is None else wave.fields
     result = posterior(log, graph, found, fields, gaps)
     report("done", settings.passes + 3, settings.passes + 3)

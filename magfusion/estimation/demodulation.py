@@ -17,7 +17,7 @@ from magfusion.model.parameters import Calibration
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields
 from magfusion.model.site import Site
 from magfusion.model.strapdown import resting
-from magfusion.model.trajectory import Trajectory
+from magfusion.model.trajectory import Trajectory, interpolated
 from magfusion.receiver.admission import Windows
 from magfusion.receiver.cycles import whole_cycles
 from magfusion.receiver.receiver import LockinReceiver, Receiver
@@ -104,16 +104,14 @@ class Demodulation:
         assert waveform is not None
         assert self.receiver is not None
         assert self.windows is not None
-        assert states.gyro_bias_body is not None
-        time = imu.time + offset
-        bias = [np.interp(time, states.time, b) for b in states.gyro_bias_body.T]
-        known = on_clock(imu, offset, np.stack(bias, axis=1))
+        known = on_clock(imu, offset, _bias_at(imu.time + offset, states))
         site, windows = calibration.site, self.windows
         if not isinstance(self.receiver, LockinReceiver):
             found, _ = self.receiver.phasors(waveform, known, windows, site)
             return MotionCompensated.of_slots(found)
         length = self.receiver.settings.window
         operator = self.receiver.operator(waveform, known, windows, site)
+        del known  # of a long log it is as much as the log
         if self.blind is not None:
             operator = replace(operator, apart=self.blind)
         wave = demodulate_about(operator, waveform.measured_sensor, states, imu, calibration)
@@ -121,6 +119,12 @@ class Demodulation:
             return wave
         fields = noisier(wave.fields, self.blind, states, calibration, length)
         return replace(wave, fields=fields)
+
+
+def _bias_at(time: Array, states: Trajectory) -> Array:
+    """Return the bias of the gyro at some times, shape (n, 3) (rad/s)."""
+    assert states.gyro_bias_body is not None
+    return interpolated(time, states.time, states.gyro_bias_body)
 
 
 OFF_GRAVITY = 0.5  # of it; a specific force farther from it is not its opposite

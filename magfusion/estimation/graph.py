@@ -1,12 +1,13 @@
 """The graph of a log or of a window: inertial factors, measurements, a calibration beside them."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
+from magfusion.estimation.considered import responses
 from magfusion.estimation.drift_segments import ONE_SEGMENT, Segments
 from magfusion.estimation.factors import (
     CALIBRATION_KEY,
@@ -19,7 +20,7 @@ from magfusion.estimation.factors import (
 from magfusion.estimation.inertial import ROWS, Link
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.prior_factor import PriorShift, prior_factor
-from magfusion.estimation.solve.bordered import eliminate, eliminate_partial, last_marginal
+from magfusion.estimation.solve.bordered import eliminate, last_marginal
 from magfusion.estimation.solve.ordering import nested_dissection
 from magfusion.estimation.state import states_in
 from magfusion.model.parameters import (
@@ -30,7 +31,7 @@ from magfusion.model.parameters import (
     prior_sigma,
     retract,
 )
-from magfusion.model.prior import prior_sqrt_covariance, prior_sqrt_information
+from magfusion.model.prior import prior_sqrt_information
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
@@ -297,35 +298,11 @@ class Graph:
     def responses(
         self, estimate: Estimate, considered: tuple[Block, ...]
     ) -> Iterator[gtsam.VectorValues]:
-        """Yield the step of every variable that considered parameters cause.
+        """Yield the steps that considered parameters cause.
 
-        One for each column of their prior's spread: one sigma of each where they are independent.
-        They are left over when all else is eliminated, so that one elimination serves them all.
+        As of `magfusion.estimation.considered`.
         """
-        assert self.declared is not None
-        spread, shift = prior_sqrt_covariance(self.declared.site, considered), None
-        if self.shift is not None:
-            spread, shift = self.shift.beside(spread)
-        graph = replace(self, declared=None).beside(
-            estimate, considered, spread, self.by_considered(spread)
-        )
-        if self.blocks:
-            graph.push_back(prior_factor(self.declared, self.declared, self.blocks, shift))
-        conditional, _ = eliminate_partial(graph, self.ordering)
-        return steps_of_others(conditional, spread.shape[1])
-
-
-def steps_of_others(
-    conditional: gtsam.GaussianBayesNet, count: int
-) -> Iterator[gtsam.VectorValues]:
-    """Yield the step of every variable that a unit of each parameter that is held causes.
-
-    One at a time: of a long log all of them are as much as the log.
-    """
-    for one in np.eye(count):
-        given = gtsam.VectorValues()
-        given.insert(CONSIDERED_KEY, one)
-        yield conditional.optimize(given)
+        return responses(self, estimate, considered)
 
 
 def initial_estimate(

@@ -114,6 +114,7 @@ class MotionShape:
             start = _turn_at(states.time, world_from_start, spread, time[rows])
             world_from_body[:, rows] = product(start, chain[:, rows])
             world_accel[rows] = turned(world_from_body[:, rows], accel[rows].T).T
+        del accel  # of a long log each of these is a good part of the log
         world_accel -= [0.0, 0.0, gravity]
         velocity, position = _integrated(time, world_accel)
         return MotionShape(
@@ -218,8 +219,11 @@ class MotionShape:
         speed, moved = _integrated(self.time, tilted)
         del tilted
         moved -= self.velocity_world
+        position = self._averaged(moved)
+        del moved
         speed -= self.accel_world
-        position, velocity = self._averaged(moved), self._averaged(speed)
+        velocity = self._averaged(speed)
+        del speed
         held_back = _hermite(self.time, position, velocity, known)
         return _ByOffset(rate, at_states, position, velocity, held_back)
 

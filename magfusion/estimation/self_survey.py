@@ -15,6 +15,7 @@ from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.beacon_placement import DetectedFields, detected_along, places
 from magfusion.estimation.demodulation import phasors
 from magfusion.estimation.log_graph import overlap
+from magfusion.estimation.passes import PassFile
 from magfusion.model.parameters import Calibration
 from magfusion.model.progress import Report
 from magfusion.model.samples import FieldSamples, Log
@@ -63,7 +64,11 @@ class Placement:
 
 
 def smooth_and_place(
-    log: Log, site: Site, settings: SmootherSettings, report: Report
+    log: Log,
+    site: Site,
+    settings: SmootherSettings,
+    report: Report,
+    passes: PassFile | None = None,
 ) -> tuple[Smoothed, tuple[Placement, ...]]:
     """Smooth a log, with those beacons placed that the site declares unknown.
 
@@ -71,6 +76,8 @@ def smooth_and_place(
     ----------
     site : Site
         Without unknown beacons this is `magfusion.estimation.batch.smooth`.
+    passes : PassFile, optional
+        Of a log whose beacons are all known.
 
     Raises
     ------
@@ -81,7 +88,7 @@ def smooth_and_place(
     """
     unknown = [beacon for beacon in site.beacons if beacon.unknown is not None]
     if not unknown:
-        return smooth(log, site, settings, report), ()
+        return smooth(log, site, settings, report, passes), ()
     _refuse(site, unknown, settings)
     samples, _ = phasors(log, site, settings.lockin)
     states, calibration = _by_the_known(log, site, samples, settings, report)

@@ -26,6 +26,7 @@ from magfusion.results.figures import Figure, Figures, Section, heading
 if TYPE_CHECKING:
     from magfusion.estimation.at_rest import AtRest
     from magfusion.estimation.batch import Smoothed, SmootherSettings
+    from magfusion.estimation.passes import PassFile
     from magfusion.jobs.inputs import Job
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
@@ -58,6 +59,10 @@ class SmoothSettings(
     tune: bool = option(
         True, "Find noise and model error from the residuals; what is declared is a prior"
     )
+    checkpoint: Path | None = option(
+        None, "File that keeps what each pass over the log left, while the job runs"
+    )
+    resume: bool = option(False, "Continue from the checkpoint, if there is one")
     free: str | None = option(
         None, "What nobody measured of a receiver of one axis: gain", metavar="gain"
     )
@@ -77,6 +82,13 @@ class SmoothSettings(
             raise InputError(
                 "--at-rest gives phasors of whole rests, which know nothing of the Earth field nor"
                 " of a common gain; leave --earth and --free out"
+            )
+        if self.resume and self.checkpoint is None:
+            raise InputError("--resume goes on from a file; name it with --checkpoint FILE")
+        if self.checkpoint is not None and self.more:
+            raise InputError(
+                "--checkpoint keeps the passes over one log; of several what is done is kept in"
+                " the output: leave it out and repeat the command"
             )
         if self.free and self.more:
             raise InputError("--free gain is found in one log; smooth the logs one by one")
@@ -108,9 +120,17 @@ def run(settings: SmoothSettings, output: Path, report: Report = quiet) -> Figur
 
         parts = settings, smoother, output, report
         return run_joint("smooth", *parts, rate=settings.rates, risk=settings.risks)
-    gain, rate, risk = settings.free is not None, settings.rates, settings.risks
-    rest = settings if settings.at_rest else None
-    return run_smooth(job, smoother, rate=rate, risk=risk, free_gain=gain, rest=rest, report=report)
+    place = settings.checkpoint
+    return run_smooth(
+        job,
+        smoother,
+        rate=settings.rates,
+        risk=settings.risks,
+        free_gain=settings.free is not None,
+        rest=settings if settings.at_rest else None,
+        kept=None if place is None else (place, settings.resume),
+        report=report,
+    )
 
 
 def run_smooth(
@@ -121,6 +141,7 @@ def run_smooth(
     risk: Risk | None = None,
     free_gain: bool = False,
     rest: RestSettings | None = None,
+    kept: tuple[Path, bool] | None = None,
     report: Report = quiet,
 ) -> Figures:
     """Smooth a log: trajectory, refined site, report and recording.
@@ -136,6 +157,8 @@ def run_smooth(
         Whether the gain of a receiver of one axis is begun where single epochs find it.
     rest : RestSettings, optional
         By which whole rests are integrated, in place of windows.
+    kept : tuple of (Path, bool), optional
+        File that keeps what each pass left, and whether to go on from it.
 
     Raises
     ------
@@ -177,10 +200,11 @@ def run_smooth(
             f"{job.declared_path}: beacons that were never surveyed are placed by one magnetometer;"
             " give a site that has one"
         )
+    passes = None if kept is None else _passes(*kept, log, site, settings)
     began = time.perf_counter()
     try:
         with named(job.log_path):
-            result, placed = smooth_and_place(log, site, settings, report)
+            result, placed = smooth_and_place(log, site, settings, report, passes)
             log, site, result, said = _agreed(log, site, settings, result, risk)
     except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
         reason = reason_of(error)
@@ -202,8 +226,32 @@ def run_smooth(
     done = with_errors(done, log, placed, (site, settings))
     with claimed as whole:
         write_finished(whole, log, done, rate=rate)
+    if passes is not None:
+        passes.place.unlink(missing_ok=True)
     refuse_failed(job.log_path, output=job.output, trust=done.trust)
     return done.figures
+
+
+def _passes(
+    place: Path, resume: bool, log: Log, site: Site, settings: SmootherSettings
+) -> PassFile:
+    """Return the file that keeps the passes, of a log with this site and these settings."""
+    from magfusion.estimation.passes import PassFile
+    from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
+
+    if any(beacon.unknown is not None for beacon in site.beacons):
+        raise InputError(
+            "--checkpoint keeps the passes over a log whose beacons are all surveyed; leave it out"
+        )
+    if not place.parent.is_dir():
+        raise InputError(f"{place.parent}: is no directory; make it, or give another path")
+    streams = [s for s in (log.imu, log.waveform, log.fields) if s is not None]
+    key = run_key("smooth", site, settings, log.epoch_ns, streams)
+    if resume:
+        read_position(place, key)
+    else:
+        claim_checkpoint(place)
+    return PassFile(place, key, resume)
 
 
 def _rested(

@@ -13,8 +13,9 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.considered import steps_of_others
 from magfusion.estimation.factors import CALIBRATION_KEY, CONSIDERED_KEY, NUISANCE_KEY
-from magfusion.estimation.graph import Estimate, Graph, steps_of_others
+from magfusion.estimation.graph import Estimate, Graph
 from magfusion.estimation.inertial import ROWS
 from magfusion.estimation.integrity.suspects import TOLERANCE, Inertial, Stream, held_blocks
 from magfusion.estimation.measurements.earth import EarthField
@@ -115,16 +116,22 @@ def score_of(result: Smoothed, imu: ImuSamples) -> Score | None:
         return None
     unit = np.diag(prior_sigma(held))
     by_others = _by_stream(result, held, imu) @ unit
-    system = graph.beside(estimate, held, unit, by_others, explaining=True)
-    conditional, rest = eliminate_partial(system, graph.ordering)
+    # One system after the other: of a long log each of them is most of what there is.
+    left = None
     if result.field_errors:
         # An error that is constant in place looks like some of them; what freeing them does to the
         # estimate, which weighs epochs as if there were none, stays the same.
         ordering = graph.ordering
         ordering.push_back(NUISANCE_KEY)
         errors = result.field_errors
-        system = graph.beside(estimate, held, unit, by_others, explaining=True, nuisance=errors)
-        _, rest = eliminate_partial(system, ordering)
+        _, left = eliminate_partial(
+            graph.beside(estimate, held, unit, by_others, explaining=True, nuisance=errors),
+            ordering,
+        )
+    conditional, rest = eliminate_partial(
+        graph.beside(estimate, held, unit, by_others, explaining=True), graph.ordering
+    )
+    rest = rest if left is None else left
     order = gtsam.Ordering()
     order.push_back(CONSIDERED_KEY)
     information, gradient = rest.hessian(order)

@@ -22,6 +22,7 @@ from magfusion.model.prior import prior_sqrt_covariance, prior_sqrt_information
 from magfusion.units import Array, BoolArray, IntArray
 
 AT_ONCE = 2e8  # bytes; variants are solved in groups of so much
+KEPT = 1e8  # bytes of rows; what is more is made anew for every group
 # A prior that keeps what is open finite: far wider than anything that is of use.
 OPEN = np.repeat([30.0, 300.0, 300.0, 30.0, 3.0], 3)  # rad, m, m/s, m/s^2, rad/s
 _FIRST, _WIDTH = {"x": 0, "v": 6, "b": 9}, {"x": 6, "v": 3, "b": 6}  # in a state's tangent vector
@@ -36,26 +37,33 @@ class _Normal:
     def __init__(self, states: int, calibration: int, considered: int) -> None:
         self.diagonal = np.zeros((states, MOTION, MOTION))
         self.following = np.zeros((max(states - 1, 0), MOTION, MOTION))
-        self.border = np.zeros((states, MOTION, calibration))
+        self.sides = np.zeros((states, MOTION, 1 + considered + calibration))
         self.corner = np.zeros((calibration, calibration))
-        self.right = np.zeros((states, MOTION, 1 + considered))
         self.right_border = np.zeros((calibration, 1 + considered))
+
+    @property
+    def right(self) -> Array:
+        """Right sides, shape (states, 15, 1 + considered)."""
+        return self.sides[..., : self.right_border.shape[1]]
+
+    @property
+    def border(self) -> Array:
+        """By the calibration, shape (states, 15, calibration)."""
+        return self.sides[..., self.right_border.shape[1] :]
 
     def variants(self, count: int) -> tuple[Chain, list["_Normal"]]:
         """Return so many copies as one chain, and each of them to add rows of fields to."""
-        chain = Chain(
-            *(
-                np.repeat(getattr(self, name)[None], 1 if name == "following" else count, axis=0)
-                for name in ("diagonal", "following", "border", "corner", "right", "right_border")
-            )
-        )
+        copies = {
+            name: np.repeat(value[None], 1 if name == "following" else count, axis=0)
+            for name, value in vars(self).items()
+        }
         own = []
         for k in range(count):
             one = object.__new__(_Normal)
-            for name, value in vars(chain).items():
+            for name, value in copies.items():
                 setattr(one, name, value[0 if name == "following" else k])
             own.append(one)
-        return chain, own
+        return Chain.of_sides(**copies), own
 
     def add(
         self, epoch: IntArray, own: Array, after: Array | None, border: Array, right: Array
@@ -136,7 +144,7 @@ class _Rows:
             by_state, by_calibration = jacobian[..., :MOTION], jacobian[..., MOTION:]
             piece = _Piece(factors.measurement.epoch, by_state, by_calibration, right)
             size += _size(piece)
-            if size < AT_ONCE:
+            if size < KEPT:
                 self.known.append(piece)
             yield piece
 

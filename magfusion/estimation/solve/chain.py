@@ -27,6 +27,8 @@ class Chain:
     corner : ndarray, shape (h, c, c)
     right : ndarray, shape (h, n, s, r)
     right_border : ndarray, shape (h, c, r)
+    sides : ndarray, shape (h, n, s, r + c), optional
+        Of which right sides and border are the parts: solving the chain overwrites it.
     """
 
     diagonal: Array
@@ -35,6 +37,15 @@ class Chain:
     corner: Array
     right: Array
     right_border: Array
+    sides: Array | None = None
+
+    @staticmethod
+    def of_sides(
+        diagonal: Array, following: Array, sides: Array, corner: Array, right_border: Array
+    ) -> "Chain":
+        """Return a chain whose right sides and border are parts of one array."""
+        right, border = np.split(sides, [right_border.shape[-1]], axis=-1)
+        return Chain(diagonal, following, border, corner, right, right_border, sides)
 
 
 class ChainSolution(NamedTuple):
@@ -58,7 +69,10 @@ def solve_chain(chain: Chain, kept: int) -> ChainSolution:
     n, size = chain.diagonal.shape[1:3]
     # What is swept takes the place of the right sides, and what is found that of what is swept: of
     # a log of hours they are the largest of all.
-    solved = np.concatenate([chain.right, chain.border], axis=-1)
+    first, outer = chain.right[..., 0].copy(), chain.border.copy()
+    solved = chain.sides
+    if solved is None:
+        solved = np.concatenate([chain.right, chain.border], axis=-1)
     inverse, gain = [], []
     pivot = chain.diagonal[:, 0]
     for i in range(n):
@@ -77,14 +91,14 @@ def solve_chain(chain: Chain, kept: int) -> ChainSolution:
         own[:, i] = cov[:, :kept, :kept]
     count = chain.right.shape[-1]
     alone, by_border = solved[..., :count], solved[..., count:]
-    explained = np.einsum("hns,hns->h", chain.right[..., 0], alone[..., 0])
+    explained = np.einsum("hns,hns->h", first, alone[..., 0])
     if not chain.corner.shape[1]:
         return ChainSolution(alone[:, :, :kept], chain.right_border, own, explained)
     # What the states leave of the border.
-    flat = chain.border.reshape(len(chain.border), n * size, -1)
-    left = np.swapaxes(flat, 1, 2)
-    corner = _inverse(chain.corner - left @ by_border.reshape(len(flat), n * size, -1))
-    rest = chain.right_border - left @ alone.reshape(len(flat), n * size, -1)
+    left = np.swapaxes(outer.reshape(len(outer), n * size, -1), 1, 2)
+    taken = left @ solved.reshape(len(outer), n * size, -1)
+    corner = _inverse(chain.corner - taken[..., count:])
+    rest = chain.right_border - taken[..., :count]
     border = corner @ rest
     part = by_border[..., :kept, :]
     states = alone[:, :, :kept] - part @ border[:, None]
