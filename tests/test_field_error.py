@@ -53,7 +53,7 @@ def test_a_mode_moves_the_estimate_as_its_response_says() -> None:
     block = result.field_errors[0]
     site, fields = result.calibration.site, result.fields
     poses = result.states
-    column = 7  # the second mode
+    column = 13  # of the second mode
     steps = list(result.graph.responses(result.estimate, result.uncertain))
     first = result.uncertain[-len(result.field_errors)].columns.start
     response = steps[first + column]

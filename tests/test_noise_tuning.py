@@ -9,10 +9,11 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import chi2
 
-from magfusion.estimation import noise_tuning
+from magfusion.estimation import variance_components
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.integrity.tuned_noise import tuned_noise
-from magfusion.estimation.noise_tuning import NORMAL, STUDENT, Tuned, _likeliest, tuned_site
+from magfusion.estimation.noise_tuning import Tuned, tuned_site
+from magfusion.estimation.variance_components import KINDS, NORMAL, STUDENT, likeliest
 from magfusion.files.site import load_site, save_site
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
@@ -146,11 +147,12 @@ def test_of_a_strong_beacon_nothing_is_found_that_was_not_declared() -> None:
     """A white error as large as its model error would be a thousand times its noise."""
     rng = np.random.default_rng(0)
     over_scales = np.tile([10.0, 1.0, 0.1, 0.01], 100)
-    parts = np.stack([np.ones(400), over_scales, np.full(400, 1e6)])
-    variance = np.array([1.0, 0.25, 0.0]) @ parts
+    smoother = np.tile([10.0, 0.3, 0.02, 0.001], 100)
+    parts = np.stack([np.ones(400), over_scales, smoother, np.full(400, 1e6)])
+    variance = np.array([1.0, 0.25, 0.0, 0.0]) @ parts
     square = variance * rng.chisquare(6, 400)
-    log = _likeliest(square, parts, np.zeros(400), np.full(400, 0.5), 6, slice(2, None))
-    noise, _, white = np.exp(2.0 * log)[:, None] * parts
+    log = likeliest(square, parts, np.zeros(400), np.full(400, 0.5), 6, KINDS)
+    noise, _, _, white = np.exp(2.0 * log)[:, None] * parts
     assert np.mean(noise + white) == pytest.approx(1.0, abs=0.2)
 
 
@@ -165,10 +167,10 @@ def test_the_slope_of_the_likelihood_is_its_derivative(monkeypatch: pytest.Monke
         asked.append((gradient(at), np.array(slope)))
         return start
 
-    monkeypatch.setattr(noise_tuning, "minimise_bounded", compare)
+    monkeypatch.setattr(variance_components, "minimise_bounded", compare)
     rng = np.random.default_rng(0)
-    parts, square = rng.uniform(0.1, 2.0, (3, 50)), rng.chisquare(6, 50)
-    _likeliest(square, parts, np.full(50, 0.1), np.full(50, 0.5), 6, slice(2, None))
+    parts, square = rng.uniform(0.1, 2.0, (4, 50)), rng.chisquare(6, 50)
+    likeliest(square, parts, np.full(50, 0.1), np.full(50, 0.5), 6, KINDS)
     ((given, expected),) = asked
     assert given == pytest.approx(expected, rel=1e-6)
 

@@ -96,7 +96,7 @@ class EpochUpdate:
     def begin(self, start: OnlineStart) -> Judgement:
         """Judge a first state."""
         said = Judgement(start.trust.reasons, turn=start.turn, shift=start.shift)
-        self.witness.begin(start.state.time, said)
+        self.witness.begin(start.state.time, said, start.borrowed)
         self.score.begin(start.score, start.state.time)
         fitted = [f for f in start.trust.remarks if f.code == "fitted_line" and start.beside]
         return self._judged(start.state, None).beside(*fitted)

@@ -10,7 +10,6 @@ few degrees of freedom lets what is false a while say little of the noise of the
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -20,28 +19,20 @@ from magfusion.estimation.log_graph import PreparedLog, overlap
 from magfusion.estimation.measurements.model_error import alike_in_batch
 from magfusion.estimation.motion_compensation import MotionCompensated
 from magfusion.estimation.residual_shares import ChannelErrors, Leavings
-from magfusion.estimation.solve.bounded import minimise_bounded
+from magfusion.estimation.variance_components import BeaconParts, likeliest, parts_of
 from magfusion.model.parameters import Block, Calibration
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray
 
-PRIOR = float(np.log(2.0))  # of the logarithm of a declared sigma
-LEAST, MOST = 0.1, 1e3  # of a factor; that a noise is smaller yet, no log tells for sure
-STUDENT = 4.0  # degrees of freedom: what is false says little
-# Gain, by components, with which that distribution finds the variance of normal residuals.
-NORMAL = {3: 1.322946, 6: 1.224631}
 SETTLED = 0.05  # of a logarithm; a smaller change is none
 GYRO, ACCEL = slice(0, 3), slice(6, 9)  # rows of an inertial factor that each determines
-SCALES = 8  # epochs in a row that are compared, so far apart that they share no sample
 FAULT = 3.0  # of a declared model error; more is no error of that kind, and is not covered by it
-WEIGHINGS = 5  # times that the epochs are weighed by what is found, at first as if noise were all
 OF_IMU = ("gyro_noise", "accel_noise")  # a beacon may be called "imu", too
 # Of a motion prior, by what of the IMU stands for it; the rate is that of the bias, in its rows.
 OF_MOTION = {"angular_accel_density": "gyro_bias_walk", "accel_density": "accel_noise"}
 WALK = slice(12, 15)
-NONE = 1e-4  # of a part that was not declared: as good as none
 PLAUSIBLE = 6.0  # by a factor of more, either way, white noise is a fault under another name
 LEFT = 1e-3  # of an error; of which less is left says nothing
 # Of a beacon's noise; where less is left no IMU holds the pose, the beacon alone does, and by its
@@ -159,48 +150,42 @@ def tune(
     system = Leavings(graph, estimate, samples, poses, windows, considered)
     now = estimate.calibration.site
     lag = max(1, round(windows))
-    found: list[Tuned] = []
-    for i, beacon in enumerate(now.beacons):
-        channels = [_without(own, blind) for own in system.channels_of(i)]
-        square, expected, near = _by_scale(channels, alike, lag)
-        if not len(square):
-            continue
-        prior = declared.beacons[i]
-        usual = declared.model_error if prior.model_error is None else prior.model_error
-        tuned = beacon.field_map is None and usual > 0.0
-        known = np.array([prior.noise_factor, usual, usual])[:, None] ** 2 * expected[:3]
-        fixed, weight = expected[3], np.full(len(square), 1.0 / lag)
-        if not tuned:
-            known, fixed = known[:1], fixed + known[1]
-        for _ in range(WEIGHINGS):
-            log = _likeliest(square, known, fixed, weight, 6, slice(2, None))
-            parts = np.exp(2.0 * log)[:, None] * known
-            of_model = (parts[1] if tuned else fixed) / (np.sum(parts, axis=0) + fixed)
-            weight = (1.0 - of_model + of_model * near) / lag
-        # What is white but goes with the field, as of a jitter among gradients, is noise all told.
-        white = float(np.sum(parts[::2]) / np.sum(known[0]))
-        # Of a strong beacon less noise than declared is not to be told from a little model error.
-        unsure = LEAST**2 * float(np.sum(known[2:]) / np.sum(known[0]))
-        white = float(np.sqrt(max(white, min(white + unsure, 1.0))))
-        self_made = not declared.platform.inertial and _left_of_noise(channels) < SELF_MADE
-        white = max(white, 1.0) if self_made else white
-        found.append(
-            Tuned(beacon.name, "noise_factor", prior.noise_factor, white * prior.noise_factor)
-        )
-        if tuned:
-            factor = min(float(np.exp(log[1])), FAULT)  # faults come first
-            factor = max(factor, 1.0) if self_made else factor
-            found.append(Tuned(beacon.name, "model_error", usual, factor * usual))
-    return (*found, *_tuned_imu(system, now, declared))
+    prior = declared.beacons
+    parts: dict[int, BeaconParts] = {}
+    self_made: dict[int, bool] = {}
+    for i in range(len(now.beacons)):
+        channels = [_without(channel, blind) for channel in system.channels_of(i)]
+        own = prior[i].model_error
+        usual = declared.model_error if own is None else own
+        sizes = prior[i].noise_factor, usual
+        mapped = now.beacons[i].field_map is not None
+        found = parts_of(channels, alike, lag, sizes, bent=not mapped and usual > 0.0)
+        if found is not None:
+            parts[i] = found
+            self_made[i] = not declared.platform.inertial and _left_of_noise(channels) < SELF_MADE
+    # Rare large errors say little, which makes those of a whole log seem smaller than they are.
+    taken = [part.taken for part in parts.values() if part.model is not None]
+    less = float(np.exp(np.mean(np.log(taken)))) if taken else 1.0
+    out: list[Tuned] = []
+    for i, part in parts.items():
+        name, (noise, usual) = prior[i].name, part.sizes
+        white = max(part.white, 1.0) if self_made[i] else part.white
+        out.append(Tuned(name, "noise_factor", noise, white * noise))
+        if part.model is not None:
+            factor = min(part.model / min(less, 1.0), FAULT)  # faults come first
+            factor = max(factor, 1.0) if self_made[i] else factor
+            out.append(Tuned(name, "model_error", usual, factor * usual))
+    smooth = [part.smooth for part in parts.values() if part.model is not None]
+    return (*out, *_tuned_imu(system, now, declared, float(np.mean(smooth)) if smooth else 0.0))
 
 
 def _without(own: ChannelErrors, blind: BoolArray | None) -> ChannelErrors:
     if blind is None:
         return own
     kept = ~blind[own.epoch]
-    noise, model, inertial = (part[kept] for part in own.left)
+    noise, rough, smooth, inertial = (part[kept] for part in own.left)
     variance = own.variance[0][kept], own.variance[1][kept]
-    left = noise, model, inertial
+    left = noise, rough, smooth, inertial
     return replace(own, epoch=own.epoch[kept], seen=own.seen[kept], left=left, variance=variance)
 
 
@@ -211,58 +196,14 @@ def _left_of_noise(channels: list[ChannelErrors]) -> float:
     return left / given if given > 0.0 else 1.0
 
 
-def _by_scale(channels: list[ChannelErrors], alike: Array, lag: int) -> tuple[Array, Array, Array]:
-    """Return squares of a beacon's residuals on several scales of time, and their expectation.
+def _tuned_imu(system: Leavings, now: Site, declared: Site, smooth: float) -> list[Tuned]:
+    """Return the densities of gyro and accelerometer.
 
-    Noise is alike on all scales; an error that is constant in place is mostly in the longest.
-
-    Returns
-    -------
-    square : ndarray, shape (m,)
-    expected : ndarray, shape (4, m)
-        Of a component, by noise and by model error of size one, by a relative error of size one
-        that is white, and by inertial noise.
-    near : ndarray, shape (m,)
-        Share of it that is independent, where model error prevails.
+    Parameters
+    ----------
+    smooth : float
+        Share of the model error's variance that is smooth.
     """
-    squares, parts, nears = [np.zeros(0)], [np.zeros((4, 0))], [np.zeros(0)]
-    for scale in _haar(SCALES):
-        seen, left, given = [], [], []
-        for own in channels:
-            used = len(own.seen) // (SCALES * lag) * SCALES * lag
-            shape = (-1, SCALES, lag)
-            rows = [
-                np.einsum("s,bslk->blk", scale, v[:used].reshape(*shape, 6)).reshape(-1, 6)
-                for v in (own.seen, *own.left)
-            ]
-            seen.append(np.sum(rows[0] ** 2, axis=1))
-            left.append([np.sum(row**2, axis=1) for row in rows[1:]])
-            given.append([np.mean(v[:used].reshape(shape), axis=1).ravel() for v in own.variance])
-            close = np.mean(alike[own.epoch][:used].reshape(shape), axis=1).ravel()
-            nears.append(np.minimum(SCALES * lag / close, 1.0))
-        kept, drawn = np.concatenate(left, axis=1), np.concatenate(given, axis=1)
-        # Of a wrong motion too, a stronger field has more.
-        drawn = np.stack([*drawn, drawn[1]])
-        total = np.array([*channels[0].size, 1.0]) ** 2 * np.sum(drawn, axis=1)
-        share = np.divide(np.sum(kept, axis=1), total, out=np.ones(3), where=total > 0.0)
-        squares += seen
-        rows = share[:, None] * drawn / 6.0
-        parts.append(np.stack([rows[0], rows[1], share[0] * drawn[1] / 6.0, rows[2]]))
-    return np.concatenate(squares), np.concatenate(parts, axis=1), np.concatenate(nears)
-
-
-@cache
-def _haar(size: int) -> Array:
-    """Return the orthonormal Haar transform, shape (size, size): the mean first."""
-    if size == 1:
-        return np.ones((1, 1))
-    means = np.kron(_haar(size // 2), [1.0, 1.0])
-    steps = np.kron(np.eye(size // 2), [1.0, -1.0])
-    return np.concatenate([means, steps]) / np.sqrt(2.0)
-
-
-def _tuned_imu(system: Leavings, now: Site, declared: Site) -> list[Tuned]:
-    """Return the densities of gyro and accelerometer."""
     plain = system.inertial()
     found = []
     owner, of_turn, names = "imu", GYRO, {name: name for name in OF_IMU}
@@ -270,10 +211,11 @@ def _tuned_imu(system: Leavings, now: Site, declared: Site) -> list[Tuned]:
         owner, of_turn, names = "motion_prior", WALK, OF_MOTION
     for (name, key), rows in zip(names.items(), (of_turn, ACCEL), strict=True):
         scale = system.sigma[:, rows]
-        square, noise, model, own = (np.sum((p[:, rows] / scale) ** 2, axis=1) for p in plain)
+        square, noise, *model, own = (np.sum((p[:, rows] / scale) ** 2, axis=1) for p in plain)
+        bent = (1.0 - smooth) * model[0] + smooth * model[1]
         before, usual = getattr(declared.platform.imu, key), getattr(now.platform.imu, key)
         here = system.ordinary
-        every = [float(np.mean(p[here])) / 3.0 for p in (noise, model, own)]
+        every = [float(np.mean(p[here])) / 3.0 for p in (noise, bent, own)]
         if not np.any(here) or every[2] < LEFT:
             continue
         count = int(np.sum(here))
@@ -281,55 +223,7 @@ def _tuned_imu(system: Leavings, now: Site, declared: Site) -> list[Tuned]:
         fixed = np.full(count, every[0] + every[1])
         # Neighbours in time share what is left of them.
         weight = np.full(count, min(1.0, (every[2] + fixed[0]) ** 2 / every[2]))
-        log = _likeliest(square[here], known, fixed, weight, 3)
+        log = likeliest(square[here], known, fixed, weight, 3)
         # What is declared below these holds scale and vibration too, which are not white.
         found.append(Tuned(owner, name, before, float(before * np.exp(max(log[0], 0.0)))))
     return found
-
-
-def _likeliest(
-    square: Array,
-    parts: Array,
-    fixed: Array,
-    weight: Array,
-    components: int,
-    undeclared: slice = slice(0, 0),
-) -> Array:
-    """Return the logarithm of what each part's standard deviation is too small by.
-
-    Parameters
-    ----------
-    square : ndarray, shape (m,)
-        Squared norms of residuals.
-    parts : ndarray, shape (kinds, m)
-        Expected square of a component by each kind of noise, as declared.
-    fixed : ndarray, shape (m,)
-        And by all else.
-    weight : ndarray, shape (m,)
-        Of each: how much of it is independent.
-    components : int
-        Of each residual.
-    undeclared : slice
-        Parts of which nothing was declared: there may be none of them.
-    """
-    start, least = np.zeros(len(parts)), np.full(len(parts), LEAST)
-    start[undeclared], least[undeclared] = np.log(LEAST), NONE
-    declared = np.ones(len(parts))
-    declared[undeclared] = 0.0
-    gain, width = NORMAL[components], STUDENT + components
-
-    def cost(log: Array) -> float:
-        variance = np.exp(2.0 * log) @ parts + fixed
-        bounded = width * np.log1p(gain * square / (STUDENT * variance))
-        likelihood = 0.5 * np.sum(weight * (components * np.log(variance) + bounded))
-        return float(likelihood + 0.5 * np.sum(declared * (log / PRIOR) ** 2))
-
-    def gradient(log: Array) -> Array:
-        by = 2.0 * np.exp(2.0 * log)[:, None] * parts
-        variance = 0.5 * np.sum(by, axis=0) + fixed
-        bounded = width * gain * square / (STUDENT * variance + gain * square)
-        by_variance = 0.5 * weight * (components - bounded) / variance
-        return np.asarray(by @ by_variance + declared * log / PRIOR**2)
-
-    limits = np.log(np.stack([least, np.full(len(parts), MOST)], axis=1))
-    return minimise_bounded(cost, start, limits, steps=100, decrease=1e-9, gradient=gradient)

@@ -37,7 +37,8 @@ class ChannelErrors:
     seen : ndarray, shape (m, 6)
         Residuals.
     left : tuple of ndarray, shape (m, 6)
-        What is left of drawn noise, of a drawn model error, and of drawn inertial noise.
+        What is left of drawn noise, of a rough and of a smooth drawn model error, and of drawn
+        inertial noise.
     variance : tuple of ndarray, shape (m,)
         Of noise and of model error of size one: the sum over the components.
     size : tuple of float
@@ -46,7 +47,7 @@ class ChannelErrors:
 
     epoch: IntArray
     seen: Array
-    left: tuple[Array, Array, Array]
+    left: tuple[Array, Array, Array, Array]
     variance: tuple[Array, Array]
     size: tuple[float, float]
 
@@ -130,15 +131,25 @@ class Leavings:
         drawn = noise[:, None] * _draw_noise(rng, samples, windows, root)
         length = max(site.model_error_length, 1e-3)
         sensors = sensor_world.shape[1]
-        shape = len(samples), samples.valid.shape[1] // sensors
-        world = _waves(rng, sensor_world / length, shape)
+        count = len(site.beacons)
+        tones = samples.valid.shape[1] // sensors
+        owner = self._owner[:tones]
+        phasor = np.nan_to_num(samples.phasor_sensor).reshape(len(samples), sensors, tones, 3)
+        parts = np.stack([phasor.real, phasor.imag], axis=3)
         turn = self._world_from_sensor
-        sensor = np.einsum("nsji,nscpj->nscpi", turn, world).reshape(*samples.valid.shape, 2, 3)
-        size = np.sqrt(np.trace(unit, axis1=2, axis2=3) / 3.0)[..., None, None]
-        false = model[:, None] * _six(np.einsum("ncij,ncpj->ncpi", root, size * sensor))
+        parts_world = np.einsum("nsij,nscpj->nscpi", turn, parts)
+
+        def false(matrix: Array) -> Array:
+            bent = np.einsum("nscij,nscpj->nscpi", matrix[:, :, owner], parts_world) / np.sqrt(3.0)
+            sensor = np.einsum("nsji,nscpj->nscpi", turn, bent).reshape(*samples.valid.shape, 2, 3)
+            return np.asarray(model[:, None] * _six(np.einsum("ncij,ncpj->ncpi", root, sensor)))
+
+        rough = false(_matrices(rng, sensor_world / length, count, smooth=False))
         imu = rng.standard_normal((len(self._inertial), ROWS))
+        smooth = false(_matrices(rng, sensor_world / length, count, smooth=True))
         nothing, still = np.zeros_like(drawn), np.zeros_like(imu)
-        self._left = [self._of(*e) for e in ((drawn, still), (false, still), (nothing, imu))]
+        errors = (drawn, still), (rough, still), (smooth, still), (nothing, imu)
+        self._left = [self._of(*error) for error in errors]
         every = (self._error, *(field for field, _ in self._left))
         self._apart = [self._without_pose(field) for field in every]
 
@@ -190,19 +201,18 @@ class Leavings:
         for channel in np.flatnonzero(self._owner == beacon).tolist():
             rows = np.flatnonzero(self._samples.valid[:, channel])
             turn = self._world_from_sensor[rows, self._sensor[channel]]
-            seen, noise, model, inertial = (
+            seen, noise, rough, smooth, inertial = (
                 np.einsum("nij,npj->npi", turn, e[rows, channel].reshape(-1, 2, 3)).reshape(-1, 6)
                 for e in self._apart
             )
             by_noise, by_model = (v[rows, channel] for v in self._variance)
             size = (float(self._size[0][beacon]), float(self._size[1][beacon]))
-            out.append(
-                ChannelErrors(rows, seen, (noise, model, inertial), (by_noise, by_model), size)
-            )
+            left = noise, rough, smooth, inertial
+            out.append(ChannelErrors(rows, seen, left, (by_noise, by_model), size))
         return out
 
     def inertial(self) -> list[Array]:
-        """Return inertial residuals, and what is left there of noise, model error and IMU's own.
+        """Return inertial residuals, and what is left there of noise, model errors and IMU's own.
 
         Each of shape (intervals, 15): rotation, position, velocity, biases.
         """
@@ -267,22 +277,25 @@ def _draw_noise(
     return _six(np.einsum("ncij,ncpj->ncpi", spread, drawn))
 
 
-def _waves(rng: np.random.Generator, place: Array, shape: tuple[int, ...]) -> Array:
-    """Return random fields of correlation exp(-distance), (n, magnetometers, channels, 2, 3).
+def _matrices(rng: np.random.Generator, place: Array, count: int, *, smooth: bool) -> Array:
+    """Return random matrices of place, (n, magnetometers, count, 3, 3), of elements of variance 1.
 
-    By waves of random vectors (random Fourier features), which are Cauchy's for that correlation.
+    Their correlation is exp(-distance), or exp(-distance^2 / 2) where they are smooth; by waves of
+    random vectors (random Fourier features), Cauchy's for the one and Gauss's for the other.
 
     Parameters
     ----------
     place : ndarray, shape (n, magnetometers, 3)
-    shape : tuple of int
-        Epochs, and channels of each magnetometer.
+    count : int
+    smooth : bool
     """
-    wave = rng.standard_normal((WAVES, 3)) / np.abs(rng.standard_normal((WAVES, 1)))
-    amplitude = rng.standard_normal((2, WAVES, shape[1] * 6)) / np.sqrt(WAVES)
+    wave = rng.standard_normal((WAVES, 3))
+    if not smooth:
+        wave /= np.abs(rng.standard_normal((WAVES, 1)))
+    amplitude = rng.standard_normal((2, WAVES, 9 * count)) / np.sqrt(WAVES)
     angle = place @ wave.T
     field = np.cos(angle) @ amplitude[0] + np.sin(angle) @ amplitude[1]
-    return np.asarray(field).reshape(*place.shape[:2], shape[1], 2, 3)
+    return np.asarray(field).reshape(*place.shape[:2], count, 3, 3)
 
 
 def _six(parts: Array) -> Array:

@@ -122,9 +122,7 @@ def slot_values(
     own_carrier = carrier[windows.place]
     inside = _inside(time, still, own, rate_hz)
     sums = _slot_sums(inside, own_carrier, settings)
-    # Of lengths that happen, the Earth's field leaks into what is beside the carrier.
-    beside = _centred(inside, own.count) if is_marked(site) else inside
-    noise = _noise(beside, own_carrier, windows.length, rate_hz)
+    noise = _noise(inside, own_carrier, windows.length, rate_hz)
     turn = measured_from_still(sums.time)
     return SlotValues(
         windows.number,
@@ -266,12 +264,6 @@ def _inside(time: Array, still: Array, windows: Windows, rate_hz: float) -> _Ins
     return _Inside(owner, begins, at, elapsed, still[sample], hann, slot_begin)
 
 
-def _centred(inside: _Inside, count: IntArray) -> _Inside:
-    """Return the samples of each slot without their mean."""
-    mean = np.add.reduceat(inside.still, inside.begins, axis=0) / count[:, None]
-    return replace(inside, still=inside.still - mean[inside.owner])
-
-
 def _slot_sums(inside: _Inside, carrier_hz: Array, settings: SlotSettings) -> _Sums:
     """Fit a constant, and beside a carrier its two quadratures, to each slot."""
     at, elapsed, begins = inside.time, inside.elapsed, inside.begins
@@ -306,14 +298,26 @@ def _slot_sums(inside: _Inside, carrier_hz: Array, settings: SlotSettings) -> _S
 def _noise(inside: _Inside, carrier_hz: Array, length: Array, rate_hz: float) -> Array:
     """Return the covariance per sample of what is beside the carrier, (n, 3, 3), still axes.
 
-    It is the power three cycles a slot away, tapered so that neither carrier nor hum leaks there.
+    It is the power three cycles a slot away, tapered so that hum does not leak there.  Nor does a
+    steady field, one that changes evenly, or the carrier, whatever the slot's length: what is seen
+    is blind to all of them.
     """
     away = 3.0 / length
     above = carrier_hz + away < 0.5 * rate_hz
     probe = np.where(above, carrier_hz + away, carrier_hz - away)
-    turned = inside.hann * np.exp(-2j * np.pi * probe[inside.owner] * inside.elapsed)
-    seen = np.add.reduceat(turned[:, None] * inside.still, inside.begins, axis=0)
-    power = np.add.reduceat(inside.hann**2, inside.begins)
+    turned = np.exp(-2j * np.pi * probe[inside.owner] * inside.elapsed)
+    columns = [np.ones(len(turned)), inside.elapsed / length[inside.owner] - 0.5]
+    if np.any(carrier_hz):
+        angle = 2.0 * np.pi * carrier_hz[inside.owner] * inside.elapsed
+        columns += [np.cos(angle), np.sin(angle)]
+    known = np.stack(columns, axis=1)
+    weighed = inside.hann[:, None] * known
+    normal = np.add.reduceat(weighed[:, :, None] * known[:, None], inside.begins, axis=0)
+    right = np.add.reduceat(weighed * turned[:, None], inside.begins, axis=0)
+    share = (np.linalg.pinv(normal, hermitian=True) @ right[..., None])[..., 0]
+    blind = inside.hann * (turned - np.sum(known * share[inside.owner], axis=1))
+    seen = np.add.reduceat(blind[:, None] * inside.still, inside.begins, axis=0)
+    power = np.add.reduceat(np.abs(blind) ** 2, inside.begins)
     cov = seen[:, :, None] * np.conj(seen[:, None])
     return np.asarray(cov.real / power[:, None, None])
 

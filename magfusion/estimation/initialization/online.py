@@ -29,6 +29,7 @@ from magfusion.receiver.receiver import Receiver
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.turn import on_clock, turn_of
 from magfusion.receiver.windows import LockinSettings
+from magfusion.units import Array
 
 START_RATE_HZ = 20.0  # of the cycles of a slotted tracker that a start is made of
 
@@ -53,6 +54,8 @@ class OnlineStart:
         The same of several magnetometers, by their names.
     turn, shift : float
         By how much more attitude (rad) and position (m) may be off for it, one sigma an axis.
+    borrowed : mapping of str to ndarray
+        Variance that estimated parameters, by name, have of what was only considered.
     """
 
     state: State
@@ -64,6 +67,7 @@ class OnlineStart:
     shift: float = 0.0
     beside: LockinSettings | None = None
     lines: Mapping[str, LockinSettings] = field(default_factory=dict)
+    borrowed: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def ambiguous(self) -> bool:
@@ -165,6 +169,7 @@ def find_online_start(
         *_wider(result, honest),
         None if beside is given else beside,
         _lines_of_each(log, site, given) if several else {},
+        {b.name: np.sum(result.calibration_response[b.columns] ** 2, 1) for b in result.blocks},
     )
 
 

@@ -5,6 +5,7 @@ declared; gravity and the Earth's field, two compasses that know nothing of beac
 find the platform elsewhere.  None of them knows the truth.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,12 +96,19 @@ class OnlineWitness:
         self._began, self._prior_at, self._prior = 0.0, -np.inf, Judgement()
         self._beginning = Judgement()
         self._declared: Calibration | None = None
+        self._borrowed: Mapping[str, Array] = {}
 
     # What is heard
 
-    def begin(self, time: float, said: Judgement) -> None:
-        """Begin with a first state (s), and what is said of the smoothed beginning."""
-        self._began, self._beginning = time, said
+    def begin(self, time: float, said: Judgement, borrowed: Mapping[str, Array]) -> None:
+        """Begin with a first state (s), and what is said of the smoothed beginning.
+
+        Parameters
+        ----------
+        borrowed : mapping of str to ndarray
+            Variance that estimated parameters have of what was only considered.
+        """
+        self._began, self._beginning, self._borrowed = time, said, borrowed
 
     def hear(self, state: State, gate: Gate, heard: Heard) -> None:
         """Take in an epoch: the state after it, and what its gate said."""
@@ -282,9 +290,13 @@ class OnlineWitness:
             walk = block.parameter.walk_per_sqrt_hour(self.site) ** 2 * elapsed / 3600.0
             prior = block.sigma**2 + walk
             own = change[block.columns]
-            gained = np.maximum(prior - left[block.columns], LEAST_GAIN * prior)
+            # What was only considered moves the estimate, and its error with it: it is in both.
+            borrowed = self._borrowed.get(block.name, np.zeros(len(own)))
+            both = 2.0 * np.minimum(borrowed, left[block.columns])
+            gained = np.maximum(prior - left[block.columns] + both, LEAST_GAIN * prior)
             score = float(np.max(np.abs(own) / np.sqrt(gained)))
-            total, number = total + float(np.sum(own**2 / prior)), number + len(own)
+            usual = np.maximum(prior, gained)
+            total, number = total + float(np.sum(own**2 / usual)), number + len(own)
             if score > DOUBT:
                 text = (
                     f"{block.name} came out {score:.1f} times what its declared sigma allows: a"

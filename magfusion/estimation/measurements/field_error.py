@@ -18,14 +18,18 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, ComplexArray
 
 SHARE = 0.97  # of the variance, which the modes have; the rest is in the white part
-COLUMNS = 96  # of all beacons
+COLUMNS = 288  # of all beacons
+MATRIX = 9  # elements
 AT_ONCE = 5e8  # bytes of their Jacobian, in a long log
 MOST_CELLS = 1000
 SAME_TIME = 1e-6  # s
 
 
 class FieldError(BeaconParameter):
-    """Amplitudes of the modes of one beacon's error: by tone, mode, quadrature and world axis.
+    """Amplitudes of the modes of one beacon's error: by mode, row and column of a matrix.
+
+    Iron answers to a field in proportion, so that what it adds is a matrix of the place times the
+    beacon's field, the same for all its tones and in phase with each.
 
     Parameters
     ----------
@@ -43,27 +47,22 @@ class FieldError(BeaconParameter):
     def __init__(
         self, time: Array, modes: Array, relative: Array, sensor_from_world: Array
     ) -> None:
-        self._time, self._relative = time, relative
-        every = np.einsum("nsm,nsai->nsami", modes, sensor_from_world)
-        both = np.stack([every, 1j * every], axis=4)
-        self._shapes = both.reshape(*both.shape[:3], -1)
+        self._time, self._modes = time, modes
+        self._relative, self._sensor_from_world = relative, sensor_from_world
 
     @property
     def columns(self) -> int:
         """How many amplitudes there are."""
-        return int(self._relative.shape[2] * self._shapes.shape[3])
+        return int(MATRIX * self._modes.shape[2])
 
     def own_jacobian(self, view: PhasorView) -> ComplexArray:
         """Return the columns of the owner's phasors."""
         time = view.calibration.reference_time + view.elapsed
-        rows = np.searchsorted(self._time, time - SAME_TIME)
-        power = 0.5 * np.sum(np.abs(view.phasor) ** 2, axis=-1) / 3.0
-        size = self._relative[rows, view.sensor] * np.sqrt(power)
-        shapes, (count, tones) = self._shapes[rows, view.sensor], size.shape
-        out = np.zeros((count, tones, 3, tones, shapes.shape[2]), dtype=complex)
-        for tone in range(tones):
-            out[:, tone, :, tone] = size[:, tone, None, None] * shapes
-        return out.reshape(count, tones, 3, -1)
+        at = np.searchsorted(self._time, time - SAME_TIME), view.sensor
+        turn, size = self._sensor_from_world[at], self._relative[at] / np.sqrt(3.0)
+        field_world = np.einsum("nak,nta->ntk", turn, view.phasor)
+        bent = np.einsum("nt,nm,naj,ntk->ntamjk", size, self._modes[at], turn, field_world)
+        return bent.reshape(*view.phasor.shape, -1)
 
 
 def field_errors(site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...]:
@@ -83,8 +82,8 @@ def field_errors(site: Site, time: Array, poses: Trajectory) -> tuple[Block, ...
     sensors = site.platform.magnetometers
     relative = model_error(site, place) + np.zeros((len(time), channels))
     relative = relative.reshape(len(time), len(sensors), -1)
-    count = channels // len(sensors)
-    most = min(COLUMNS, int(AT_ONCE / (48.0 * channels * len(time)))) // (6 * count)
+    most = min(COLUMNS, int(AT_ONCE / (48.0 * channels * len(time))))
+    most //= MATRIX * len(site.beacons)
     modes = modes_in_place(place.reshape(-1, 3), length, max(most, 1))
     modes = modes.reshape(len(time), len(sensors), -1)
     sensor_from_world = np.stack(
