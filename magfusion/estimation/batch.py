@@ -328,13 +328,15 @@ def posterior(
     states, response = read_states(estimate.values, log.states.time), None
     errors: tuple[Block, ...] = ()
     if log.fixes is None:
-        errors = field_errors(estimate.calibration.site, samples.time, log.at_fields(states))
+        measured = log.measured_at(graph.measurements)
+        here = Trajectory(**{k: v[measured] for k, v in vars(states).items() if v is not None})
+        errors = field_errors(estimate.calibration.site, here.time, here)
     uncertain = placed((*log.considered, *errors))
     pose_cov, calibration_cov, moved = marginals(graph, estimate, uncertain)
     if log.fixes is not None:
-        here = survey_response(log.declared, log.samples, log.at_fields(states))
+        there = survey_response(log.declared, log.samples, log.at_fields(states))
         later = np.searchsorted(log.epoch, np.arange(len(states)))
-        response = here[np.minimum(later, len(here) - 1)]
+        response = there[np.minimum(later, len(there) - 1)]
         pose_cov = pose_cov + response @ np.swapaxes(response, 1, 2)
     left = {type(m): graph.residual(m, estimate) for m in map(alone, graph.measurements)}
     error = left.get(FieldPhasors, np.nan)

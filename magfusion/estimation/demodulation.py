@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.close_log import CloseLog
 from magfusion.estimation.integrity.detection import drowned, without_silence
 from magfusion.estimation.integrity.spectrum import beside_lines
 from magfusion.estimation.motion_compensation import MotionCompensated, demodulate_about, noisier
@@ -50,6 +51,8 @@ class Demodulation:
         Windows in which what the fields tell of the motion stands in for inertial samples.
     without_turn : Windows
         That were dropped for want of inertial samples alone.
+    close : CloseLog, optional
+        Its short windows, where the tones are close.
     """
 
     log: Log
@@ -60,6 +63,7 @@ class Demodulation:
     drowned: BoolArray | None = None
     blind: BoolArray | None = None
     without_turn: Windows = field(default_factory=Windows.none)
+    close: CloseLog | None = None
 
     @property
     def anew(self) -> bool:
@@ -90,7 +94,9 @@ class Demodulation:
         _, steady = operator.demodulate(waveform.measured_sensor - offset)
         return replace(steady, measured_sensor=steady.measured_sensor + offset)
 
-    def compensated(self, calibration: Calibration, states: Trajectory) -> MotionCompensated:
+    def compensated(
+        self, calibration: Calibration, states: Trajectory, path: Trajectory | None = None
+    ) -> MotionCompensated:
         """Return the phasors with the motion inside the windows taken off.
 
         A slot is too short for more than the gyro's bias to matter.
@@ -99,6 +105,8 @@ class Demodulation:
         ----------
         states : Trajectory
             At the centres of the windows.
+        path : Trajectory, optional
+            All that there are, where those of the windows are not.
         """
         waveform, imu, offset = self.log.waveform, self.log.imu, calibration.time_offset
         assert waveform is not None
@@ -114,7 +122,15 @@ class Demodulation:
         del known  # of a long log it is as much as the log
         if self.blind is not None:
             operator = replace(operator, apart=self.blind)
-        wave = demodulate_about(operator, waveform.measured_sensor, states, imu, calibration)
+        wave = demodulate_about(
+            operator,
+            waveform.measured_sensor,
+            states,
+            imu,
+            calibration,
+            path,
+            wanted=None if self.close is None else self.close.nodes,
+        )
         if self.blind is None:
             return wave
         fields = noisier(wave.fields, self.blind, states, calibration, length)
@@ -153,7 +169,10 @@ def demodulated(log: Log, site: Site, settings: LockinSettings | None = None) ->
         hidden |= ~fields.valid
     without = receiver.without_turn if isinstance(receiver, LockinReceiver) else Windows.none()
     dropped = receiver.dropped
-    return Demodulation(log, heard, dropped, receiver, windows, hidden, without_turn=without)
+    close = CloseLog.of(log, site, settings)
+    return Demodulation(
+        log, heard, dropped, receiver, windows, hidden, without_turn=without, close=close
+    )
 
 
 def phasors(

@@ -30,6 +30,7 @@ from magfusion.estimation.integrity.recovery import (
 from magfusion.estimation.integrity.score_online import OnlineScore
 from magfusion.estimation.measured import Measured
 from magfusion.estimation.measurements.earth import EarthField, EarthWeight, speed_sigma
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
@@ -131,16 +132,16 @@ class EpochUpdate:
         if found is None or not np.any(found.samples.valid):
             self.gate.nothing_measured()
         else:
-            if lost and self._found_again(estimator, found, predicted):
+            if lost and found.apart and self._found_again(estimator, found, predicted):
                 return self._judged(estimator.state, None)
-            point, refused = self._linearization_point(found.samples, state)
+            point, refused = self._linearization_point(found, state)
             explained, valid = state if point is None else point, found.samples.valid[0]
             phasors = self._weighed_phasors(found, explained, asked=point is None)
             if self.metal.comes:
                 return self._without_the_last(estimator, predicted)
             phasors = self.gate.passed(phasors, explained, valid, refused)
             found = replace(found, phasors=phasors)
-            if self.gate.lost and self._found_again(estimator, found, predicted):
+            if self.gate.lost and found.apart and self._found_again(estimator, found, predicted):
                 return self._judged(estimator.state, None)
         if found is not None:
             measurements += self._of_fields(found, replace(point or state, cov=state.cov), step)
@@ -157,7 +158,7 @@ class EpochUpdate:
             linear = None
         self._separate(linear, measurements, estimator.state)
         self._hear(before, predicted, estimator.state, found)
-        if found is not None:
+        if found is not None and found.apart:
             self._compare(found.samples, estimator.state)
         judged = self._judged(estimator.state, self._lost_since(estimator.state))
         return judged if found is None else replace(judged, heard=found.heard)
@@ -171,17 +172,23 @@ class EpochUpdate:
 
     # What was measured
 
-    def _weighed_phasors(self, found: Measured, explained: State, *, asked: bool) -> FieldPhasors:
+    def _weighed_phasors(
+        self, found: Measured, explained: State, *, asked: bool
+    ) -> FieldPhasors | JointPhasors:
         """Weigh phasors by what is near; of those that the score asks of, all is predicted once."""
         if asked:
             self.score.foresee(found.phasors, explained)
+        if isinstance(found.phasors, JointPhasors):  # of two beacons or more
+            return found.phasors
         return self.metal.weighed(found.phasors, explained, found.samples.valid[0])
 
     def _of_fields(self, found: Measured, known: State, step: float) -> list[Measurement]:
         measurements: list[Measurement] = [found.phasors]
         if found.earth is not None:
             measurements.append(self._weighed(found.earth, known))
-            if not np.any(found.phasors.sqrt_information):
+            if isinstance(found.phasors, FieldPhasors) and not np.any(
+                found.phasors.sqrt_information
+            ):
                 sigma = speed_sigma(step, self.site.platform.motion)
                 measurements.append(zero_velocity(NOW, sigma))
         return measurements
@@ -265,16 +272,20 @@ class EpochUpdate:
 
     # Being lost, and found again
 
+    def asks_for_each(self, state: State) -> bool:
+        """Return whether beacons that are told together do not do: each must be told alone."""
+        return self._lost(state) or _wide(state)
+
     def _lost(self, state: State) -> bool:
         return self.gate.lost or not _no_wider(state.cov[POSITION, POSITION], LOST_POSITION)
 
-    def _linearization_point(
-        self, samples: FieldSamples, state: State
-    ) -> tuple[State | None, BoolArray]:
+    def _linearization_point(self, found: Measured, state: State) -> tuple[State | None, BoolArray]:
         """Return where to linearise if a prediction is too wide for it, and what disagrees."""
+        samples = found.samples
         nothing = np.zeros(len(samples.channels), dtype=bool)
-        wide = (POSITION, WIDE_POSITION), (ROTATION, WIDE_ROTATION)
-        if all(_no_wider(state.cov[part, part], sigma) for part, sigma in wide):
+        if not found.apart:  # of a state that is near enough, or its windows were not asked for
+            return None, nothing
+        if not _wide(state):
             self._pointing.over()
             return None, nothing
         if not self._pointing.due(state.time):
@@ -318,6 +329,12 @@ class EpochUpdate:
         self.gate.refused_in_a_row = 0
         self._attempts.over()
         self.witness.uncertain("found_again", time)
+
+
+def _wide(state: State) -> bool:
+    """Return whether a state is no place to linearise."""
+    wide = (POSITION, WIDE_POSITION), (ROTATION, WIDE_ROTATION)
+    return not all(_no_wider(state.cov[part, part], sigma) for part, sigma in wide)
 
 
 def _no_wider(cov: Array, sigma: float) -> bool:

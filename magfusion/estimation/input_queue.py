@@ -25,6 +25,7 @@ from magfusion.estimation.measurements.zero_velocity import (
 from magfusion.estimation.motion_compensation import MotionCompensated, demodulate_predicted
 from magfusion.estimation.preintegration import RATE_SPAN
 from magfusion.estimation.settings import EstimatorSettings
+from magfusion.estimation.short_windows import ShortWindows
 from magfusion.estimation.stand_in import StandIn
 from magfusion.estimation.state import MOTION, VELOCITY, State, as_trajectory
 from magfusion.estimation.stream_buffer import Buffer, check_clock
@@ -76,9 +77,12 @@ class Arrivals:
         Inertial samples that were left out because the IMU hung.
     stand_in : StandIn
         What takes its place there.
+    short : ShortWindows, optional
+        Of tones that are close.
     """
 
     receiver: Receiver
+    short: ShortWindows | None
     applied_offset: float
     imu: Buffer
     waveform: Buffer
@@ -101,7 +105,7 @@ class Arrivals:
     _noise_unseen: bool
 
     def __init__(self, receiver: Receiver, applied_offset: float) -> None:
-        self.receiver = receiver
+        self.receiver, self.short = receiver, None
         # What stands in for them needs a state, which a whole log has only when it is smoothed.
         receiver.needs_turn = not isinstance(receiver, LockinReceiver)
         receiver.joined = True
@@ -309,6 +313,9 @@ class Arrivals:
             if isinstance(self.receiver, LockinReceiver):
                 self.receiver.beside = start.beside
             self.receiver.begin(start.waveform, self.inertial_samples())
+            if self.short is not None:
+                self.short.receiver.beside_lines(start.beside)
+                self.short.receiver.begin(start.waveform, self.inertial_samples())
             self.receive(start.state, delay)
         self.forget(time)
 
@@ -318,6 +325,9 @@ class Arrivals:
         Windows wait for a prediction of the motion in them.
         """
         until, receiver = min(self.awaited, self.waveform.newest) - delay, self.receiver
+        if self.short is not None and self.short.receiver.complete(until):
+            samples = self._waveform_samples(), self.inertial_samples()
+            self.short.receive(*samples, until, self.last_epoch)
         if not receiver.complete(until):
             return
         assert receiver.grid is not None
@@ -332,8 +342,22 @@ class Arrivals:
             found = receiver.push(waveform, imu, until, state.gyro_bias_body, offset)
             self.fields += found.rows(found.time > after).epochs()
 
-    def next_window(self) -> float | None:
-        """Go on to the next window that was admitted: return its centre (s); None for none."""
+    def next_window(self, state: State, *, lost: bool = False) -> float | None:
+        """Go on to the next window that was admitted: return its centre (s); None for none.
+
+        Of close tones to the next short one, as long as the state is near enough for it.
+
+        Parameters
+        ----------
+        lost : bool
+            Whether the tones must be told apart before anything else.
+        """
+        if self.short is not None:
+            while self.windows and self.receiver.centre_of(self.windows[0]) <= state.time:
+                self.windows.popleft()
+            centre = None if lost else self.short.next_after(state.time)
+            if centre is not None:
+                return centre
         if not self.windows:
             return None
         self._window = self.windows.popleft()
@@ -342,7 +366,9 @@ class Arrivals:
     @property
     def window_to_come(self) -> bool:
         """Whether the samples of a window are there that awaits its inertial ones."""
-        return self.receiver.complete(self.waveform.newest)
+        newest = self.waveform.newest
+        short = self.short is not None and self.short.receiver.complete(newest)
+        return short or self.receiver.complete(newest)
 
     def apply_offset_anew(self, state: State, blocks: tuple[Block, ...]) -> float:
         """Cut the inertial stream by the time offset that has been learnt since; return the change.
@@ -434,6 +460,8 @@ class Arrivals:
         """
         time = predicted.time
         by_offset, steady = None, self.steady.pop(time, None)
+        if samples is None and self.short is not None and self.short.at(time):
+            return self._measured_together(self.short, before, predicted, standing=standing)
         if samples is None:
             wave = self._demodulated(before, predicted, lost=lost)
             if wave is None:
@@ -469,6 +497,25 @@ class Arrivals:
             site = predicted.calibration.site
             field = earth_measurement(site, steady, now, rate_body, offset, step)
         return Measured(samples, phasors, field, steady, repeats)
+
+    def _measured_together(
+        self, short: ShortWindows, before: State, predicted: State, *, standing: bool
+    ) -> Measured:
+        """Return what a short window tells of tones together."""
+        half, time = 0.5 * short.length, predicted.time
+        begin, end = min(before.time, time - half), time + half
+        imu = self.motion_samples(begin - MARGIN, end + MARGIN)
+        rate_body = self._rate_body(time) - predicted.gyro_bias_body
+        self.last_epoch = time
+        return short.measured(
+            before,
+            predicted,
+            self._waveform_samples(),
+            imu,
+            self.applied_offset,
+            rate_body,
+            standing=standing,
+        )
 
     def _own_step(self, samples: FieldSamples) -> float:
         """Return since when the magnetometers of an epoch did not measure, the shortest (s)."""

@@ -21,6 +21,7 @@ from magfusion.estimation.solve.bordered import Optimised, eliminate, optimise
 from magfusion.model.parameters import Block, Calibration, difference, dimension, retract
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray
 
 
@@ -131,8 +132,9 @@ def after_round(kept: OfLog, done: Round, shared: Shared) -> OfLog:
     """Return what is kept of a log after a round."""
     estimate, log = done.found.estimate, done.log
     states = read_states(estimate.values, log.states.time)
-    samples = log.samples if done.wave is None else done.wave.fields
-    errors = field_errors(estimate.calibration.site, samples.time, log.at_fields(states))
+    measured = log.measured_at(done.graph.measurements)
+    here = Trajectory(**{k: v[measured] for k, v in vars(states).items() if v is not None})
+    errors = field_errors(estimate.calibration.site, here.time, here)
     part = condensed(done.graph, estimate, log.considered, errors)
     said = Said(difference(shared.declared, estimate.calibration, shared.blocks), part)
     begun = replace(kept.begun, states=states)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from magfusion.estimation.close_log import looked_at, without_silent
 from magfusion.estimation.demodulation import Demodulation
 from magfusion.estimation.drift_segments import segments_of
 from magfusion.estimation.graph import Graph, initial_estimate
@@ -16,8 +17,9 @@ from magfusion.estimation.integrity.detection import (
     only,
 )
 from magfusion.estimation.measurements.earth import earth_measurement, unheld
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.measurement import Measurement
-from magfusion.estimation.measurements.phasors import field_phasors
+from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
 from magfusion.estimation.measurements.pose_fix import pose_fixes
 from magfusion.estimation.measurements.signs import with_signs
 from magfusion.estimation.measurements.zero_rate import zero_rate
@@ -87,6 +89,11 @@ class PreparedLog:
         rows = {k: v[self.epoch] for k, v in vars(states).items() if v is not None}
         return Trajectory(**rows)
 
+    def measured_at(self, measurements: tuple[Measurement, ...]) -> IntArray:
+        """Return the states at which fields were measured, in long windows or short ones."""
+        short = [m.epoch for m in measurements if isinstance(m, JointPhasors)]
+        return np.unique(np.concatenate([self.epoch, *short])) if short else self.epoch
+
     def compensated(self, calibration: Calibration, states: Trajectory) -> MotionCompensated:
         """Return the phasors with the motion taken off, by the stream that a calibration corrects.
 
@@ -100,7 +107,8 @@ class PreparedLog:
         log = self.demodulation.log
         imu = calibration.on_log_rate(corrected_imu(calibration, self.blocks, self.imu))
         known = replace(self.demodulation, log=log if imu is log.imu else replace(log, imu=imu))
-        wave = known.compensated(calibration, self.at_fields(states))
+        path = None if known.close is None else states
+        wave = known.compensated(calibration, self.at_fields(states), path)
         heard, hidden = self.samples.valid, self.demodulation.drowned
         if hidden is not None and np.any(hidden):
             heard = heard | hidden & above_noise(wave.fields, DETECTION_CHI_SQUARE_ONLINE)
@@ -160,6 +168,7 @@ def graph_of(
         measurements.append(_fixes(log, log.fixes))
     else:
         measurements += _fields(log, states, calibration, wave, standing)
+        measurements = _with_short(log, states, calibration, wave, standing, measurements)
     native = inertial_graph([link.measurement for link in links], log.declared.site.platform)
     acting = links if links[0].by_calibration is not None else ()
     segments = segments_of(states.time, log.declared, log.blocks)
@@ -240,6 +249,28 @@ def _fields(
         detected = np.any(samples.valid, axis=1)
         out += unheld(states, log.epoch, detected, step, log.declared.site.platform.motion)
     return out
+
+
+def _with_short(
+    log: PreparedLog,
+    states: Trajectory,
+    calibration: Calibration,
+    wave: MotionCompensated | None,
+    standing: BoolArray | None,
+    measurements: list[Measurement],
+) -> list[Measurement]:
+    """Return measurements with those of short windows, where the tones are close."""
+    close = log.demodulation.close
+    if close is None or wave is None or wave.unexplained_sensor is None:
+        return measurements
+    assert wave.wanted is not None
+    imu = calibration.on_log_rate(corrected_imu(calibration, log.blocks, log.imu))
+    left, nodes = wave.unexplained_sensor, wave.wanted
+    joint = close.measured(left, nodes, states, calibration, imu, standing)
+    joint = without_silent(joint, wave.fields, log.at_fields(states), calibration)
+    length = float(np.median(wave.fields.window))
+    out = [looked_at(m, joint, length) if isinstance(m, FieldPhasors) else m for m in measurements]
+    return [*out, replace(joint, robust=log.loss)]
 
 
 def overlap(samples: FieldSamples) -> float:

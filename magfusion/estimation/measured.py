@@ -1,8 +1,9 @@
-"""What a running estimator measures at one epoch."""
+"""What an epoch of a running estimate holds."""
 
 from dataclasses import dataclass
 
 from magfusion.estimation.measurements.earth import EarthField
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.model.samples import FieldSamples, SteadyFields
 
@@ -14,7 +15,10 @@ class Measured:
     Parameters
     ----------
     samples : FieldSamples
-        Without the beacons that are not detected.
+        Without the beacons that are not detected; where tones are told together alone, as they are
+        foreseen.
+    phasors : FieldPhasors or JointPhasors
+        The phasors as a measurement.
     earth : EarthField, optional
         The steady field as a measurement, where it is one.
     steady : SteadyFields, optional
@@ -24,10 +28,15 @@ class Measured:
     """
 
     samples: FieldSamples
-    phasors: FieldPhasors
+    phasors: FieldPhasors | JointPhasors
     earth: EarthField | None
     steady: SteadyFields | None
     repeats: float
+
+    @property
+    def apart(self) -> bool:
+        """Whether each phasor was measured alone."""
+        return isinstance(self.phasors, FieldPhasors)
 
     @property
     def heard(self) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """What the lock-in makes of motion inside its window, predicted and taken off."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.linalg import norm
@@ -41,12 +42,18 @@ class MotionCompensated:
         The Earth field and the offset.
     unseen : bool
         Whether nothing was known of the motion, and nothing taken off.
+    unexplained_sensor : ndarray, shape (samples, 3), optional
+        What the prediction leaves of the samples (T), where it is asked for with
+    wanted : Trajectory, optional
+        the motion at other times.
     """
 
     fields: FieldSamples
     by_time_offset: ComplexArray
     steady: SteadyFields
     unseen: bool = False
+    unexplained_sensor: Array | None = None
+    wanted: Trajectory | None = None
 
     @staticmethod
     def of_slots(fields: FieldSamples) -> "MotionCompensated":
@@ -56,6 +63,69 @@ class MotionCompensated:
         return MotionCompensated(fields, np.zeros_like(fields.phasor_sensor), steady)
 
 
+class TakenOff(NamedTuple):
+    """What a prediction leaves of samples.
+
+    Parameters
+    ----------
+    unexplained_sensor, change_sensor : ndarray, shape (samples, 3)
+        What is left (T), and the prediction's derivative by the IMU's time offset (T/s).
+    wanted : Trajectory, optional
+        The motion at other times that were asked for.
+    """
+
+    unexplained_sensor: Array
+    change_sensor: Array
+    sending: Sending
+    earth_world: Array
+    wanted: Trajectory | None
+
+
+def taken_off(
+    samples: Waveform,
+    path: Trajectory,
+    imu: ImuSamples,
+    calibration: Calibration,
+    time_offset: float,
+    window: float,
+    wanted: Array | None = None,
+) -> TakenOff:
+    """Return what a prediction along a motion leaves of samples.
+
+    Parameters
+    ----------
+    path : Trajectory
+        States between which the motion is interpolated, with the shape of the IMU's.
+    time_offset : float
+        Of the IMU (s).
+    window : float
+        A beacon is predicted that is felt in windows so long (s).
+    wanted : ndarray, shape (m,), optional
+        Other times at which the motion is asked for (s).
+    """
+    site, measured_sensor = calibration.site, samples.measured_sensor
+    earth = np.zeros(3) if site.earth_field_world is None else site.earth_field_world
+    shape = MotionShape.of(path, imu, time_offset, site.gravity)
+    unexplained, change = np.empty_like(measured_sensor), np.empty_like(measured_sensor)
+    sending = Sending.of(calibration, window)
+    for begin in range(0, len(samples.time), sending.at_once):
+        rows = slice(begin, begin + sending.at_once)
+        time = samples.time[rows]
+        motion = shape.at(time)
+        heard = sending.along(motion)
+        predicted, change[rows] = predicted_waveform(
+            motion,
+            heard,
+            earth,
+            carriers(tone_frequencies(heard.site), time),
+            Motion(*shape.by_time_offset(time)),
+        )
+        unexplained[rows] = measured_sensor[rows] - predicted
+    return TakenOff(
+        unexplained, change, sending, earth, None if wanted is None else shape.at(wanted)
+    )
+
+
 def demodulate_about(
     operator: WindowOperator,
     measured_sensor: Array,
@@ -63,6 +133,8 @@ def demodulate_about(
     imu: ImuSamples,
     calibration: Calibration,
     path: Trajectory | None = None,
+    *,
+    wanted: Array | None = None,
 ) -> MotionCompensated:
     """Demodulate what a prediction of the waveform leaves, and add the phasors at the centres.
 
@@ -77,28 +149,14 @@ def demodulate_about(
         At the centres of the windows.
     path : Trajectory, optional
         States between which the motion is interpolated, where they are not those of the windows.
+    wanted : ndarray, shape (m,), optional
+        Other times at which the motion is asked for (s), with what is left of the samples.
     """
     site, known = calibration.site, states if path is None else path
-    earth = np.zeros(3) if site.earth_field_world is None else site.earth_field_world
-
-    offset, designs = calibration.time_offset, operator.designs
-    shape = MotionShape.of(known, imu, offset, site.gravity)
-    unexplained, change = np.empty_like(measured_sensor), np.empty_like(measured_sensor)
-    sending = Sending.of(calibration, designs.settings.window)
-    for begin in range(0, len(designs.time), sending.at_once):
-        rows = slice(begin, begin + sending.at_once)
-        time = designs.time[rows]
-        motion = shape.at(time)
-        heard = sending.along(motion)
-        predicted, change[rows] = predicted_waveform(
-            motion,
-            heard,
-            earth,
-            carriers(tone_frequencies(heard.site), time),
-            Motion(*shape.by_time_offset(time)),
-        )
-        unexplained[rows] = measured_sensor[rows] - predicted
-    del shape  # which is larger than all that follows
+    samples = Waveform(operator.designs.time, measured_sensor)
+    window = operator.designs.settings.window
+    off = taken_off(samples, known, imu, calibration, calibration.time_offset, window, wanted)
+    earth, sending, unexplained = off.earth_world, off.sending, off.unexplained_sensor
     rest, left = operator.demodulate(unexplained)
     at_centre = predict_channels(
         calibration, states.time, states.world_from_body, states.position_world
@@ -107,8 +165,10 @@ def demodulate_about(
     fields = replace(rest, phasor_sensor=rest.phasor_sensor + at_centre)
     return MotionCompensated(
         fields=fields if operator.tone_of_channel is None else _of_loudest(fields, sending, states),
-        by_time_offset=operator.apply(change),
+        by_time_offset=operator.apply(off.change_sensor),
         steady=replace(left, measured_sensor=left.measured_sensor + steady.measured_sensor),
+        unexplained_sensor=None if wanted is None else unexplained,
+        wanted=off.wanted,
     )
 
 

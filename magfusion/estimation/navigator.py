@@ -33,6 +33,7 @@ from magfusion.estimation.navigator_settings import NavigatorSettings as Navigat
 from magfusion.estimation.process_noise import calibration_process_noise
 from magfusion.estimation.propagation import Propagated, propagate
 from magfusion.estimation.several_arrivals import arrivals_of
+from magfusion.estimation.short_windows import ShortWindows
 from magfusion.estimation.state import State
 from magfusion.estimation.state_of_now import CarriedState, Said, StateOfNow
 from magfusion.estimation.still_samples import StillSamples
@@ -103,6 +104,8 @@ class Navigator:
         self._update = EpochUpdate(site, estimated, self.blocks, self.settings.earth, bank)
         self._process_noise = calibration_process_noise(site, self.blocks, self._considered)
         self._arrived = arrivals_of(site, self.settings.lockin)
+        if not self.settings.earth:  # of short windows there is no steady field
+            self._arrived.short = ShortWindows.of(site, self.settings.lockin)
         self._estimator: Estimator | None = None
         self._next_start = first_try(self.site, self.settings.start_duration)
         imu = site.platform.imu
@@ -417,9 +420,10 @@ class Navigator:
     def _step(self) -> bool:
         """Process the next epoch, if all that it needs has come."""
         assert self._estimator is not None
-        now = self._estimator.state.time
+        state = self._estimator.state
+        now = state.time
         arrived, delay = self._arrived, self.settings.delay
-        arrived.receive(self._estimator.state, delay)
+        arrived.receive(state, delay)
         inertial, other = arrived.awaited - delay, arrived.next_other
         if other <= now:
             self.counts["measurement too late"] += len(arrived.others_at(other))
@@ -427,7 +431,7 @@ class Navigator:
         if other <= inertial and other < arrived.next_field:
             self._absorb(other, None)
             return True
-        centre = arrived.next_window()
+        centre = arrived.next_window(state, lost=self._update.asks_for_each(state))
         if centre is not None:
             self._step_window(centre)
             return True

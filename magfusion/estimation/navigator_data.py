@@ -19,6 +19,7 @@ from magfusion.estimation.integrity.judgement import JudgedState, Judgement
 from magfusion.estimation.integrity.running import Running
 from magfusion.estimation.integrity.score_online import Sums
 from magfusion.estimation.measurements.earth import EarthField
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors, Predictions
 from magfusion.estimation.measurements.pose_fix import PoseFix
@@ -33,7 +34,13 @@ from magfusion.model.trust import Verdict
 from magfusion.receiver.marked_bursts import OVERLAP, Bursts
 from magfusion.units import Array
 
-MEASUREMENTS: tuple[type[Measurement], ...] = (FieldPhasors, EarthField, ZeroVelocity, PoseFix)
+MEASUREMENTS: tuple[type[Measurement], ...] = (
+    FieldPhasors,
+    JointPhasors,
+    EarthField,
+    ZeroVelocity,
+    PoseFix,
+)
 ROUNDING = 1e-6  # of a rotation, and of a correlation's least eigenvalue
 
 

@@ -139,6 +139,8 @@ def _demodulated(log: Log, site: Site, settings: SmootherSettings) -> _Demodulat
         steady, samples = demodulation.steady(calibration), only(samples, detected(samples))
     between = _in_gaps(samples, log.imu, calibration.time_offset, site.platform.motion)
     others = [time for time, _ in settings.measurements]
+    if demodulation.close is not None and not loose:
+        others.append(demodulation.close.windows.centre)
     time = np.unique(np.concatenate([samples.time, between, *others]))
     return _Demodulated(log, demodulation, samples, steady, time, calibration)
 

@@ -312,7 +312,7 @@ class SeveralArrivals(Arrivals):
         none = FieldSamples.empty(self.streams[0].receiver.site.channels)
         return side_by_side([found.get(k, none) for k in range(len(self.streams))], self.site)
 
-    def next_window(self) -> float | None:
+    def next_window(self, state: State, *, lost: bool = False) -> float | None:  # noqa: ARG002
         """Go on to the next windows of all: return their centre (s); None where one may come."""
         centre = min(stream.next_admitted for stream in self.streams)
         grids = [s.receiver for s in self.streams if s.receiver.grid is not None]

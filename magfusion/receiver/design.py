@@ -15,6 +15,7 @@ from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray, IntArray
 
 CHUNK = 64  # windows demodulated at once: what is made of them stays in the cache
+LARGEST = 2**28  # bytes of the maps of so many; of many tones in long windows fewer are at once
 KEPT = 256 * 2**20  # bytes of maps that are kept; what is more is made anew
 WORST_CONDITION = 1e8  # of a normal matrix; beyond, the samples do not tell its columns apart
 
@@ -75,15 +76,22 @@ class Designs:
         Those of many windows are kept when they are asked for again: most logs are demodulated
         once.
         """
-        for begin in range(0, len(self.windows), CHUNK):
-            rows = slice(begin, begin + CHUNK)
+        chunk = self._at_once()
+        for begin in range(0, len(self.windows), chunk):
+            rows = slice(begin, begin + chunk)
             known = self.kept.get(begin)
             maps = self._maps(self.windows.rows(rows)) if known is None else known
-            again = begin in self.asked or len(self.windows) <= CHUNK
+            again = begin in self.asked or len(self.windows) <= chunk
             if known is None and again and self._size() + _size(maps) < KEPT:
                 self.kept[begin] = maps
             self.asked.add(begin)
             yield rows, maps
+
+    def _at_once(self) -> int:
+        """Return how many windows are demodulated at once."""
+        most = int(np.max(self.windows.count, initial=1))
+        columns = 6 * len(self.frequencies_hz) + 2
+        return int(np.clip(LARGEST // (8 * most * columns), 1, CHUNK))
 
     def _size(self) -> int:
         return sum(map(_size, self.kept.values()))

@@ -13,6 +13,7 @@ import numpy as np
 from magfusion.estimation.ekf import measured_rows
 from magfusion.estimation.integrity.judgement import Judgement
 from magfusion.estimation.integrity.separation import LEAST, Separation, protection_levels, radii
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors, leaves_out
 from magfusion.estimation.propagation import Propagated
@@ -26,6 +27,7 @@ MOST = 6  # filters; of more beacons some share one
 SLACK = 3.0  # sigma; a deviation below it is covered
 # Of what a filter without a beacon does not take over from a start that was made with all.
 WIDE = np.repeat([0.2, 0.3, 0.5], 3)  # rad, m, m/s
+NOBODY, TOGETHER = -1, -2  # groups of rows that are of no beacon, or of all
 OPEN_ROTATION, OPEN_POSITION = 0.3, 10.0  # rad, m; beyond, nothing else determines the pose
 
 
@@ -102,10 +104,11 @@ class SubsetBank:
             part[:, :, :MOTION] = part @ motion.T
             part += noise
         error, jacobian, owner = self._rows(measurements, predicted.state)
+        taken = self._taken(jacobian, owner)
+        self._leave_out_together(measurements, owner, jacobian, taken)
         if leaves_out(measurements):
             kept = np.any(jacobian, axis=1)
-            error, jacobian, owner = error[kept], jacobian[kept], owner[kept]
-        taken = self._taken(jacobian, owner)
+            error, jacobian, taken = error[kept], jacobian[kept], taken[:, kept]
         crossed = taken @ cov
         gain = self._gains(taken, crossed)
         back = np.swapaxes(gain, 1, 2)
@@ -134,8 +137,11 @@ class SubsetBank:
         parts = [(measured_rows([], state, self.blocks), np.zeros(0, dtype=np.int64))]
         for measurement in measurements:
             rows = measured_rows([measurement], state, self.blocks)
-            of_field = isinstance(measurement, FieldPhasors)
-            owner = np.repeat(self._owner, 6) if of_field else np.full(len(rows[0]), -1)
+            if isinstance(measurement, FieldPhasors):
+                owner = np.repeat(self._owner, 6)
+            else:
+                together = isinstance(measurement, JointPhasors)
+                owner = np.full(len(rows[0]), TOGETHER if together else NOBODY)
             parts.append((rows, owner))
         error = np.concatenate([rows[0] for rows, _ in parts])
         jacobian = np.concatenate([rows[1] for rows, _ in parts])
@@ -146,6 +152,17 @@ class SubsetBank:
         others = [owner != group for group in range(self.groups)]
         kept = np.stack([np.ones(len(owner), dtype=bool), *others])
         return np.where(kept[:, :, None], jacobian, 0.0)
+
+    def _leave_out_together(
+        self, measurements: Sequence[Measurement], owner: IntArray, jacobian: Array, taken: Array
+    ) -> None:
+        """Leave out of rows of tones that are told together what each group can explain."""
+        rows = np.flatnonzero(owner == TOGETHER)
+        for measurement in measurements:
+            if isinstance(measurement, JointPhasors):
+                for group in range(self.groups):
+                    basis = measurement.spanned((self._owner == group)[None])[0]
+                    taken[1 + group, rows] -= basis @ (basis.T @ jacobian[rows])
 
     def _gains(self, taken: Array, crossed: Array) -> Array:
         """Return the gain of every filter, shape (1 + groups, n, rows)."""

@@ -6,14 +6,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from magfusion.estimation.integrity.magnetometer_watch import MagnetometerWatch
-from magfusion.estimation.measurements.measurement import group_distances
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.state import State, states_of
+from magfusion.estimation.state import State
 from magfusion.model.parameters import Block
 from magfusion.units import Array, BoolArray
 
 GATE = 38.3  # chi square of six components, one in a million
 LOST_EPOCHS = 5  # in a row, most of whose channels were refused: the state is wrong, not they
+Phasors = FieldPhasors | JointPhasors
 MEMORY = 0.95  # of the running mean of the distortion, an epoch
 
 
@@ -58,19 +59,18 @@ class Gate:
         return self.refused_in_a_row >= LOST_EPOCHS
 
     def passed(
-        self, measurements: FieldPhasors, state: State, valid: BoolArray, refused: BoolArray
-    ) -> FieldPhasors:
+        self, measurements: Phasors, state: State, valid: BoolArray, refused: BoolArray
+    ) -> Phasors:
         """Return the measurements without the channels that a state does not explain.
 
         Parameters
         ----------
-        measurements : FieldPhasors
+        measurements : FieldPhasors or JointPhasors
             Of one epoch.
         valid, refused : bool ndarray, shape (channels,)
             What the epoch holds, and what was refused before.
         """
-        rows = measurements.alone().linearize(states_of([state]), state.calibration, self.blocks)
-        distance = group_distances(rows, state.cov)[0]
+        distance = measurements.alone().distances(state, self.blocks, GATE)
         false = self.watch.heard(distance > GATE, valid)
         rejected: BoolArray = np.asarray((distance > GATE) | refused | false) & valid
         self._note(distance, valid)

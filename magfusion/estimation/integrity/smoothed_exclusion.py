@@ -10,7 +10,8 @@ from magfusion.estimation.batch import Smoothed, solved_again
 from magfusion.estimation.integrity.separation import Separation, protection_levels, radii
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
 from magfusion.estimation.log_graph import overlap
-from magfusion.estimation.measurements.measurement import robust_weight
+from magfusion.estimation.measurements.joint_phasors import JointPhasors, at_nearest
+from magfusion.estimation.measurements.measurement import Measurement, robust_weight
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.state import states_in
 from magfusion.model.trajectory import Trajectory
@@ -129,7 +130,8 @@ def _without_level(result: Smoothed) -> SeparatedSmooth:
     """Return a result that nothing was compared with."""
     text = (
         "There are no protection levels: they are made of the beacons' phasors in one solution,"
-        " which neither loose coupling nor a log of hours has."
+        " which neither loose coupling nor a log of hours has, nor one of tones that are told"
+        " together alone."
     )
     trust = Trust((Finding("no_redundancy", text, Verdict.TRUSTWORTHY, 0.0),))
     return SeparatedSmooth(result, alike(len(result.states), Verdict.TRUSTWORTHY), trust)
@@ -175,10 +177,24 @@ def _resolved(result: Smoothed, name: str, false: BoolArray) -> Smoothed | None:
     kept = replace(phasors, sqrt_information=np.where(left_out, 0.0, phasors.sqrt_information))
     try:
         return solved_again(
-            result, tuple(kept if m is phasors else m for m in result.graph.measurements)
+            result, tuple(_left(m, phasors, kept, false, own) for m in result.graph.measurements)
         )
     except RuntimeError:  # GTSAM's own: without it the pose is open
         return None
+
+
+def _left(
+    measurement: Measurement,
+    phasors: FieldPhasors,
+    kept: FieldPhasors,
+    false: BoolArray,
+    own: BoolArray,
+) -> Measurement:
+    """Return what is left of a measurement without a beacon."""
+    if isinstance(measurement, JointPhasors):
+        out = at_nearest(phasors.time, false[:, None] & own, measurement.time)
+        return measurement.leaving_out(out)
+    return kept if measurement is phasors else measurement
 
 
 def _without_say(result: Smoothed, names: tuple[str, ...]) -> BoolArray:

@@ -14,6 +14,7 @@ from magfusion.estimation.convergence import OPEN_ROTATION
 from magfusion.estimation.factors import CALIBRATION_KEY, CONSIDERED_KEY, PIECE, Factors
 from magfusion.estimation.graph import Estimate, Graph
 from magfusion.estimation.integrity.separation import Separation
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.solve.chain import Chain, solve_chain
 from magfusion.estimation.state import MOTION, states_in
@@ -156,8 +157,8 @@ def _size(piece: _Piece) -> int:
 def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Separation | None:
     """Return the separation at every state, in body axes; None where there is none to be had.
 
-    That is with fixes in the graph (loose coupling), and of a log so long that its calibration
-    drifts.
+    That is with fixes in the graph (loose coupling), of a log so long that its calibration drifts,
+    and of close tones that count together.
 
     Parameters
     ----------
@@ -166,7 +167,8 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
     """
     graph = result.graph
     fields = [f.measurement for f in graph.factors if isinstance(f.measurement, FieldPhasors)]
-    if len(fields) != 1 or len(graph.segments) > 1 or graph.declared is None:
+    together = any(isinstance(m, JointPhasors) for m in graph.measurements)
+    if together or len(fields) != 1 or len(graph.segments) > 1 or graph.declared is None:
         return None
     site = result.declared.site
     owner = site.sensor if by_magnetometer else site.owner

@@ -7,9 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.measurements.measurement import Loss, Measurement, Rows
+from magfusion.estimation.measurements.measurement import (
+    Loss,
+    Measurement,
+    Rows,
+    group_distances,
+)
 from magfusion.estimation.measurements.signs import whitened_along
-from magfusion.estimation.state import States
+from magfusion.estimation.state import State, States, states_of
 from magfusion.model.audibility import are_many
 from magfusion.model.field import skew
 from magfusion.model.noise import (
@@ -184,6 +189,11 @@ class FieldPhasors(Measurement):
         by_velocity = by_place @ np.swapaxes(world_from_body, 1, 2)[:, None]
         by_pose[..., :3] -= by_place @ skew(swing_body)
         return value, by_pose, by_velocity, by_calibration
+
+    def distances(self, state: State, blocks: tuple[Block, ...], _gate: float = np.inf) -> Array:
+        """Return the squared distance of each channel's innovation of an epoch, (channels,)."""
+        rows = self.linearize(states_of([state]), state.calibration, blocks)
+        return group_distances(rows, state.cov)[0]
 
     def without(self, rejected: BoolArray) -> "FieldPhasors":
         """Return the measurement without some channels, shape (channels,)."""
