@@ -1,16 +1,18 @@
 """A first look at a log, in seconds: everything that can be judged without solving for it."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.demodulation import phasors
+from magfusion.estimation.hearing import heard_site
 from magfusion.estimation.integrity.compasses import StillMeans, still_means
 from magfusion.estimation.integrity.diagnosis import with_cause
 from magfusion.estimation.integrity.recording import recorded
-from magfusion.estimation.integrity.signal import Heard, heard_in
+from magfusion.estimation.integrity.signal import Heard, heard_in, within_reach
 from magfusion.estimation.integrity.spectrum import (
     Line,
     Spectrum,
@@ -23,6 +25,7 @@ from magfusion.estimation.integrity.stamps import Timing, timings
 from magfusion.estimation.skin_depths import depths_of
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.audibility import are_many
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Site
@@ -98,6 +101,9 @@ def first_look(log: Log, site: Site | None, lockin: LockinSettings | None = None
     if site is None or not site.beacons:
         return Look(Trust(recorded(log, site)), *look, None, found, seen)
     findings: list[Finding] = []
+    many = are_many(site)
+    with suppress(InputError):  # what follows says why nothing is heard
+        log, site = heard_site(log, site, lockin)
     try:
         samples = phasors(log, site, lockin)[0]
     except InputError as error:
@@ -121,6 +127,8 @@ def first_look(log: Log, site: Site | None, lockin: LockinSettings | None = None
         best = fixes.best()
         poses = Trajectory(best.time[sure], best.world_from_body[sure], best.position_world[sure])
         poses = poses if len(poses) and not findings_of_fit(fixes) else None
+    if many and hearing is not None:
+        hearing = within_reach(hearing, site, poses)
     findings += recorded(log, site, COPED, poses, beacons=True, hearing=hearing)
     trust = Trust(tuple(_promoted(findings)))
     if trust.reasons and trust.reasons[0].code in SYMPTOMS:

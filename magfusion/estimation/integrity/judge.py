@@ -11,6 +11,7 @@ import numpy as np
 
 from magfusion.estimation.batch import Smoothed
 from magfusion.estimation.graph import Estimate
+from magfusion.estimation.integrity.close_residuals import together
 from magfusion.estimation.integrity.held import held
 from magfusion.estimation.integrity.outcome import convergence, geometry, rivals
 from magfusion.estimation.integrity.place_witness import of_place
@@ -80,7 +81,7 @@ def _heard(case: Case) -> Iterator[Testimony]:
     yield from residuals
     yield _traces(priors, cause)
     yield _traces(biases, cause)
-    for witness in (fixes, convergence, geometry, rivals):
+    for witness in (fixes, together, convergence, geometry, rivals):
         yield witness(case)
 
 

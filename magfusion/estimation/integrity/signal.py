@@ -8,11 +8,13 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.estimation.integrity.detection import DETECTION_CHI_SQUARE
 from magfusion.estimation.integrity.samples import runs
-from magfusion.model.noise import whitening
+from magfusion.model.audibility import largest_fields, phasor_sigma, tones_of
+from magfusion.model.noise import sensor_positions, whitening
 from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Verdict
-from magfusion.receiver.receiver import received
+from magfusion.receiver.receiver import received, usual_lockin
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray
@@ -22,6 +24,7 @@ UNHEARD = 0.1  # share of the epochs without any beacon, from which it casts dou
 SILENCE = 1.0  # s; a shorter one is not said
 FALLEN = 0.2  # of the amplitude beside it, what is left of a beacon that is switched off
 LISTED = 3
+SURELY = 3.0  # times the faintest field that is detected: where one of many beacons must be heard
 SAME_WINDOW = 1e-6  # s; between the centres of one and the same window
 
 
@@ -42,6 +45,9 @@ class Heard:
         Whether it is told from noise.
     across : bool
         Whether components are missing: a field across the axes that are there looks like silence.
+    passed_by : bool
+        Whether there are so many that each is out of reach for a while: to be left is then no more
+        than that.
     """
 
     time: Array
@@ -50,6 +56,7 @@ class Heard:
     amplitude: Array
     loud: BoolArray
     across: bool = False
+    passed_by: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +80,7 @@ def heard(samples: FieldSamples, site: Site) -> Heard:
     """Return how well each beacon is heard in phasors.
 
     A phasor that is missing is one that was not detected; where coils are driven in turn it may
-    only be another's turn.
+    only be another's turn, and where beacons share frequencies another's phasor.
     """
     names = tuple(dict.fromkeys(name for name, _ in samples.channels))
     sqrt_information = whitening(samples.phasor_cov, samples.there)
@@ -95,7 +102,7 @@ def heard(samples: FieldSamples, site: Site) -> Heard:
         axis=1,
     )
     there = np.isfinite(best)
-    if not has_schedule(site):
+    if not (has_schedule(site) or tones_of(site).reused):
         best, there = np.maximum(best, 0.0), np.ones_like(there)
     snr = np.where(there, np.sqrt(np.maximum(best, 0.0) / 6.0), np.nan)
     loud = there & (best > DETECTION_CHI_SQUARE)
@@ -140,11 +147,49 @@ def heard_with_motion(raw: Heard, freed: Detected) -> Heard:
     return replace(raw, loud=loud)
 
 
+def within_reach(found: Heard, site: Site, poses: Trajectory | None) -> Heard:
+    """Return how those of many beacons are heard that are, at all, or that must be.
+
+    A beacon must be heard where its field across its axis is far above the noise.
+
+    Parameters
+    ----------
+    poses : Trajectory, optional
+        Where the platform was for sure, at some epochs; None where that is not known.
+    """
+    due = np.zeros(len(found.beacons), dtype=bool)
+    if poses is not None and not has_schedule(site):
+        places = sensor_positions(site, poses)[:, 0]
+        least = 0.5 * np.max(largest_fields(site, places), axis=0)
+        sigma = phasor_sigma(site, usual_lockin(site).window)
+        loud = least > SURELY * np.sqrt(DETECTION_CHI_SQUARE) * sigma
+        names = {name for (name, _), one in zip(site.channels, loud, strict=True) if one}
+        due = np.array([name in names for name in found.beacons])
+    share = _share(found)
+    kept = np.flatnonzero(due | (share >= HARDLY))
+    if not len(kept):
+        return replace(found, passed_by=True)
+    return replace(
+        found,
+        beacons=tuple(found.beacons[k] for k in kept.tolist()),
+        snr=found.snr[:, kept],
+        amplitude=found.amplitude[:, kept],
+        loud=found.loud[:, kept],
+        passed_by=True,
+    )
+
+
+def _share(found: Heard) -> Array:
+    """Return in which share of its epochs each beacon is told from noise, shape (beacons,)."""
+    told = np.maximum(np.sum(np.isfinite(found.snr), axis=0), 1)
+    return np.asarray(np.sum(found.loud, axis=0) / told)
+
+
 def unheard(found: Heard, site: Site) -> Iterator[Finding]:
     """Yield the beacons that are silent, all along or for a while, and a log in which all are."""
     if len(found.time) == 0:
         return
-    share = np.sum(found.loud, axis=0) / np.maximum(np.sum(np.isfinite(found.snr), axis=0), 1)
+    share = _share(found)
     if np.all(share < HARDLY):
         best = float(np.nanmax(np.nanmedian(np.where(np.isnan(found.snr), 0.0, found.snr), axis=0)))
         yield Finding(
@@ -193,7 +238,8 @@ def _silences(found: Heard, k: int, tones: str) -> Iterator[Finding]:
         beside = np.concatenate(
             [amplitude[max(first - 10, 0) : first], amplitude[last : last + 10]]
         )
-        gone = float(np.median(amplitude[first:last])) < FALLEN * float(np.median(beside))
+        gone = not found.passed_by
+        gone &= float(np.median(amplitude[first:last])) < FALLEN * float(np.median(beside))
         stretch = (float(time[first] - 0.5 * step), float(time[last - 1] + 0.5 * step))
         (off if gone else drowned).append(stretch)
     name = found.beacons[k]

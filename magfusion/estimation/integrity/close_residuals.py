@@ -1,0 +1,42 @@
+"""What an estimate leaves of the short windows in which close tones are told together."""
+
+import numpy as np
+
+from magfusion.estimation.integrity.priors import NOTHING_EXPLAINED
+from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
+from magfusion.model.trust import Finding, Verdict
+from magfusion.receiver.windows import LONGEST_WINDOW
+
+EXPLAINED = 1.5  # mean square, one where noise and model are as declared
+LEAST = 3  # windows of which a mean is taken
+
+
+def together(case: Case) -> Testimony:
+    """Judge the short windows, some seconds of them at a time."""
+    graph = case.result.graph
+    measured = next((m for m in graph.measurements if isinstance(m, JointPhasors)), None)
+    if measured is None or len(measured.time) < LEAST:
+        return NOTHING
+    left = graph.residual(measured, case.result.estimate)
+    square = np.mean(left**2, axis=(1, 2))
+    piece = np.floor((measured.time - measured.time[0]) / LONGEST_WINDOW).astype(np.int64)
+    count = np.bincount(piece)
+    mean = np.bincount(piece, square) / np.maximum(count, 1)
+    mean = np.where(count >= LEAST, mean, np.mean(square))
+    worst = float(np.max(mean))
+    if worst <= EXPLAINED:
+        return NOTHING
+    time = case.result.states.time
+    at = np.floor((time - measured.time[0]) / LONGEST_WINDOW).astype(np.int64)
+    factor = np.maximum(mean[np.clip(at, 0, len(mean) - 1)], 1.0)
+    rms, share = np.sqrt(worst), 100.0 * float(np.mean(mean > EXPLAINED))
+    finding = Finding(
+        "field_residuals",
+        f"What the beacons send together deviates by up to {rms:.2g} times what noise and model"
+        f" error allow, in {share:.0f} % of the log. A beacon that is not as declared, iron near the"
+        " path, or a start that was wrong: record longer, and see which beacon is named.",
+        Verdict.FAILED if rms > NOTHING_EXPLAINED else Verdict.DOUBTFUL,
+        20.0 + rms,
+    )
+    return Testimony((finding,), factor=factor)
