@@ -4,8 +4,9 @@
    Does it err as with those alone, and what does it cost beside them?  Both are smoothed, and both
    are navigated as they come; what is heard is what is above the noise of a window anywhere on the
    true path.
-2. Tones 0.5 Hz apart need windows of four seconds, in which somebody walks past a beacon.  Do 60
-   beacons so close err more than the same 60 with 5 Hz between them (``--spacing``)?
+2. Tones 0.5 Hz apart need windows of four seconds to be told apart, in which somebody walks past a
+   beacon; short ones tell them together.  Do 60 beacons so close err more than the same 60 with
+   5 Hz between them (``--spacing``)?
 
 ``--minutes`` says how long the walk is::
 

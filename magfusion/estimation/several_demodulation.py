@@ -56,7 +56,12 @@ class SeveralDemodulation(Demodulation):
         """Whether there are samples to demodulate again, once the motion is known."""
         return True
 
-    def compensated(self, calibration: Calibration, states: Trajectory) -> MotionCompensated:
+    def compensated(
+        self,
+        calibration: Calibration,
+        states: Trajectory,
+        path: Trajectory | None = None,  # noqa: ARG002
+    ) -> MotionCompensated:
         """Return the phasors with the motion inside the windows taken off, of each by its own."""
         fields = self.fields
         phasor = np.full_like(fields.phasor_sensor, np.nan)

@@ -34,8 +34,8 @@ def together(case: Case) -> Testimony:
     finding = Finding(
         "field_residuals",
         f"What the beacons send together deviates by up to {rms:.2g} times what noise and model"
-        f" error allow, in {share:.0f} % of the log. A beacon that is not as declared, iron near the"
-        " path, or a start that was wrong: record longer, and see which beacon is named.",
+        f" error allow, in {share:.0f} % of the log. A beacon is not as declared, iron is near the"
+        " path, or the start was wrong: record longer, and see which beacon is named.",
         Verdict.FAILED if rms > NOTHING_EXPLAINED else Verdict.DOUBTFUL,
         20.0 + rms,
     )
