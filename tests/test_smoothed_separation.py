@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import binom
 from small_problem import SIGMA, SmallLog
 
-from magfusion.estimation import factors
+from magfusion.estimation import considered, factors
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.graph import marginals
 from magfusion.estimation.integrity import smoothed_separation
@@ -152,7 +152,9 @@ def test_piece_by_piece_a_log_is_separated_as_at_once(monkeypatch: pytest.Monkey
     known = separate_smoothed(result), marginals(result.graph, result.estimate, result.uncertain)
     for module in (factors, smoothed_separation):
         monkeypatch.setattr(module, "PIECE", 7)
-    monkeypatch.setattr(smoothed_separation, "AT_ONCE", 1.0)  # one beacon at once, nothing kept
+    monkeypatch.setattr(smoothed_separation, "AT_ONCE", 1.0)  # one beacon at once
+    monkeypatch.setattr(smoothed_separation, "KEPT", 1.0)
+    monkeypatch.setattr(considered, "AT_ONCE", 1.0)  # and one parameter that is held
     found = separate_smoothed(result), marginals(result.graph, result.estimate, result.uncertain)
     assert known[0] is not None
     assert found[0] is not None

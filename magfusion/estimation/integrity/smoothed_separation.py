@@ -16,7 +16,7 @@ from magfusion.estimation.graph import Estimate, Graph
 from magfusion.estimation.integrity.separation import Separation
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.solve.chain import Chain, solve_chain
+from magfusion.estimation.solve.chain import Chain, ChainSolution, solve_chain
 from magfusion.estimation.state import MOTION, states_in
 from magfusion.model.parameters import Block, difference, dimension
 from magfusion.model.prior import prior_sqrt_covariance, prior_sqrt_information
@@ -220,11 +220,7 @@ def _without_each(
     whole: tuple[Array, Array] | None = None
     for first in range(0, len(kept), group):
         some = kept[first : first + group]
-        chain, variants = rest.variants(len(some))
-        for piece in rows.pieces():
-            for normal, channels in zip(variants, some, strict=True):
-                piece.added_to(normal, channels)
-        found = solve_chain(chain, 6)
+        found = _solved(rest, rows, some)
         costs.append(some @ square - found.explained)
         for states, cov in zip(found.states, found.cov, strict=True):
             response = states[..., 1:]
@@ -235,7 +231,18 @@ def _without_each(
                 continue
             moved = response - whole[0]
             aparts.append(cov - whole[1] + moved @ np.swapaxes(moved, -1, -2))
+            del moved
+        del found, states, response, cov  # before the next group: of a long log they are much
     return (np.array(steps), np.array(covs), np.array(aparts)), np.concatenate(costs)
+
+
+def _solved(rest: _Normal, rows: _Rows, some: BoolArray) -> ChainSolution:
+    """Solve some variants at once."""
+    chain, variants = rest.variants(len(some))
+    for piece in rows.pieces():
+        for normal, channels in zip(variants, some, strict=True):
+            piece.added_to(normal, channels)
+    return solve_chain(chain, 6)
 
 
 def _linear(
