@@ -13,9 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.integrity.judgement import JudgedState
 from magfusion.estimation.integrity.magnetometer_exclusion import agreed
 from magfusion.estimation.integrity.magnetometers import without_silent
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.estimation.state import as_trajectory
 from magfusion.files.fields import (
     on_log_clock,
     order_channels,
@@ -25,6 +28,7 @@ from magfusion.files.fields import (
 )
 from magfusion.files.site import load_site, save_site
 from magfusion.files.table import Span
+from magfusion.jobs.replay import Replay, feed
 from magfusion.model.parameters import (
     Block,
     Calibration,
@@ -287,7 +291,7 @@ def walked(seed: int) -> tuple[Log, Site, SimulatedLog]:
     fields = side_by_side(
         [on_log_clock(part, only(site, which)) for which, part in enumerate(parts)], site
     )
-    return replace(walk.log, waveform=None, fields=fields), site, walk
+    return replace(walk.log, waveforms={}, fields=fields), site, walk
 
 
 def test_the_clock_of_the_second_is_found_by_the_phases() -> None:
@@ -318,3 +322,26 @@ def test_one_that_is_mounted_otherwise_is_named_and_the_other_goes_on() -> None:
     assert [finding.code for finding in found.findings] == ["magnetometer_excluded"]
     assert "Magnetometer right" in found.findings[0].text
     assert [sensor.name for sensor in found.site.platform.magnetometers] == ["left"]
+
+
+@pytest.mark.slow
+def test_online_as_offline_it_is_named_at_the_start_and_the_other_is_not_blamed() -> None:
+    log, site, walk = walked(4)
+    left, right = site.platform.magnetometers
+    turn = Rotation.from_euler("x", 8.0, degrees=True).as_matrix()
+    wrong = replace(right, body_from_sensor=right.body_from_sensor @ turn)
+    site = replace(site, platform=site.platform.carrying((left, wrong)))
+    navigator, states = Navigator(site, NavigatorSettings("ekf")), list[JudgedState]()
+    for _, piece in Replay(log).pieces():
+        feed(navigator, piece)
+        states += navigator.take()
+    assert states
+    for state in states:
+        reasons = state.judgement.reasons
+        named = [f for f in reasons if f.code == "magnetometer_excluded"]
+        assert len(named) == 1
+        assert named[0].text.startswith("Magnetometer right contradicts the others")
+        assert not any("left.rotation" in f.text or f.code == "mounting" for f in reasons)
+    found = as_trajectory(states)
+    errors = trajectory_errors(found, walk.motion.trajectory(found.time))
+    assert errors.ate < 0.02

@@ -97,6 +97,7 @@ class EpochUpdate:
     def begin(self, start: OnlineStart) -> Judgement:
         """Judge a first state."""
         said = Judgement(start.trust.reasons, turn=start.turn, shift=start.shift)
+        self.gate.watch.begin(start.excluded, start.said)
         self.witness.begin(start.state.time, said, start.borrowed)
         self.score.begin(start.score, start.state.time)
         fitted = [f for f in start.trust.remarks if f.code == "fitted_line" and start.beside]

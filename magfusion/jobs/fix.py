@@ -131,6 +131,7 @@ def run_fix(
 
     from magfusion.estimation.demodulation import fix_inputs, phasors
     from magfusion.estimation.integrity.explained_fixes import explained_fixes
+    from magfusion.estimation.integrity.fix_magnetometers import contradicting_magnetometers
     from magfusion.estimation.integrity.place_witness import of_place
     from magfusion.estimation.integrity.recording import BRIDGED, recorded
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
@@ -178,6 +179,7 @@ def run_fix(
     first = (fixes.world_from_body, fixes.position_world, fixes.pose_cov)
     trust = found.trust | Trust(of_place(site, fixes.time, *(part[:, 0] for part in first)))
     trust |= Trust(recorded(recording, site, BRIDGED, beacons=True, hearing=hearing))
+    trust |= Trust(contradicting_magnetometers(samples, calibration))
     trust |= Trust(() if rested is None else rested.findings)
     figures = heading("fix", log.name) | trust_figures(trust) | fix_figures(fixes, site)
     figures |= dropped_figures(dropped if rested is None else rested.dropped)

@@ -9,6 +9,8 @@ from magfusion.estimation.state import MOTION, State
 from magfusion.model.parameters import (
     Block,
     Calibration,
+    MagnetometerParameter,
+    Parameter,
     channels_of,
     dimension,
     initial_calibration,
@@ -18,11 +20,15 @@ from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.site import Site
 from magfusion.units import IntArray
 
+Key = tuple[Parameter, str]
+
 
 def among_all(
     state: State, known: tuple[Block, ...], site: Site, settings: EstimatorSettings
 ) -> State:
     """Return a state in the tangent of a whole site; what was not heard is as declared.
+
+    A start may be of some beacons, of some magnetometers, or of some of both.
 
     Parameters
     ----------
@@ -38,22 +44,32 @@ def among_all(
             root[rows, rows] = prior_sqrt_covariance(site, some)
     cov = np.zeros((MOTION + len(root),) * 2)
     cov[MOTION:, MOTION:] = root @ root.T
-    own = np.concatenate([np.arange(MOTION), MOTION + _columns(blocks, known)])
+    keys = [_key(block, state.calibration.site, site) for block in known]
+    own = np.concatenate([np.arange(MOTION), MOTION + _columns(blocks, keys)])
     cov[own] = cov[:, own] = 0.0
     cov[np.ix_(own, own)] = state.cov
     return replace(state, calibration=_whole(state, site), cov=cov)
 
 
-def _columns(blocks: tuple[Block, ...], known: tuple[Block, ...]) -> IntArray:
+def _key(block: Block, some: Site, site: Site) -> Key:
+    """Return what a block of some magnetometers is among all: the only one has no name."""
+    sensors = some.platform
+    alone = isinstance(block.parameter, MagnetometerParameter) and not sensors.further
+    if alone and site.platform.further:
+        return block.parameter, sensors.magnetometer.name
+    return block.key
+
+
+def _columns(blocks: tuple[Block, ...], known: list[Key]) -> IntArray:
     """Return where the columns of known blocks are among all."""
     place = {block.key: block.columns for block in blocks}
-    found = [np.arange(place[b.key].start, place[b.key].stop) for b in known]
+    found = [np.arange(place[key].start, place[key].stop) for key in known]
     return np.concatenate([np.zeros(0, dtype=np.int64), *found])
 
 
 def _whole(state: State, site: Site) -> Calibration:
-    """Return the calibration with the beacons that were not heard as the site declares them."""
-    heard, part = state.calibration, state.calibration.site
+    """Return the calibration with what was not heard as the site declares it."""
+    heard, part = _of_all_magnetometers(state.calibration, site), state.calibration.site
     every = initial_calibration(site, heard.reference_time, heard.imu_begin)
     names = {beacon.name: beacon for beacon in part.beacons}
     beacons = np.array([k for k, beacon in enumerate(site.beacons) if beacon.name in names])
@@ -61,5 +77,23 @@ def _whole(state: State, site: Site) -> Calibration:
     phase, drift, log_gain = every.phase.copy(), every.drift.copy(), every.log_gain.copy()
     phase[channels], log_gain[channels] = heard.phase, heard.log_gain
     drift[beacons] = heard.drift
-    whole = replace(part, beacons=tuple(names.get(b.name, b) for b in site.beacons), unheard=())
+    whole = replace(
+        heard.site, beacons=tuple(names.get(b.name, b) for b in site.beacons), unheard=()
+    )
     return replace(heard, site=whole, phase=phase, drift=drift, log_gain=log_gain)
+
+
+def _of_all_magnetometers(calibration: Calibration, site: Site) -> Calibration:
+    """Return the calibration with the magnetometers that it lacks as the site declares them."""
+    part, every = calibration.site, site.platform.magnetometers
+    if len(part.platform.magnetometers) == len(every):
+        return calibration
+    known = {sensor.name: sensor for sensor in part.platform.magnetometers}
+    sensors = tuple(known.get(sensor.name, sensor) for sensor in every)
+    first = part.of_sensor(0)  # drives are the same of every magnetometer
+    return replace(
+        calibration,
+        site=replace(part, platform=part.platform.carrying(sensors)),
+        phase=np.tile(calibration.phase[first], len(every)),
+        log_gain=np.tile(calibration.log_gain[first], len(every)),
+    )

@@ -12,6 +12,7 @@ from magfusion.estimation.demodulated_apart import each_alone
 from magfusion.estimation.initialization.among_many import among_all
 from magfusion.estimation.initialization.handover import last_state
 from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.magnetometer_exclusion import Agreed, agreed
 from magfusion.estimation.integrity.score import Score, score_of
 from magfusion.estimation.integrity.spectrum import beside_lines
 from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
@@ -23,7 +24,7 @@ from magfusion.model.audibility import are_many
 from magfusion.model.marks import Marks
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
 from magfusion.model.site import Site
-from magfusion.model.trust import Trust, Verdict
+from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.receiver.cycles import cycles, joins
 from magfusion.receiver.receiver import Receiver
 from magfusion.receiver.slots import has_schedule
@@ -52,6 +53,10 @@ class OnlineStart:
         How the receiver goes on where lines are to be fitted that the site does not declare.
     lines : mapping
         The same of several magnetometers, by their names.
+    excluded : tuple of str
+        Magnetometers that it was made without, as they contradict the others.
+    said : tuple of Finding
+        Of that, or that they contradict each other and none can be named.
     turn, shift : float
         By how much more attitude (rad) and position (m) may be off for it, one sigma an axis.
     borrowed : mapping of str to ndarray
@@ -68,6 +73,8 @@ class OnlineStart:
     beside: LockinSettings | None = None
     lines: Mapping[str, LockinSettings] = field(default_factory=dict)
     borrowed: Mapping[str, Array] = field(default_factory=dict)
+    excluded: tuple[str, ...] = ()
+    said: tuple[Finding, ...] = ()
 
     @property
     def ambiguous(self) -> bool:
@@ -144,11 +151,13 @@ def find_online_start(
             log = replace(log, fields=demodulated_several(log, site, settings.lockin).fields)
         if log.waveform is not None and has_schedule(site) and joins(site, log.waveform.marks):
             log = _of_cycles(log, log.waveform, site, settings)
-        result = smooth(log, site, SmootherSettings(loss="huber", **asked))
+        how = SmootherSettings(loss="huber", **asked)
+        found = _agreed(smooth(log, site, how), log, site, how)
+        log, result = found.log, found.result
         honest, trust = judged(result, log)
         score = score_of(result, imu)
         state = last_state(result, result.considered)
-        if result.calibration.site.unheard:
+        if result.calibration.site.unheard or site.platform.further:
             known = (*result.blocks, *result.considered)
             state = among_all(state, known, site, settings)
     except (EstimationError, InputError) as error:
@@ -157,6 +166,7 @@ def find_online_start(
         return NoStart("The measurements leave a direction of the motion open.")
     if trust.verdict is Verdict.FAILED:
         return NoStart(trust.reasons[0].text, trust)
+    left = [sensor.name for sensor in found.site.platform.magnetometers]
     given = settings.lockin
     lined = given is not None and len(given.lines_hz) > 0
     beside = given if lined else beside_lines(log, site, given)
@@ -168,8 +178,24 @@ def find_online_start(
         score,
         *_wider(result, honest),
         None if beside is given else beside,
-        _lines_of_each(log, site, given) if several else {},
+        _lines_of_each(heard, site, given) if several else {},
         {b.name: np.sum(result.calibration_response[b.columns] ** 2, 1) for b in result.blocks},
+        tuple(sensor.name for sensor in site.platform.magnetometers if sensor.name not in left),
+        found.findings,
+    )
+
+
+def _agreed(result: Smoothed, log: Log, site: Site, settings: SmootherSettings) -> Agreed:
+    """Return a start without a magnetometer that contradicts the others, as of a whole log."""
+    if not site.platform.further:
+        return Agreed(log, site, result, ())
+    plain = replace(settings, tune=False)
+    return agreed(
+        result,
+        log,
+        site,
+        lambda log, site: smooth(log, site, settings),
+        lambda log, site: smooth(log, site, plain),
     )
 
 

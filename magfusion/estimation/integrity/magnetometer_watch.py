@@ -20,10 +20,14 @@ class MagnetometerWatch:
         By magnetometer.
     epochs : dict of str to int
         Of each, as many as hold any of its phasors.
+    excluded : list of str
+        Those that the first state was made without.
     """
 
     share: dict[str, float]
     epochs: dict[str, int]
+    excluded: list[str]
+    _said: list[Finding]
 
     def __init__(self, site: Site) -> None:
         sensors = site.platform.magnetometers
@@ -31,13 +35,19 @@ class MagnetometerWatch:
         self._names = tuple(sensor.name for sensor in sensors) if several else ()
         self._sensor = site.sensor
         self.share, self.epochs = {}, {}
+        self.excluded, self._said = [], []
+
+    def begin(self, excluded: tuple[str, ...], said: tuple[Finding, ...]) -> None:
+        """Leave out what the first state was made without, and keep what is said of that."""
+        self.excluded, self._said = list(excluded), list(said)
 
     @property
     def false(self) -> tuple[str, ...]:
         """Those that are left out: refused mostly, where another seldom is."""
         asked = [name for name in self._names if self.epochs.get(name, 0) >= FEWEST]
         right = [name for name in asked if self.share[name] < SELDOM]
-        return tuple(name for name in asked if right and self.share[name] > MOSTLY)
+        late = [name for name in asked if right and self.share[name] > MOSTLY]
+        return tuple(dict.fromkeys([*self.excluded, *late]))
 
     def heard(self, refused: BoolArray, valid: BoolArray) -> BoolArray:
         """Take in which of an epoch's channels a state does not explain; return what is left out.
@@ -61,12 +71,13 @@ class MagnetometerWatch:
 
     def findings(self) -> tuple[Finding, ...]:
         """Return what is to be said of those that are left out."""
-        return tuple(
+        late = [name for name in self.false if name not in self.excluded]
+        return *self._said, *(
             Finding(
                 "magnetometer_excluded",
                 f"Magnetometer {name} contradicts the others: {100.0 * self.share[name]:.0f} % of"
                 " its phasors are not what the motion allows, of another hardly any. It is left"
                 " out. Check its body_from_sensor, matrix, response and clock_offset_s.",
             )
-            for name in self.false
+            for name in late
         )
