@@ -218,8 +218,6 @@ def test_what_one_axis_cannot_do_is_refused(
     site = with_axes(demo_site(), "z")
     prior = MotionPrior(2.0, 3.0)
     save_site(replace(site, platform=replace(site.platform, motion_prior=prior)), log / "site.yaml")
-    said = refuse("smooth", log, "-o", tmp_path / "run")
-    assert "tells nothing of the roll about it" in said
     said = refuse("coverage", log / "site.yaml", "-o", tmp_path / "run")
     assert "is [z], and this job needs all three axes" in said
     save_site(demo_site(), tmp_path / "whole.yaml")

@@ -16,6 +16,7 @@ from magfusion.estimation.integrity.judgement import Judgement
 from magfusion.estimation.integrity.magnetometer_watch import MagnetometerWatch
 from magfusion.estimation.integrity.near_metal import NearMetal
 from magfusion.estimation.integrity.online import Heard, OnlineWitness
+from magfusion.estimation.integrity.open_roll import roll_findings
 from magfusion.estimation.integrity.place_witness import of_place
 from magfusion.estimation.integrity.reckoned import Reckoned
 from magfusion.estimation.integrity.recovery import (
@@ -87,6 +88,7 @@ class EpochUpdate:
         self.site, self.blocks, self.bank = site, blocks, bank
         self.gate = Gate(site.channels, blocks, MagnetometerWatch(site))
         self.of_currents: tuple[Finding, ...] = ()
+        self._roll = roll_findings(site)
         self.metal, self._reckoned = NearMetal(site, blocks), Reckoned(blocks)
         self.witness = OnlineWitness(site, estimated)
         self.score = OnlineScore(site, estimated, blocks[len(estimated) :], steady=earth)
@@ -251,6 +253,7 @@ class EpochUpdate:
             *self.of_currents,
             *self.gate.watch.findings(),
             *_of_place(self.site, state),
+            *self._roll,
         )
         return said if self.bank is None else self.bank.heard(said, state)
 

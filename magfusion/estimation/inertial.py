@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from magfusion.estimation.preintegration import Increments, preintegrate
+from magfusion.estimation.preintegration import Increments, across_held, preintegrate
 from magfusion.model.parameters import (
     Block,
     Calibration,
@@ -15,6 +15,7 @@ from magfusion.model.parameters import (
     inertial_blocks,
     retract,
 )
+from magfusion.model.platform_motion import HeldModel
 from magfusion.model.site import Platform, Site
 from magfusion.units import Array
 
@@ -77,7 +78,12 @@ def inertial_graph(
     """Return priors of the first velocity and bias, and the inertial factors between epochs."""
     graph, imu = gtsam.NonlinearFactorGraph(), platform.imu
     sigmas = np.repeat([imu.accel_bias_sigma, imu.gyro_bias_sigma], 3)
+    bias_noise: gtsam.noiseModel.Gaussian
     bias_noise = gtsam.noiseModel.Diagonal.Sigmas(np.maximum(sigmas, 1e-9))
+    if isinstance(imu, HeldModel):
+        cov = np.diag(sigmas**2)
+        cov[3:, 3:] = across_held(cov[3:, 3:], imu)
+        bias_noise = gtsam.noiseModel.Gaussian.Covariance(cov)
     zero_bias = gtsam.imuBias.ConstantBias(np.zeros(3), np.zeros(3))
     graph.addPriorConstantBias(B(0), zero_bias, bias_noise)
     speed = gtsam.noiseModel.Isotropic.Sigma(3, platform.motion.start_speed_sigma)

@@ -7,7 +7,9 @@ import numpy as np
 from magfusion.estimation.graph import Estimate, initial_estimate, read_states
 from magfusion.estimation.initialization.search import differ, thinned
 from magfusion.estimation.log_graph import PreparedLog, graph_of
+from magfusion.estimation.measurements.held_roll import without_roll
 from magfusion.estimation.solve.bordered import Optimised, optimise
+from magfusion.model.one_axis import roll_is_open
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import IntArray
 
@@ -74,4 +76,6 @@ def _optimised(log: PreparedLog, iterations: int = 30) -> Optimised[Estimate]:
 
 
 def _path(found: Optimised[Estimate], log: PreparedLog) -> Trajectory:
-    return read_states(found.estimate.values, log.states.time)
+    path, site = read_states(found.estimate.values, log.states.time), log.declared.site
+    signed = log.samples.signed
+    return without_roll(path, site, signed=signed) if roll_is_open(site) else path

@@ -18,6 +18,7 @@ from magfusion.estimation.integrity.detection import (
 )
 from magfusion.estimation.measurements.earth import earth_measurement, unheld
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
+from magfusion.estimation.measurements.held_roll import held_roll
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
 from magfusion.estimation.measurements.pose_fix import pose_fixes
@@ -27,6 +28,7 @@ from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.motion_compensation import MotionCompensated
 from magfusion.estimation.preintegration import low_passed_rate_at
 from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.one_axis import roll_is_open
 from magfusion.model.parameters import Block, Calibration, corrected_imu, dimension, placed
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields
 from magfusion.model.trajectory import Trajectory
@@ -161,6 +163,8 @@ def graph_of(
         replace(measurement, epoch=np.searchsorted(states.time, time)[measurement.epoch])
         for time, measurement in log.others
     ]
+    if roll_is_open(log.declared.site):
+        measurements.append(held_roll(log.declared.site, states))
     if standing is not None and np.any(standing):
         measurements.append(log.rests(standing))
         measurements += log.zero_rates(standing, states.time, calibration)

@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from magfusion.model.platform_motion import HeldModel
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel
 from magfusion.units import Array, BoolArray, IntArray
@@ -15,6 +16,7 @@ from magfusion.units import Array, BoolArray, IntArray
 BRIDGE_GYRO_NOISE = 1.0  # rad/s/sqrt(Hz)
 BRIDGE_ACCEL_NOISE = 3.0  # m/s^2/sqrt(Hz)
 RATE_SPAN = 0.08  # s; motion is slower, noise is not
+LEAST_HELD = 1e-4  # rad/s, and that per root s, about an axis that is held: none, but regular
 GAP_SAMPLES = 5.0  # a gap is this many times the usual sampling interval
 
 
@@ -93,6 +95,15 @@ def in_gap(time: Array, grid: Array, usual: float) -> BoolArray:
     return np.asarray(spacing[holding] > GAP_SAMPLES * usual)
 
 
+def across_held(cov: Array, imu: ImuModel) -> Array:
+    """Return the covariance of a gyro's bias, (3, 3), without any about the axis that is held."""
+    if not isinstance(imu, HeldModel):
+        return cov
+    axis = np.array(imu.held_axis)
+    across = np.eye(3) - np.outer(axis, axis)
+    return np.asarray(across @ cov @ across + LEAST_HELD**2 * np.outer(axis, axis))
+
+
 @lru_cache(maxsize=8)
 def preintegration_parameters(
     imu: ImuModel, gravity: float, *, bridge: bool
@@ -104,7 +115,7 @@ def preintegration_parameters(
     parameters.setGyroscopeCovariance(gyro**2 * np.eye(3))
     parameters.setAccelerometerCovariance(accel**2 * np.eye(3))
     parameters.setIntegrationCovariance(1e-12 * np.eye(3))
-    parameters.setBiasOmegaCovariance(imu.gyro_bias_walk**2 * np.eye(3))
+    parameters.setBiasOmegaCovariance(across_held(imu.gyro_bias_walk**2 * np.eye(3), imu))
     parameters.setBiasAccCovariance(imu.accel_bias_walk**2 * np.eye(3))
     return parameters
 

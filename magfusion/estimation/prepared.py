@@ -17,10 +17,12 @@ from magfusion.estimation.initialization.offline import (
 from magfusion.estimation.integrity.detection import detected, only
 from magfusion.estimation.likeliest import likeliest
 from magfusion.estimation.log_graph import PreparedLog
+from magfusion.estimation.measurements.held_roll import without_roll
 from magfusion.estimation.measurements.zero_velocity import quiet_before
 from magfusion.estimation.settings import SmootherSettings
 from magfusion.estimation.several_demodulation import demodulated_several
 from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.one_axis import roll_is_open
 from magfusion.model.parameters import Calibration, initial_calibration
 from magfusion.model.progress import Report
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields
@@ -92,7 +94,11 @@ def prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) -
             settings,
             Begun(
                 with_rest_bias(
-                    carried(beginning.states, imu, offset, heard.time),
+                    _one_roll(
+                        carried(beginning.states, imu, offset, heard.time),
+                        site,
+                        signed=heard.samples.signed,
+                    ),
                     heard.log.imu,
                     heard.calibration,
                 ),
@@ -104,6 +110,11 @@ def prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) -
         for beginning in beginnings
     ]
     return bridged(likeliest(starts))
+
+
+def _one_roll(states: Trajectory, site: Site, *, signed: bool) -> Trajectory:
+    """Return states whose rolls, where nothing tells them, are those of one that does not turn."""
+    return without_roll(states, site, signed=signed) if roll_is_open(site) else states
 
 
 def prepared_again(log: Log, site: Site, settings: SmootherSettings, known: Begun) -> PreparedLog:

@@ -17,7 +17,7 @@ from magfusion.estimation.carried import (
 from magfusion.estimation.held_motion import HeldMotion
 from magfusion.estimation.input_queue import Arrivals
 from magfusion.estimation.integrity.bank import SubsetBank
-from magfusion.estimation.integrity.judgement import JudgedState, Judgement
+from magfusion.estimation.integrity.judgement import JudgedState, Judgement, told_cov
 from magfusion.estimation.navigator_settings import NavigatorSettings
 from magfusion.estimation.state import State
 from magfusion.units import DEGREE, Array
@@ -169,7 +169,7 @@ class StateOfNow:
                 self._blend.told(state) if self._blend.length > 0.0 else (state, np.zeros(9))
             )
             judgement = _wider(said.judgement, more, step)
-            told = vars(own) | {"cov": judgement.honest(own.cov), "judgement": judgement}
+            told = vars(own) | {"cov": told_cov(own, judgement), "judgement": judgement}
             counter, epoch = said.reset_counter, departure.state.time
             found.append(CarriedState(**told, reset_counter=counter, epoch=epoch))
         return found

@@ -9,6 +9,7 @@ import numpy as np
 from magfusion.estimation.initialization.online import NoStart
 from magfusion.estimation.integrity.diagnosis import with_cause
 from magfusion.estimation.integrity.judgement import JudgedState
+from magfusion.estimation.integrity.open_roll import comparable
 from magfusion.estimation.integrity.recording import BRIDGED, recorded
 from magfusion.estimation.integrity.signal import Detected
 from magfusion.estimation.navigator import Navigator, NavigatorSettings
@@ -36,6 +37,7 @@ from magfusion.results.recording import write_recording
 from magfusion.results.refinement import parameter_estimates, refined_site
 from magfusion.results.report import (
     compared_with_truth,
+    open_figures,
     rival_figures,
     sigma_figures,
     where_found,
@@ -201,18 +203,20 @@ def navigated(
     assert current is not None
     states = current.states
     estimates, refined = _calibration(navigator, log.name)
-    errors, compared = compared_with_truth(states, log)
+    errors, compared = compared_with_truth(states, comparable(log, states, site))
     figures = heading("navigate", log.name) | trust_figures(trust)
     figures |= _settings_figures(navigator.settings) | _run_figures(navigator, states) | compared
-    figures |= level_figures(current.trust)
+    figures |= level_figures(current.trust) | open_figures(site)
     lagged = _part(rows, _chosen(rows, trust, LAGGED), site)
     if lagged is not None:
         figures |= Figures(Figure("lagged_epochs", len(lagged.states), section=Section.REPORT))
-        figures |= compared_with_truth(lagged.states, log, Column.LAGGED, "lagged_")[1]
+        left = comparable(log, lagged.states, site)
+        figures |= compared_with_truth(lagged.states, left, Column.LAGGED, "lagged_")[1]
     carried = _part(rows, _chosen(rows, trust, CARRIED), site)
     if carried is not None:
         figures |= Figures(Figure("carried_states", len(carried.states), section=Section.REPORT))
-        figures |= compared_with_truth(carried.states, log, Column.CARRIED, "carried_")[1]
+        now = comparable(log, carried.states, site)
+        figures |= compared_with_truth(carried.states, now, Column.CARRIED, "carried_")[1]
     latency = rows["latency"][rows["lagged"][:, 0] == CURRENT, 0]
     figures |= _update_figures(latency, elapsed)
     figures |= Figures(*estimates) | determined_figures(estimates)

@@ -11,6 +11,7 @@ from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.between_epochs import at_rate
 from magfusion.estimation.integrity.diagnosis import with_cause
 from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.open_roll import comparable, roll_findings, with_open_roll
 from magfusion.estimation.integrity.smoothed_exclusion import (
     separated_smooth,
     states_between,
@@ -33,6 +34,7 @@ from magfusion.results.refinement import result_site
 from magfusion.results.report import (
     compared_with_truth,
     error_figures,
+    open_figures,
     placement_figures,
     smoothed_figures,
     where_found,
@@ -83,7 +85,8 @@ def finished(
     """
     separated = separated_smooth(result, risk)
     result, trust = judged(separated.result, log)
-    trust |= Trust(open_signs(result))
+    trust |= Trust((*open_signs(result), *roll_findings(site)))
+    result = replace(result, states=with_open_roll(result.states, site))
     if excess > 1.0 and result.states.pose_cov is not None:
         wider = excess * result.states.pose_cov
         result = replace(result, states=replace(result.states, pose_cov=wider))
@@ -94,7 +97,7 @@ def finished(
         | trust_figures(trust)
         | Figures(where_found("coupling", settings.coupling != "tight", settings.coupling))
     )
-    figures |= smoothed_figures(result) | level_figures(by_state)
+    figures |= smoothed_figures(result) | level_figures(by_state) | open_figures(site)
     return Finished(result, trust, by_state, figures, None)
 
 
@@ -124,7 +127,8 @@ def with_errors(
         With which the log is smoothed once more, its survey fixed: what estimating it was worth.
     """
     result = done.result
-    errors, compared = compared_with_truth(result.states, log)
+    own = comparable(log, result.states, result.declared.site)
+    errors, compared = compared_with_truth(result.states, own)
     figures = done.figures | compared | placement_figures(placed, result.calibration.site)
     if errors is not None and not placed and fixed is not None:
         figures |= _fixed_survey_figures(log, *fixed, result)
@@ -138,7 +142,9 @@ def write_finished(whole: Path, log: Log, done: Finished, *, rate: Rate) -> None
         states = replace(result.states, gyro_bias_body=None, accel_bias_body=None)
         result = replace(result, states=states)
     refined, innovations = result_site(result, log.name), _innovations(result)
-    written = result.states if rate == "field" else at_rate(done.result, log, rate)
+    written = result.states
+    if rate != "field":
+        written = with_open_roll(at_rate(done.result, log, rate), result.declared.site)
     if not log.inertial:
         written = replace(written, gyro_bias_body=None, accel_bias_body=None)
     directory = found_in(whole, done.trust)

@@ -61,6 +61,21 @@ class ImuModel:
     clock_rate_sigma: float = 5e-5
 
 
+@dataclass(frozen=True)
+class HeldModel(ImuModel):
+    """What stands for an IMU by a motion prior that has no rate about an axis.
+
+    Of a receiver of one axis, whose roll about its coil nothing tells.
+
+    Parameters
+    ----------
+    held_axis : tuple of float
+        Body axes, of length one.
+    """
+
+    held_axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+
 # Of a site that describes none: nothing is known by it.
 NO_IMU = ImuModel(
     gyro_noise=float("inf"),

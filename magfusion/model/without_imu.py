@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.model.platform_motion import ImuModel, MotionPrior, Replaced
+from magfusion.model.one_axis import axis_of
+from magfusion.model.platform_motion import HeldModel, ImuModel, MotionPrior, Replaced
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
 
@@ -40,6 +41,9 @@ def on_motion_prior(site: Site) -> Site:
         time_offset_sigma=0.0,
         clock_rate_sigma=0.0,
     )
+    axis = _held(site)
+    if axis is not None:
+        imu = HeldModel(**vars(imu), held_axis=axis)
     platform, motion = site.platform, site.platform.motion
     never = replace(motion, rest_gyro=0.0, rest_accel=0.0)  # zeros must not pass for rest
     replaced = Replaced(platform.imu, motion, site.gravity)
@@ -48,6 +52,15 @@ def on_motion_prior(site: Site) -> Site:
         gravity=0.0,
         platform=replace(platform, imu=imu, motion=never, replaced=replaced),
     )
+
+
+def _held(site: Site) -> tuple[float, float, float] | None:
+    """Return the coil about which nothing tells a turn; None where there are more axes."""
+    platform = site.platform
+    if platform.further or len(platform.magnetometer.axes) != 1:
+        return None
+    x, y, z = axis_of(platform.magnetometer).tolist()
+    return x, y, z
 
 
 def as_declared(site: Site) -> Site:
@@ -110,11 +123,4 @@ def require_motion_prior(site: Site) -> None:
             "holds no inertial samples (imu.parquet), and its site no platform.motion_prior to"
             " smooth by; record the IMU, or declare how the platform moves:"
             f" motion_prior: {EXAMPLE} is a hand's"
-        )
-    if not site.platform.inertial and len(site.platform.magnetometer.axes) == 1:
-        raise InputError(
-            "holds no inertial samples (imu.parquet), and a receiver of one axis"
-            " (platform.magnetometer.axes) tells nothing of the roll about it: neither attitude nor"
-            " lever arm would be determined; record the IMU, or run magfusion fix, which says of"
-            " each epoch what is told"
         )

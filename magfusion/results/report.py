@@ -13,6 +13,7 @@ from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.self_survey import Placement
 from magfusion.estimation.snapshot.ambiguity import ambiguities, relations
 from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.one_axis import roll_is_open
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -127,6 +128,13 @@ def dropped_figures(dropped: Mapping[str, int], what: str = "windows") -> Figure
             for reason, count in dropped.items()
         ),
     )
+
+
+def open_figures(site: Site) -> Figures:
+    """Return which directions of every pose nothing tells, where there are any."""
+    if not roll_is_open(site):
+        return Figures()
+    return Figures(Figure("open_directions", ["roll about the axis"], section=Section.REPORT))
 
 
 def residual_figure(beacon: str, rms: float) -> Figure:

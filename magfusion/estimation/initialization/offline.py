@@ -23,6 +23,7 @@ from magfusion.estimation.integrity.fix_separation import separate_fixes
 from magfusion.estimation.measurements.zero_rate import freed_of_bias
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.one_axis import roll_is_open
 from magfusion.model.parameters import Calibration
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields
 from magfusion.model.site import Site
@@ -93,7 +94,8 @@ def begin(
             declared = start_phases(calibration, fixes.time, start.phase)
         whole = start if everywhere else _carried(start, imu, offset, samples.time)
         out.append(OfflineStart(whole, whole.states, declared, fixes))
-    if epochs.signed and _doubtful(chains) and can_search(epochs):
+    tracked = epochs.signed and not roll_is_open(calibration.site)
+    if tracked and _doubtful(chains) and can_search(epochs):
         still = replace(imu, gyro_body=imu.gyro_body - _rest_bias(imu, calibration))
         for found in search(epochs, fixes, still, calibration):
             out.append(_tracked(found, fixes, imu, calibration, samples.time))

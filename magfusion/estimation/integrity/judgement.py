@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from magfusion.estimation.state import POSITION, ROTATION, State
+from magfusion.model.one_axis import opened_state, roll_is_open
 from magfusion.model.trust import Finding, Trust, Verdict, worst
 from magfusion.units import Array
 
@@ -109,8 +110,17 @@ class JudgedState(State):
         return self.verdict is Verdict.FAILED
 
 
+def told_cov(state: State, judgement: Judgement) -> Array:
+    """Return the covariance of a state as it is told: with any roll that nothing tells."""
+    cov, site = judgement.honest(state.cov), state.calibration.site
+    if not roll_is_open(site):
+        return cov
+    turned = state.world_from_body, state.gyro_bias_body, site.platform.imu.gyro_bias_sigma
+    return opened_state(site, cov, *turned)
+
+
 def judged_state(state: State, judgement: Judgement, reset_counter: int = 0) -> JudgedState:
     """Return a state of an estimator as it is told."""
     own = {field.name: getattr(state, field.name) for field in fields(State)}
-    told = {"cov": judgement.honest(state.cov), "judgement": judgement}
+    told = {"cov": told_cov(state, judgement), "judgement": judgement}
     return JudgedState(**own | told | {"reset_counter": reset_counter})

@@ -11,29 +11,15 @@ from magfusion.estimation.snapshot.axis_starts import least_turn
 from magfusion.estimation.snapshot.coil_fix import CoilFixes
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.field import skew
-from magfusion.model.site import Magnetometer, Site
+from magfusion.model.one_axis import ANY_ROLL, CIRCLE, axis_of, coil_lever
+from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory, interpolate
 from magfusion.model.trust import Finding, StateTrust, Trust, Verdict
 from magfusion.units import Array, BoolArray
 
-ANY_ROLL = np.pi / np.sqrt(3.0)  # rad; standard deviation of a turn of which nothing is known
 AMBIGUOUS = 0.05  # posterior share of a rival that is said
 FEW = 0.1  # share of the epochs; more of them cast doubt
 LONGEST_STEP = 0.1  # s; of a truth that is interpolated
-
-
-def axis_of(sensor: Magnetometer) -> Array:
-    """Return the direction that a magnetometer of one axis feels, body axes, shape (3,)."""
-    felt = sensor.body_from_sensor @ sensor.matrix["xyz".index(sensor.axes)]
-    return np.asarray(felt / np.linalg.norm(felt))
-
-
-def coil_lever(sensor: Magnetometer) -> Array:
-    """Return where its coil is, body axes, shape (3,) (m)."""
-    if sensor.coil_centres_sensor is None:
-        return sensor.position_body
-    own = sensor.coil_centres_sensor["xyz".index(sensor.axes)]
-    return np.asarray(sensor.position_body + sensor.body_from_sensor @ own)
 
 
 def poses_of(found: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixes:
@@ -64,7 +50,7 @@ def poses_of(found: CoilFixes, time: Array, site: Site, *, signed: bool) -> Fixe
     cov = by_axis @ found.cov @ np.swapaxes(by_axis, -1, -2)
     cov += ANY_ROLL**2 * _outer(np.concatenate([towards, np.cross(lever, towards)], axis=-1))
     along = np.sum(lever * towards, axis=-1, keepdims=True) * towards
-    cov[..., 3:, 3:] += 1.5 * _outer(lever - along)  # about the coil on a circle, not a tangent
+    cov[..., 3:, 3:] += CIRCLE * _outer(lever - along)  # about the coil on a circle, not a tangent
     if not signed:  # twice as far in half of the cases
         cov[..., 3:, 3:] += 2.0 * _outer(along)
     body = np.zeros_like(cov)

@@ -1,0 +1,74 @@
+"""The roll about a single coil, held where it is: nothing measures it, and any is as good."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.measurements.measurement import Measurement, Rows
+from magfusion.estimation.snapshot.axis_starts import least_turn
+from magfusion.estimation.state import States
+from magfusion.model.one_axis import axis_of, coil_lever
+from magfusion.model.parameters import Block, Calibration
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array
+
+SIGMA = 1e-3  # rad; what is told of a state opens the roll
+
+
+@dataclass(frozen=True, eq=False)
+class HeldRoll(Measurement):
+    """The turn about an axis of the body from some attitudes is zero.
+
+    Parameters
+    ----------
+    axis_body : ndarray, shape (3,)
+    world_from_body : ndarray, shape (n, 3, 3)
+    """
+
+    axis_body: Array
+    world_from_body: Array
+
+    def linearize(
+        self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
+    ) -> Rows:
+        """Return the rows at an estimate, one group of one."""
+        turn = np.swapaxes(self.world_from_body, 1, 2) @ states.world_from_body
+        about = Rotation.from_matrix(turn).as_rotvec() @ self.axis_body
+        by_pose = np.zeros((len(turn), 1, 1, 6))
+        by_pose[..., :3] = self.axis_body / SIGMA  # at a turn of which the rest is small
+        return Rows(error=about[:, None, None] / SIGMA, by_pose=by_pose)
+
+
+def held_roll(site: Site, states: Trajectory) -> HeldRoll:
+    """Return that the first state has the roll that it has."""
+    first = np.zeros(1, dtype=np.int64)
+    return HeldRoll(first, axis_of(site.platform.magnetometer), states.world_from_body[:1])
+
+
+def without_roll(states: Trajectory, site: Site, *, signed: bool = True) -> Trajectory:
+    """Return states whose attitudes do not turn about the coil from one to the next.
+
+    The coil is where it was, and points as it did; the first has the smallest turn that does.
+
+    Parameters
+    ----------
+    signed : bool
+        Whether it is known which way the coil points.  Amplitudes do not tell it: the first points
+        up, and none turns round from one state to the next.
+    """
+    sensor = site.platform.magnetometer
+    axis, lever = axis_of(sensor), coil_lever(sensor)
+    towards = states.world_from_body @ axis
+    if not signed:
+        forth = np.sum(towards[1:] * towards[:-1], axis=1)
+        sign = np.cumprod(np.where(np.append(towards[:1, 2], forth) < 0.0, -1.0, 1.0))
+        towards = sign[:, None] * towards
+    turns = np.empty_like(states.world_from_body)
+    turns[0] = least_turn(axis, towards[0])
+    for k, step in enumerate(least_turn(towards[:-1], towards[1:])):
+        turns[k + 1] = step @ turns[k]
+    place = states.position_world + (states.world_from_body - turns) @ lever
+    whole = Rotation.from_matrix(turns).as_matrix()  # rounding adds up over many
+    return Trajectory(**vars(states) | {"world_from_body": whole, "position_world": place})

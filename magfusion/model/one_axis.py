@@ -1,0 +1,78 @@
+"""A receiver of one axis: which way its coil points, where it is, and the roll that nothing tells.
+
+Without an IMU nothing tells the roll about the coil.  The estimators then follow a frame that does
+not turn about the coil, which any roll of the platform's is as good as, and what they say of it is
+opened: the roll may be any, and with it the place of the body on its circle about the coil.
+"""
+
+import numpy as np
+
+from magfusion.model.site import Magnetometer, Site
+from magfusion.units import Array
+
+ANY_ROLL = np.pi / np.sqrt(3.0)  # rad; standard deviation of a turn of which nothing is known
+CIRCLE = 1.5  # of a lever's square, for a place on a circle about the coil and not on its tangent
+
+
+def axis_of(sensor: Magnetometer) -> Array:
+    """Return the direction that a magnetometer of one axis feels, body axes, shape (3,)."""
+    felt = sensor.body_from_sensor @ sensor.matrix["xyz".index(sensor.axes)]
+    return np.asarray(felt / np.linalg.norm(felt))
+
+
+def coil_lever(sensor: Magnetometer) -> Array:
+    """Return where its coil is, body axes, shape (3,) (m)."""
+    if sensor.coil_centres_sensor is None:
+        return sensor.position_body
+    own = sensor.coil_centres_sensor["xyz".index(sensor.axes)]
+    return np.asarray(sensor.position_body + sensor.body_from_sensor @ own)
+
+
+def roll_is_open(site: Site) -> bool:
+    """Tell whether neither fields nor an IMU tell the roll about the one axis."""
+    platform = site.platform
+    one = not platform.further and len(platform.magnetometer.axes) == 1
+    return one and not platform.inertial
+
+
+def opened_poses(site: Site, pose_cov: Array) -> Array:
+    """Return covariances of poses (..., 6, 6), body axes, with any roll about the coil."""
+    sensor = site.platform.magnetometer
+    axis, lever = axis_of(sensor), coil_lever(sensor)
+    along = np.concatenate([axis, np.cross(lever, axis)])
+    out = pose_cov + ANY_ROLL**2 * np.outer(along, along)
+    across = lever - (lever @ axis) * axis
+    out[..., 3:6, 3:6] += CIRCLE * np.outer(across, across)
+    return np.asarray(out)
+
+
+def opened_state(
+    site: Site, cov: Array, world_from_body: Array, gyro_bias_body: Array, rate_sigma: float
+) -> Array:
+    """Return the covariance of a state's tangent with any roll about the coil.
+
+    Parameters
+    ----------
+    cov : ndarray, shape (k, k)
+        Pose (body axes), velocity (world), accelerometer and gyro bias, calibration.
+    gyro_bias_body : ndarray, shape (3,)
+        The rate reversed, of a motion prior (rad/s).
+    rate_sigma : float
+        Of the rate about the coil (rad/s).
+    """
+    sensor = site.platform.magnetometer
+    axis, lever = axis_of(sensor), coil_lever(sensor)
+    # The rate turns with the roll, in body axes; about the coil it may be any of the prior's.
+    rolled, spun = np.zeros(len(cov)), np.zeros(len(cov))
+    swing, rate = np.cross(axis, lever), -gyro_bias_body
+    rolled[6:9] = -world_from_body @ np.cross(rate, swing)
+    rolled[12:15] = np.cross(axis, rate)
+    rolled[:6] = np.concatenate([axis, -swing])
+    spun[6:9], spun[12:15] = -world_from_body @ swing, -axis
+    out = cov.copy()
+    out[:6, :6] = opened_poses(site, cov[:6, :6])
+    pose = np.zeros_like(rolled)
+    pose[:6] = rolled[:6]
+    out += ANY_ROLL**2 * (np.outer(rolled, rolled) - np.outer(pose, pose))
+    out += rate_sigma**2 * np.outer(spun, spun)
+    return np.asarray(out)
