@@ -7,6 +7,7 @@ opened: the roll may be any, and with it the place of the body on its circle abo
 
 import numpy as np
 
+from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.site import Magnetometer, Site
 from magfusion.units import Array
 
@@ -32,7 +33,7 @@ def roll_is_open(site: Site) -> bool:
     """Tell whether neither fields nor an IMU tell the roll about the one axis."""
     platform = site.platform
     one = not platform.further and len(platform.magnetometer.axes) == 1
-    return one and not platform.inertial
+    return one and (platform.imu == NO_IMU or not platform.inertial)
 
 
 def opened_poses(site: Site, pose_cov: Array) -> Array:
