@@ -17,8 +17,8 @@ from magfusion.estimation.integrity.detection import (
     only,
 )
 from magfusion.estimation.measurements.earth import earth_measurement, unheld
-from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.held_roll import held_roll
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
 from magfusion.estimation.measurements.pose_fix import pose_fixes
