@@ -174,7 +174,7 @@ FIELDS = {"time": 1.0, "window": 0.4, "sigma": 1e-9, "phasors": {"A": [[VECTOR, 
     [
         (b"{", "Invalid JSON"),
         (b"[]", "write a mapping with the keys imu, magnetometer, fields"),
-        (b"{}", "it should hold imu, magnetometer, fields, temperature, drive or marks"),
+        (b"{}", "it should hold imu, magnetometer, fields, temperature, drive, marks or reference"),
         ({"gyro": 1}, "gyro: is not a known key; remove it or write one of imu, magnetometer"),
         ({"imu": {"time": 1.0, "gyro": VECTOR}}, "imu.accel: is missing; add it"),
         ({"imu": {"time": "1", "gyro": VECTOR, "accel": VECTOR}}, "imu.time: found '1'; it should"),

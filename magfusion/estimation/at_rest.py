@@ -9,9 +9,11 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.integrity.signal import Heard
+from magfusion.estimation.rest_lengths import coherent, piece_length, walk
 from magfusion.estimation.rest_witness import (
     Freed,
     Judged,
+    Known,
     freed_pieces,
     judged,
     witness_of,
@@ -35,12 +37,7 @@ from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings, default_settings, sent_frequencies_hz
 from magfusion.units import Array, BoolArray
 
-HOUR = 3600.0  # s
 TOO_SHORT = "rest too short"
-LONGEST_PIECE = 8.0  # s
-PIECE_TURNS = 8.0  # of the closest tones against each other, in a piece
-UNKNOWN_TURN = 0.2  # of a tone, that an unknown clock may make in a piece that is searched
-LARGEST_WALK = 0.1  # rad; of a phase against its mean, in a rest that is one epoch
 LEAST_RATE = 1e-3  # rad/s; a bias of the gyroscope may look like that
 
 
@@ -129,25 +126,19 @@ def at_rest(
     """
     if log.waveform is None:
         raise InputError("holds no magnetometer.parquet to integrate at rest; give the raw log")
-    if has_schedule(site):
-        raise InputError("--at-rest integrates tones, and a beacon has time slots; leave it out")
-    if tones_of(site).reused:
-        raise InputError(
-            "--at-rest integrates each tone for one beacon, and beacons share a frequency; leave it"
-            " out"
-        )
+    check_tones(site)
     usual = default_settings(site)
     given = usual if lockin is None else lockin
-    longest = _coherent(site)
+    longest = coherent(site)
     dropped = Counter[str]()
-    parts: list[_Rest] = []
+    parts: list[Rest] = []
     found = rests(log, site)
     divided = -(-least // max(len(found), 1))
     for span in found:
         duration = span[1] - span[0]
-        length, parted = _piece(site, usual, lockin, duration / divided), divided
+        length, parted = piece_length(site, usual, lockin, duration / divided), divided
         if length is None:
-            length, parted = _piece(site, usual, lockin, duration), 1
+            length, parted = piece_length(site, usual, lockin, duration), 1
         if length is None:
             dropped[TOO_SHORT] += 1
             continue
@@ -155,7 +146,7 @@ def at_rest(
         ends = np.linspace(*span, count + 1)
         for begin, end in itertools.pairwise(ends):
             one = (float(begin), float(end))
-            parts.append(_rest(log, one, site, length, given.mains_hz, false_alarm))
+            parts.append(rest_epoch(log, one, site, length, given.mains_hz, false_alarm))
     if not parts:
         need = LEAST_LENGTHS * usual.window
         short = f" ({dropped[TOO_SHORT]} are shorter)" if dropped else ""
@@ -166,7 +157,7 @@ def at_rest(
     fields = FieldSamples.joined([part.fields for part in parts])
     chance = np.stack([part.chance for part in parts])
     heard = chance < false_alarm
-    findings = (*_believed(log), *_unheard(fields, heard, site, false_alarm))
+    findings = (*believed(log), *unheard_in(fields, heard, site, false_alarm))
     gain = None
     if log.reference is not None:
         gain = np.array([[tone.gain for tone in part.tones] for part in parts])
@@ -176,6 +167,22 @@ def at_rest(
     phasor = np.where(gone[..., None], np.nan, fields.phasor_sensor)
     fields = replace(fields, phasor_sensor=phasor)
     return AtRest(fields, chance, heard, dropped, findings, gain)
+
+
+def check_tones(site: Site) -> None:
+    """Refuse tones that whole rests are not integrated by.
+
+    Raises
+    ------
+    InputError
+    """
+    if has_schedule(site):
+        raise InputError("--at-rest integrates tones, and a beacon has time slots; leave it out")
+    if tones_of(site).reused:
+        raise InputError(
+            "--at-rest integrates each tone for one beacon, and beacons share a frequency; leave it"
+            " out"
+        )
 
 
 def rests(log: Log, site: Site) -> list[tuple[float, float]]:
@@ -214,70 +221,56 @@ def _beacon(site: Site, name: str) -> Beacon:
     return next(b for b in site.beacons if b.name == name)
 
 
-def _piece(
-    site: Site, usual: LockinSettings, lockin: LockinSettings | None, duration: float
-) -> float | None:
-    """Return the length of pieces for a rest (s); None where it is too short for any."""
-    most = duration / LEAST_LENGTHS
-    if lockin is not None and lockin.window != usual.window:
-        return lockin.window if lockin.window <= most else None
-    lines = np.sort(np.append(sent_frequencies_hz(site), 0.0))
-    spacing = float(np.min(np.diff(lines)))
-    wanted = min(max(PIECE_TURNS / spacing, usual.window), LONGEST_PIECE)
-    for beacon in site.beacons:
-        if not beacon.synchronised:
-            highest = float(np.max(beacon.tone_frequencies_hz))
-            wanted = min(wanted, UNKNOWN_TURN / (site.clock.drift_largest * highest))
-    length = min(max(wanted, usual.window), most)
-    return length if length >= usual.window else None
-
-
-def _coherent(site: Site) -> float:
-    """Return how long a rest may be one epoch (s): as long as phases and clocks stay."""
-    duration = 1000.0 * HOUR
-    while _walk(site, float(np.max(sent_frequencies_hz(site))), duration) > LARGEST_WALK**2:
-        duration *= 0.9
-    return duration
-
-
-def _walk(site: Site, frequency_hz: float, duration: float) -> float:
-    """Return the variance of a phase's mean over a rest against that at its middle (rad^2).
-
-    Of a random walk of phase, and of one of frequency.
-    """
-    clock = site.clock
-    phase = clock.phase_walk**2 / HOUR * duration / 12.0
-    drift = (2.0 * np.pi * frequency_hz * clock.drift_walk) ** 2 / HOUR * duration**3 / 320.0
-    return float(phase + drift + clock.log_moment_walk**2 / HOUR * duration / 12.0)
-
-
 @dataclass(frozen=True, eq=False)
-class _Rest:
-    """One rest, or as much of it as is one epoch."""
+class Rest:
+    """One rest, or as much of it as is one epoch.
+
+    Parameters
+    ----------
+    fields : FieldSamples
+        Of one epoch.
+    chance : ndarray, shape (channels,)
+        Probability that noise alone is so loud.
+    tones : list of Judged
+    known : Known, optional
+        For later parts of a stream, of which it was one.
+    """
 
     fields: FieldSamples
     chance: Array
     tones: list[Judged]
+    known: Known | None
 
 
-def _rest(
+def rest_epoch(
     log: Log,
     span: tuple[float, float],
     site: Site,
     length: float,
     mains_hz: float,
     false_alarm: float,
-) -> _Rest:
-    """Return the epoch of a rest."""
+    known: Known | None = None,
+) -> Rest:
+    """Return the epoch of a rest.
+
+    Parameters
+    ----------
+    span : tuple of float
+        Its beginning and end (s).
+    length : float
+        Of the pieces (s).
+    known : Known, optional
+        What earlier parts of a stream tell of its reference.
+    """
     assert log.waveform is not None
     rows = slice(*np.searchsorted(log.waveform.time, span))
     wave = Waveform(log.waveform.time[rows], log.waveform.measured_sensor[rows])
     hum = hum_of(wave, mains_hz)
     time, nominal_hz = 0.5 * (span[0] + span[1]), sent_frequencies_hz(site)
-    witness = witness_of(wave, log.reference, nominal_hz, hum)
+    witness = witness_of(wave, log.reference, nominal_hz, hum, known)
 
     def by(sent_hz: Array) -> Freed:
-        return freed_pieces(wave, span, sent_hz, length, hum, witness)
+        return freed_pieces(wave, span, sent_hz, length, hum, witness, known)
 
     found, sent_hz = by(nominal_hz), nominal_hz.copy()
     searches = _searches(found.best(), site, nominal_hz)
@@ -304,7 +297,10 @@ def _rest(
         phasor_sensor=(np.stack([one.phasor for one in single]) * phase[:, None])[None],
         phasor_cov=cov[None],
     )
-    return _Rest(fields, _chances(single, site, searches), tones)
+    if known is not None and witness is not None:
+        normals = tuple(None if one is None else one.normal for one in found.relations)
+        known = Known(witness.clock, witness.lag, normals)
+    return Rest(fields, _chances(single, site, searches), tones, known)
 
 
 def _searches(found: Pieces, site: Site, nominal_hz: Array) -> dict[str, Search]:
@@ -334,7 +330,7 @@ def _wandered(
     one: Integrated, site: Site, frequency_hz: float, duration: float, name: str
 ) -> Array:
     """Return the covariance of what the drive wanders within a rest, shape (3, 3) (T^2)."""
-    variance = _walk(site, frequency_hz, duration)
+    variance = walk(site, frequency_hz, duration)
     square = np.real(np.outer(one.phasor, np.conj(one.phasor)))
     if not _beacon(site, name).synchronised:
         solved = np.linalg.solve(one.cov, one.phasor)
@@ -353,7 +349,7 @@ def _chances(single: list[Integrated], site: Site, searches: Mapping[str, Search
     return np.array(own)
 
 
-def _believed(log: Log) -> tuple[Finding, ...]:
+def believed(log: Log) -> tuple[Finding, ...]:
     """Return that nothing in the log says that the platform rests."""
     if log.inertial:
         return ()
@@ -364,7 +360,7 @@ def _believed(log: Log) -> tuple[Finding, ...]:
     return (Finding("few_data", text, Verdict.TRUSTWORTHY),)
 
 
-def _unheard(
+def unheard_in(
     fields: FieldSamples, heard: BoolArray, site: Site, false_alarm: float
 ) -> tuple[Finding, ...]:
     """Return what is said of the tones that are not told from noise, in no rest."""

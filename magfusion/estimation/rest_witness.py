@@ -1,7 +1,7 @@
 """The pieces of a rest, freed of the noise that a reference sensor heard too."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,7 +12,17 @@ from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.hum import Hum
 from magfusion.receiver.integration import Integrated, integrated
 from magfusion.receiver.pieces import Pieces, pieces
-from magfusion.receiver.reference import Lag, Relation, beside, lag_of, probes_hz, relation
+from magfusion.receiver.reference import (
+    NO_LAG,
+    Lag,
+    Normal,
+    Relation,
+    beside,
+    lag_of,
+    probes_hz,
+    relation,
+)
+from magfusion.receiver.reference_clock import Clock, lag_in
 from magfusion.units import Array, BoolArray
 
 LEAST_COVERED = 0.8  # of the pieces of a rest, a reference has
@@ -28,20 +38,59 @@ class Witness:
 
     Parameters
     ----------
-    field : ndarray, shape (n, 3)
+    measured : ndarray, shape (n, 3)
         (T)
     there : bool ndarray, shape (n,)
     """
 
-    field: Array
+    measured: Array
     there: BoolArray
     lag: Lag
+    clock: Clock = field(default_factory=Clock)
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What earlier stretches of a stream tell of a reference.
+
+    Parameters
+    ----------
+    clock : Clock
+    lag : Lag
+        By which the latest of them was read.
+    normals : tuple of Normal or None
+        Of each tone.
+    """
+
+    clock: Clock = field(default_factory=Clock)
+    lag: Lag = NO_LAG
+    normals: tuple[Normal | None, ...] = ()
+
+    def at(self, lag: Lag, time: float, tones_hz: Array) -> tuple[Normal | None, ...]:
+        """Return the normal equations as they count about a time (s), read by another lag."""
+        if not self.normals:
+            return (None,) * len(tones_hz)
+        late = float(lag.of(np.array(time)) - self.lag.of(np.array(time)))
+        return tuple(
+            None if one is None else one.later(2.0 * np.pi * tone * late)
+            for one, tone in zip(self.normals, tones_hz.tolist(), strict=True)
+        )
 
 
 def witness_of(
-    wave: Waveform, reference: Waveform | None, tones_hz: Array, hum: Hum | None
+    wave: Waveform,
+    reference: Waveform | None,
+    tones_hz: Array,
+    hum: Hum | None,
+    known: Known | None = None,
 ) -> Witness | None:
-    """Return a reference on the clock of a rest; None where it has too little of it."""
+    """Return a reference on the clock of a rest; None where it has too little of it.
+
+    Parameters
+    ----------
+    known : Known, optional
+        From earlier parts of a stream; without it the rest is all that there is.
+    """
     if reference is None:
         return None
     margin = 10.0  # s; more than its clock may be off
@@ -50,9 +99,15 @@ def witness_of(
     if len(own) < len(tones_hz) + 2:
         return None
     lines = tones_hz if hum is None else np.append(tones_hz, hum.orders * hum.frequency_hz)
-    lag = lag_of(wave, own, lines)
-    field, there = beside(wave, own, lag)
-    return Witness(field, there, lag) if np.mean(there) > LEAST_COVERED else None
+    clock = Clock()
+    if known is None:
+        lag = lag_of(wave, own, lines)
+    else:
+        seen = lag_in(wave, own, lines)
+        clock = known.clock if seen is None else known.clock.heard(*seen)
+        lag = clock.line or NO_LAG
+    measured, there = beside(wave, own, lag)
+    return Witness(measured, there, lag, clock) if np.mean(there) > LEAST_COVERED else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +151,15 @@ def freed_pieces(
     length: float,
     hum: Hum | None,
     witness: Witness | None,
+    known: Known | None = None,
 ) -> Freed:
-    """Return the pieces of a rest, and what the reference makes of them."""
+    """Return the pieces of a rest, and what the reference makes of them.
+
+    Parameters
+    ----------
+    known : Known, optional
+        As of `witness_of`.
+    """
     none: tuple[Relation | None, ...] = (None,) * len(tones_hz)
     if witness is None:
         return Freed(pieces(wave, span, tones_hz, length, hum), None, None, none)
@@ -105,7 +167,7 @@ def freed_pieces(
     lines = tones_hz if hum is None else np.append(tones_hz, hum.orders * hum.frequency_hz)
     probes = [probes_hz(tone, lines, length, highest) for tone in tones_hz.tolist()]
     ends = np.cumsum([0, *(len(own) for own in probes)])
-    both = Waveform(wave.time, np.concatenate([wave.measured_sensor, witness.field], axis=1))
+    both = Waveform(wave.time, np.concatenate([wave.measured_sensor, witness.measured], axis=1))
     found = pieces(both, span, tones_hz, length, hum, np.concatenate(probes))
     raw = replace(found, phasor=found.phasor[..., :3])
     first = np.searchsorted(wave.time, found.centre - 0.5 * length)
@@ -114,8 +176,10 @@ def freed_pieces(
     there = missing[last] == missing[first]
     if np.mean(there) < LEAST_COVERED:
         return Freed(raw, None, None, none)
+    middle = 0.5 * (span[0] + span[1])
+    before = (known or Known()).at(witness.lag, middle, tones_hz)
     relations = tuple(
-        relation(found, there, slice(int(ends[c]), int(ends[c + 1])))
+        relation(found, there, slice(int(ends[c]), int(ends[c + 1])), before[c])
         if ends[c + 1] > ends[c]
         else None
         for c in range(len(tones_hz))

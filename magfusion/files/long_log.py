@@ -152,7 +152,7 @@ def long_log(path: Path, start: float | None = None, end: float | None = None) -
     if tables["imu"] is None or tables["magnetometer"] is tables["fields"] is None:
         return None  # which is refused where it is read whole
     raw = tables["magnetometer"]
-    if find_table(path, "marks") is not None or (
+    if any(find_table(path, name) is not None for name in ("marks", "reference")) or (
         raw is not None
         and (
             drive_columns(raw)

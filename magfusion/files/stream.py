@@ -151,6 +151,18 @@ class MagnetometerRecord(_Arrays):
         return self
 
 
+class ReferenceRecord(_Arrays):
+    """Samples of a reference sensor, by its own clock: stamps (k,), fields (k, 3) (T)."""
+
+    time: Annotated[Array, PlainValidator(_times)]
+    field: Annotated[Array, PlainValidator(_vectors)]
+
+    @model_validator(mode="after")
+    def _alike(self) -> "ReferenceRecord":
+        _check_lengths(self.time, field=self.field)
+        return self
+
+
 class FieldsRecord(_Arrays):
     """Phasors of one window; of every detected beacon, its tones.
 
@@ -223,11 +235,12 @@ class Record(StrictModel):
     temperature: TemperatureRecord | None = None
     drive: DriveRecord | None = None
     marks: MarksRecord | None = None
+    reference: ReferenceRecord | None = None
 
     @model_validator(mode="after")
     def _not_empty(self) -> "Record":
         if all(getattr(self, kind) is None for kind in type(self).model_fields):
-            kinds = "imu, magnetometer, fields, temperature, drive or marks"
+            kinds = "imu, magnetometer, fields, temperature, drive, marks or reference"
             raise PydanticCustomError("empty", "it should hold {kinds}", {"kinds": kinds})
         return self
 

@@ -38,6 +38,12 @@ def magnetometer_content(waveform: Waveform, magnetometer: str | None = None) ->
     return {"magnetometer": {**named, "time": waveform.time.tolist(), "field": field}}
 
 
+def reference_content(waveform: Waveform) -> dict[str, Any]:
+    """Return samples of a reference sensor as a record."""
+    field = [_or_none(row) for row in waveform.measured_sensor]
+    return {"reference": {"time": waveform.time.tolist(), "field": field}}
+
+
 def marks_content(marks: Marks) -> dict[str, Any]:
     """Return bursts as a record."""
     start, end = marks.begin.tolist(), marks.end.tolist()

@@ -86,7 +86,7 @@ _LOG = {"log.yaml", *_SITE, *_TRUE_SITE, "report.json", *_TABLES}
 NOT_USED = Finding(
     "reference_unused",
     "The reference sensor is not used: what it tells of noise is taken off at rest alone, by"
-    " demodulate or fix with --at-rest.",
+    " demodulate, fix, smooth or navigate with --at-rest.",
     Verdict.TRUSTWORTHY,
 )
 UNFINISHED_DRIFT = "unfinished"

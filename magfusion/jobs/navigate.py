@@ -14,6 +14,7 @@ from magfusion.errors import EstimationError, InputError
 from magfusion.jobs.live import LiveSettings, state_sinks
 from magfusion.jobs.rates import RateSettings, refuse_rate
 from magfusion.jobs.region import RegionSettings
+from magfusion.jobs.rest_settings import RestSettings
 from magfusion.jobs.settings import (
     Command,
     EarthSettings,
@@ -46,6 +47,7 @@ LONGEST_EPOCH = 60.0  # s; of a phasor that belongs to a state of now
 class NavigateSettings(
     RegionSettings,
     WindowSettings,
+    RestSettings,
     ReplayedSettings,
     EarthSettings,
     EstimateSettings,
@@ -122,6 +124,10 @@ def run(
     settings: NavigateSettings, output: Path, given: set[str], report: Report = quiet
 ) -> Figures | None:
     """Navigate as the settings ask; see `run_navigate` and `run_stream`."""
+    if settings.at_rest:
+        from magfusion.jobs.navigate_rests import run_at_rest
+
+        return run_at_rest(settings, output, given, report)
     if str(settings.log) == "-":
         _run_pipe(settings, given)
         return None

@@ -212,25 +212,49 @@ def _contents(piece: Piece) -> Iterator[dict[str, Any]]:
         yield from fields_contents(samples)
 
 
+class _Beside:
+    """What goes with the samples of a log, and is known before them."""
+
+    def __init__(self, log: Log | LongLog) -> None:
+        from magfusion.files.long_log import LongLog
+        from magfusion.model.temperature import Temperatures
+
+        degrees = log.temperatures or Temperatures()
+        self._readings = deque(sorted(degrees.each()))
+        self._currents = _currents(log)
+        self._reference = None if isinstance(log, LongLog) else log.reference
+
+    def until(self, arrival: float) -> Iterator[dict[str, Any]]:
+        """Yield the records of what has come up to a time (s)."""
+        from magfusion.files.stream_contents import (
+            drive_content,
+            reference_content,
+            temperature_content,
+        )
+
+        while self._readings and self._readings[0][0] < arrival:
+            yield temperature_content(*self._readings.popleft())
+        if self._currents is not None:
+            due = int(np.searchsorted(self._currents.time, arrival))
+            if due:
+                yield drive_content(self._currents.rows(slice(0, due)))
+            self._currents = self._currents.rows(slice(due, None))
+        if self._reference is not None:
+            due = int(np.searchsorted(self._reference.time, arrival))
+            if due:
+                yield reference_content(self._reference.rows(slice(0, due)))
+            self._reference = self._reference.rows(slice(due, None))
+
+
 def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool) -> None:
     """Write a log as the records of a stream, in the order of their arrival."""
     from magfusion.files.long_log import LongLog
-    from magfusion.files.stream_contents import drive_content, temperature_content, write_record
-    from magfusion.model.temperature import Temperatures
+    from magfusion.files.stream_contents import write_record
 
     pieces = _of_long(log) if isinstance(log, LongLog) else Replay(log).pieces()
-    degrees = log.temperatures or Temperatures()
-    readings = deque(sorted(degrees.each()))
-    currents = _currents(log)
+    beside = _Beside(log)
     for _, piece in paced(pieces, realtime):
-        while readings and readings[0][0] < piece.arrival:
-            write_record(temperature_content(*readings.popleft()), sink, form)
-        if currents is not None:
-            due = int(np.searchsorted(currents.time, piece.arrival))
-            if due:
-                write_record(drive_content(currents.rows(slice(0, due))), sink, form)
-            currents = currents.rows(slice(due, None))
-        for content in _contents(piece):
+        for content in (*beside.until(piece.arrival), *_contents(piece)):
             write_record(content, sink, form)
         if realtime:
             sink.flush()

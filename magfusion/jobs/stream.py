@@ -35,6 +35,7 @@ from magfusion.model.trust import Finding
 from magfusion.units import Array
 
 _PLACE = {"json": "line", "msgpack": "record"}
+NOT_ONLINE = "its samples are used by navigate --at-rest alone."
 WAITING = 1.0  # s; before the first state, as often a sign of life
 
 
@@ -128,6 +129,8 @@ def _navigate(
         if place is not None and newest >= saved + settings.every:
             save(navigator, numbered.number, None, place, key)
             saved = newest
+    if told.reference:
+        messages.write(f"magfusion: reference: {NOT_ONLINE}\n")
     for stream, count in missing.items():
         messages.write(f"magfusion: {stream}: {count} samples are NaN. They are left out.\n")
     if refused:
@@ -142,11 +145,17 @@ class _Told:
     ----------
     sink : file
         Binary.
+
+    Attributes
+    ----------
+    reference : bool
+        Whether samples of a reference sensor have come, which are not used here.
     """
 
     def __init__(self, navigator: Navigator, sink: BinaryIO, others: tuple[StateSink, ...]) -> None:
         self._navigator, self._sink, self._others = navigator, sink, others
         self._newest = -np.inf
+        self.reference = False
 
     def tell(self, state: JudgedState | None, told: dict[str, Any]) -> None:
         """Write what is told of a state, None before the first."""
@@ -181,6 +190,7 @@ def _take_in(
         raise InputError(numbered.refusal)
     record, newest = numbered.record, -np.inf
     _take_in_beside(navigator, record)
+    told.reference |= record.reference is not None
     if record.imu is not None:
         time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
         if len(time):

@@ -13,17 +13,19 @@ from scipy.interpolate import CubicSpline
 
 from magfusion.model.samples import Waveform
 from magfusion.receiver.pieces import Pieces
-from magfusion.units import Array, BoolArray, ComplexArray
+from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 LARGEST_LAG = 5.0  # s; of the reference's clock
 BLOCK = 40.96  # s; by which lag and rate of the clock are found
 CLEAR_HZ = 0.6  # about tones and mains, which correlate at any lag of whole turns
 LEAST_PEAK = 8.0  # times the scatter of a correlation about its mean, a lag has
+FINER = 8  # lags in a sampling step
 NEAR_LAG = 8  # samples about the common lag, in which blocks find their own
 BESIDE = 8  # probes about a tone
 APART = 2.0  # resolutions of a piece, between them and from every tone
 GROUPS = 8  # of pieces in a row, of which every other one tells the matrix
 WORTH = 0.95  # of the power that is left, beyond which a reference tells nothing
+MEMORY = 0.7  # of earlier pieces' weight, in each later stretch of a stream
 GAP = 2.5  # steps of the reference, over which it is not filled in
 
 
@@ -68,20 +70,15 @@ def lag_of(waveform: Waveform, reference: Waveform, lines_hz: Array) -> Lag:
     even, there = beside(waveform, reference, NO_LAG)
     if not len(starts) or not np.any(there):
         return NO_LAG
-    found = np.stack(
-        [
-            _correlation(waveform.measured_sensor[k : k + size], even[k : k + size], step, lines_hz)
-            for k in starts
-        ]
-    )
-    reach = int(LARGEST_LAG / step)
-    lags = np.arange(-reach, reach + 1)
-    mean = np.mean(found, axis=0)[lags]
-    best = int(np.argmax(mean))
-    if mean[best] - np.median(mean) < LEAST_PEAK * _scatter(mean):
+    found = correlations(waveform.measured_sensor, even, starts, size, step, lines_hz)
+    step /= FINER
+    peaks = peak_of(found)
+    if peaks is None:
         return NO_LAG
-    near = lags[best] + np.arange(-NEAR_LAG, NEAR_LAG + 1)
-    own = found[:, near]
+    mean, best, lags = peaks
+    first = max(best - NEAR_LAG * FINER, 0)
+    own = found[:, first : best + NEAR_LAG * FINER + 1]
+    near = lags[first : first + own.shape[1]]
     peak = np.clip(np.argmax(own, axis=1), 1, own.shape[1] - 2)
     clear = own[np.arange(len(own)), peak] > np.median(mean) + LEAST_PEAK * _scatter(mean)
     middle = waveform.time[starts] + 0.5 * BLOCK
@@ -100,6 +97,35 @@ def lag_of(waveform: Waveform, reference: Waveform, lines_hz: Array) -> Lag:
     return Lag(float(offset), float(rate))
 
 
+def correlations(
+    own: Array, other: Array, starts: IntArray, size: int, step: float, lines_hz: Array
+) -> Array:
+    """Return the power of the correlation in some stretches, at lags up to the largest, (n, lags).
+
+    Lags are a part of a step apart: the peak of whitened noise is as narrow as a step.
+
+    Parameters
+    ----------
+    starts : int ndarray, shape (n,)
+        First samples of the stretches, of ``size`` samples each.
+    """
+    reach = int(LARGEST_LAG / step) * FINER
+    lags = np.arange(-reach, reach + 1)
+    return np.stack(
+        [_correlation(own[k : k + size], other[k : k + size], step, lines_hz)[lags] for k in starts]
+    )
+
+
+def peak_of(found: Array) -> tuple[Array, int, IntArray] | None:
+    """Return the mean correlation by lag, where its peak is, and the lags; None without a peak."""
+    reach = (found.shape[1] - 1) // 2
+    mean = np.mean(found, axis=0)
+    best = int(np.argmax(mean))
+    if mean[best] - np.median(mean) < LEAST_PEAK * _scatter(mean):
+        return None
+    return mean, best, np.arange(-reach, reach + 1)
+
+
 def _scatter(values: Array) -> float:
     return float(1.4826 * np.median(np.abs(values - np.median(values)))) + 1e-300
 
@@ -115,10 +141,10 @@ def _correlation(own: Array, other: Array, step: float, lines_hz: Array) -> Arra
     for field in (own, other):
         found = np.fft.rfft((field - np.mean(field, axis=0)) * taper, axis=0)
         spectra.append(found / np.maximum(np.abs(found), 1e-300) * clear[:, None])
-    total = np.zeros(len(own))
+    total = np.zeros(FINER * len(own))
     for a in spectra[0].T:
         for b in spectra[1].T:
-            total += np.fft.irfft(a * np.conj(b), len(own)) ** 2
+            total += np.fft.irfft(a * np.conj(b), len(total)) ** 2
     return total
 
 
@@ -132,6 +158,49 @@ def probes_hz(tone_hz: float, tones_hz: Array, length: float, highest_hz: float)
 
 
 @dataclass(frozen=True, eq=False)
+class Normal:
+    """Normal equations of a matrix between a sensor's noise and a reference's.
+
+    Parameters
+    ----------
+    other, both : complex ndarray, shape (3, 3)
+        Sums of the reference's products, and of those with the sensor's.
+    """
+
+    other: ComplexArray
+    both: ComplexArray
+
+    @staticmethod
+    def of(own: ComplexArray, other: ComplexArray, weight: Array) -> "Normal":
+        """Return those of pieces (n, probes, 3) with a weight each (n,)."""
+        weighted = np.conj(other) * weight[:, None, None]
+        return Normal(
+            np.einsum("npi,npj->ij", weighted, other), np.einsum("npi,npj->ij", weighted, own)
+        )
+
+    def later(self, turn: float) -> "Normal":
+        """Return them as they count for pieces that come after, by a clock put on by ``turn``.
+
+        Parameters
+        ----------
+        turn : float
+            Angle by which the reference's phase is less than before (rad).
+        """
+        return Normal(MEMORY * self.other, MEMORY * np.exp(1j * turn) * self.both)
+
+    def beside(self, more: "Normal | None") -> "Normal":
+        """Return the sums of both."""
+        if more is None:
+            return self
+        return Normal(self.other + more.other, self.both + more.both)
+
+    def solved(self) -> ComplexArray:
+        """Return the matrix."""
+        normal = self.other + 1e-9 * np.trace(self.other).real * np.eye(3) + 1e-300 * np.eye(3)
+        return np.asarray(np.linalg.solve(normal, self.both).T)
+
+
+@dataclass(frozen=True, eq=False)
 class Relation:
     """What the noise of a sensor is of that of a reference, about a tone.
 
@@ -140,10 +209,13 @@ class Relation:
     matrix : complex ndarray, shape (3, 3)
     left : float
         Power of the noise that it leaves, of that without it, in pieces that it was not found by.
+    normal : Normal
+        Of which it was found: what goes on to later pieces.
     """
 
     matrix: ComplexArray
     left: float
+    normal: Normal
 
     @property
     def tells(self) -> bool:
@@ -151,7 +223,9 @@ class Relation:
         return self.left < WORTH
 
 
-def relation(found: Pieces, there: BoolArray, columns: slice) -> Relation:
+def relation(
+    found: Pieces, there: BoolArray, columns: slice, before: Normal | None = None
+) -> Relation:
     """Return how a sensor and its reference go together in the probes beside a tone.
 
     Parameters
@@ -162,6 +236,8 @@ def relation(found: Pieces, there: BoolArray, columns: slice) -> Relation:
         Pieces with a reference.
     columns : slice
         Probes of the tone.
+    before : Normal, optional
+        Of earlier pieces.
     """
     own, other = found.beside[:, columns, :3], found.beside[:, columns, 3:]
     power = np.sum(np.abs(own) ** 2, axis=(1, 2))
@@ -170,17 +246,11 @@ def relation(found: Pieces, there: BoolArray, columns: slice) -> Relation:
     # What is loud counts for less: a bang beside one of them is none of the other.
     weight = there / (1.0 + power / usual[0] + witness / usual[1])
     group = np.arange(len(own)) * GROUPS // max(len(own), 1) % 2
-    left = before = 0.0
+    left = power_before = 0.0
     for half in (0, 1):
-        matrix = _matrix(own, other, weight * (group != half))
+        matrix = Normal.of(own, other, weight * (group != half)).beside(before).solved()
         mine = (weight * (group == half))[:, None, None]
-        before += float(np.sum(mine * np.abs(own) ** 2))
+        power_before += float(np.sum(mine * np.abs(own) ** 2))
         left += float(np.sum(mine * np.abs(own - other @ matrix.T) ** 2))
-    return Relation(_matrix(own, other, weight), left / max(before, 1e-300))
-
-
-def _matrix(own: ComplexArray, other: ComplexArray, weight: Array) -> ComplexArray:
-    weighted = np.conj(other) * weight[:, None, None]
-    normal = np.einsum("npi,npj->ij", weighted, other)
-    normal += 1e-9 * np.trace(normal).real * np.eye(3) + 1e-300 * np.eye(3)
-    return np.asarray(np.linalg.solve(normal, np.einsum("npi,npj->ij", weighted, own)).T)
+    normal = Normal.of(own, other, weight).beside(before)
+    return Relation(normal.solved(), left / max(power_before, 1e-300), normal)

@@ -1,0 +1,50 @@
+"""How long a piece of a rest may be, and how long a rest is one epoch."""
+
+import numpy as np
+
+from magfusion.model.site import Site
+from magfusion.receiver.integration import LEAST_LENGTHS
+from magfusion.receiver.windows import LockinSettings, sent_frequencies_hz
+
+HOUR = 3600.0  # s
+LONGEST_PIECE = 8.0  # s
+PIECE_TURNS = 8.0  # of the closest tones against each other, in a piece
+UNKNOWN_TURN = 0.2  # of a tone, that an unknown clock may make in a piece that is searched
+LARGEST_WALK = 0.1  # rad; of a phase against its mean, in a rest that is one epoch
+
+
+def piece_length(
+    site: Site, usual: LockinSettings, lockin: LockinSettings | None, duration: float
+) -> float | None:
+    """Return the length of pieces for a rest (s); None where it is too short for any."""
+    most = duration / LEAST_LENGTHS
+    if lockin is not None and lockin.window != usual.window:
+        return lockin.window if lockin.window <= most else None
+    lines = np.sort(np.append(sent_frequencies_hz(site), 0.0))
+    spacing = float(np.min(np.diff(lines)))
+    wanted = min(max(PIECE_TURNS / spacing, usual.window), LONGEST_PIECE)
+    for beacon in site.beacons:
+        if not beacon.synchronised:
+            highest = float(np.max(beacon.tone_frequencies_hz))
+            wanted = min(wanted, UNKNOWN_TURN / (site.clock.drift_largest * highest))
+    length = min(max(wanted, usual.window), most)
+    return length if length >= usual.window else None
+
+
+def coherent(site: Site) -> float:
+    """Return how long a rest may be one epoch (s): as long as phases and clocks stay."""
+    duration = 1000.0 * HOUR
+    while walk(site, float(np.max(sent_frequencies_hz(site))), duration) > LARGEST_WALK**2:
+        duration *= 0.9
+    return duration
+
+
+def walk(site: Site, frequency_hz: float, duration: float) -> float:
+    """Return the variance of a phase's mean over a rest against that at its middle (rad^2).
+
+    Of a random walk of phase, and of one of frequency.
+    """
+    clock = site.clock
+    phase = clock.phase_walk**2 / HOUR * duration / 12.0
+    drift = (2.0 * np.pi * frequency_hz * clock.drift_walk) ** 2 / HOUR * duration**3 / 320.0
+    return float(phase + drift + clock.log_moment_walk**2 / HOUR * duration / 12.0)

@@ -1,0 +1,331 @@
+"""Navigation of rests as they last: by a log, or by records on standard input."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
+
+import numpy as np
+
+from magfusion.errors import EstimationError, InputError
+from magfusion.model.progress import Report, quiet
+from magfusion.results.figures import Figure, Figures, heading
+
+if TYPE_CHECKING:
+    from magfusion.estimation.rest_stream import RestNavigator, RestState
+    from magfusion.files.stream import Format, Record
+    from magfusion.jobs.inputs import Job
+    from magfusion.jobs.navigate import NavigateSettings
+    from magfusion.model.samples import Log
+    from magfusion.model.site import Site
+    from magfusion.model.trust import Risk, Trust
+    from magfusion.receiver.windows import LockinSettings
+
+PIECE = 1.0  # s; of a log that is replayed
+# Of `navigate`, what has a part in it.
+TAKEN = {
+    *("site", "log", "output", "start", "end", "topics", "as_json", "form", "keep_going"),
+    *("at_rest", "false_alarm", "window", "step", "mains_hz", "risk", "fault_prior"),
+    *("hemisphere", "region"),
+}
+_PLACE = {"json": "line", "msgpack": "record"}
+
+
+@dataclass(frozen=True)
+class How:
+    """How rests are integrated: as `magfusion.estimation.rest_stream.RestNavigator`."""
+
+    lockin: LockinSettings | None
+    false_alarm: float
+    risk: Risk
+
+    def navigator(self, site: Site) -> RestNavigator:
+        """Return an estimator."""
+        from magfusion.estimation.rest_stream import RestNavigator
+
+        return RestNavigator(site, self.lockin, self.false_alarm, self.risk)
+
+
+def run_at_rest(
+    settings: NavigateSettings, output: Path, given: set[str], report: Report
+) -> Figures | None:
+    """Tell where the platform stands, as it stands."""
+    from magfusion.files.site import load_site
+    from magfusion.files.standard_streams import binary_input, binary_output, until_closed
+
+    refuse_other(given)
+    pipe = str(settings.log) == "-"
+    job = settings.job(Path() if pipe else output)
+    how = How(settings.lockin(job), settings.false_alarm, settings.risks)
+    if not pipe:
+        return run_rests(job, how, report)
+    if settings.site is None:
+        raise InputError("navigate - needs the site's file; name it with --site SITE.yaml")
+    site = settings.where.bounded(load_site(settings.site))
+    with until_closed():
+        streams = (binary_input(), binary_output(), sys.stderr)
+        run_rests_stream(site, how, settings.form, settings.keep_going, *streams)
+    return None
+
+
+def refuse_other(given: set[str]) -> None:
+    """Refuse options of `navigate` that have no part in it.
+
+    Raises
+    ------
+    InputError
+    """
+    other = sorted(given - TAKEN)
+    if other:
+        raise InputError(
+            f"--{other[0].replace('_', '-')} is of navigation through motion, and --at-rest tells"
+            " where the platform stands; leave one of the two out"
+        )
+
+
+def replayed(log: Log, navigator: RestNavigator, report: Report = quiet) -> list[RestState]:
+    """Return the states of a log that is given to a navigator as it was recorded."""
+    wave, imu, other = log.waveform, log.imu, log.reference
+    assert wave is not None
+    edges = np.arange(wave.time[0], wave.time[-1] + PIECE, PIECE) + PIECE
+    first = np.zeros(3, dtype=int)
+    states: list[RestState] = []
+    streams = [wave.time, imu.time, np.empty(0) if other is None else other.time]
+    for k, edge in enumerate(edges):
+        last = np.array([int(np.searchsorted(stream, edge)) for stream in streams])
+        own = [slice(int(a), int(b)) for a, b in zip(first, last, strict=True)]
+        if log.inertial:
+            navigator.add_imu(imu.time[own[1]], imu.gyro_body[own[1]], imu.accel_body[own[1]])
+        if other is not None:
+            navigator.add_reference(other.time[own[2]], other.measured_sensor[own[2]])
+        navigator.add_magnetometer(wave.time[own[0]], wave.measured_sensor[own[0]])
+        states += navigator.take()
+        first = last
+        if k % 100 == 0:
+            report("integrating", k, len(edges))
+    navigator.end()
+    return states + navigator.take()
+
+
+def run_rests(job: Job, how: How, report: Report = quiet) -> Figures:
+    """Navigate the rests of a log: a pose after every stretch of a rest, with what came before.
+
+    Raises
+    ------
+    InputError, EstimationError
+        Where it does not rest, or no beacon is heard.
+    """
+    from magfusion.estimation.integrity.recording import BRIDGED, recorded
+    from magfusion.jobs.inputs import claim, named, read_job, refuse_failed
+    from magfusion.model.trust import Trust
+
+    claimed = claim(job.output, "navigate")
+    log, site = read_job(job, reference=True, heard=False, report=report)
+    if log.waveform is None:
+        raise InputError(
+            f"{job.log_path}: holds no magnetometer.parquet to integrate at rest; give the raw log"
+        )
+    began = time.perf_counter()
+    with named(job.log_path):
+        navigator = how.navigator(site)
+        states = replayed(log, navigator, report)
+    told = [one for one in states if one.found is not None]
+    if not told:
+        text = "the platform rests nowhere for long enough"
+        if any(one.standing for one in states):
+            text = states[-1 if states[-1].standing else -2].trust.ordered[0].text
+        raise EstimationError(f"{job.log_path}: {text}")
+    newest = _newest_of_rests(states)
+    trust = Trust(tuple(recorded(log, site, BRIDGED)))
+    for one in newest:
+        trust |= one.trust
+    elapsed = Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
+    with claimed as whole:
+        figures = _written(whole, log, site, told, trust) | _said(newest) | elapsed
+        from magfusion.results.report import write_report
+
+        write_report(whole, figures)
+    refuse_failed(job.log_path, job.output, trust)
+    return figures
+
+
+def _newest_of_rests(states: list[RestState]) -> list[RestState]:
+    """Return the last state of each rest in which a beacon is heard."""
+    out: list[RestState] = []
+    held: RestState | None = None
+    for one in states:
+        if one.found is not None:
+            held = one
+        if not one.standing and held is not None:
+            out.append(held)
+            held = None
+    return out if held is None else [*out, held]
+
+
+def _written(whole: Path, log: Log, site: Site, told: list[RestState], trust: Trust) -> Figures:
+    """Write the poses, and return their figures."""
+    from magfusion.files.site import save_site
+    from magfusion.files.trajectory_table import write_trajectory
+    from magfusion.files.tum import write_tum
+    from magfusion.jobs.inputs import found_in
+    from magfusion.model.trajectory import Trajectory
+    from magfusion.model.trust import alike
+    from magfusion.results.recording import write_recording
+    from magfusion.results.report import compared_with_truth
+    from magfusion.results.verdict import trust_figures
+
+    fixes = [one.found.fixes for one in told if one.found is not None]
+    best = Trajectory(
+        time=np.array([one.time for one in told]),
+        world_from_body=np.concatenate([f.world_from_body[:, 0] for f in fixes]),
+        position_world=np.concatenate([f.position_world[:, 0] for f in fixes]),
+        pose_cov=np.concatenate([f.pose_cov[:, 0] for f in fixes]),
+    )
+    directory, states = found_in(whole, trust), alike(len(best), trust.verdict)
+    errors, compared = compared_with_truth(best, log)
+    write_tum(best, directory / "trajectory.tum", log.epoch_ns)
+    write_trajectory(best, directory / "trajectory.parquet", log.epoch_ns, states)
+    save_site(site, directory / "site.yaml")
+    recording = directory / "run.rrd"
+    write_recording(
+        recording, site, best, truth=log.truth, errors=errors, trust=trust, states=states
+    )
+    return heading("navigate", log.name) | trust_figures(trust) | compared
+
+
+def _said(newest: list[RestState]) -> Figures:
+    """Return what each rest came to."""
+    sigma = [
+        float(np.sqrt(np.trace(one.found.fixes.pose_cov[0, 0, 3:, 3:])))
+        for one in newest
+        if one.found is not None
+    ]
+    gain = np.concatenate([one.gain for one in newest])
+    used = gain[np.isfinite(gain)]
+    figures = [
+        Figure("rests", len(newest)),
+        Figure("rest_s", float(sum(one.duration for one in newest)), "s", label="time at rest"),
+        Figure("position_sigma_m", float(np.median(sigma)), "m", label="position sigma, median"),
+    ]
+    if len(used):
+        value = float(np.median(used))
+        figures.append(Figure("reference_gain", value, label="reference's gain, median"))
+    return Figures(*figures)
+
+
+def run_rests_stream(
+    site: Site,
+    how: How,
+    form: Format,
+    keep_going: bool,
+    source: BinaryIO,
+    sink: BinaryIO,
+    messages: TextIO,
+) -> int:
+    """Navigate rests by the records of a stream; one line of JSON for each state.
+
+    Returns
+    -------
+    int
+        How many records were passed over.
+
+    Raises
+    ------
+    InputError
+        Where a record is none and ``keep_going`` is not set.
+    """
+    from magfusion.files.stream import json_line, read_records
+
+    navigator, refused = how.navigator(site), 0
+    for numbered in read_records(source, form):
+        try:
+            if numbered.record is None:
+                raise InputError(numbered.refusal)
+            _take_in(navigator, numbered.record)
+        except InputError as error:
+            sentence = f"standard input, {_PLACE[form]} {numbered.number}: {error}"
+            if not keep_going:
+                raise InputError(sentence) from error
+            refused += 1
+            messages.write(f"magfusion: {sentence} (passed over)\n")
+            continue
+        for state in navigator.take():
+            sink.write(json_line(rest_content(state)))
+        sink.flush()
+    navigator.end()
+    for state in navigator.take():
+        sink.write(json_line(rest_content(state)))
+    sink.flush()
+    return refused
+
+
+def _take_in(navigator: RestNavigator, record: Record) -> None:
+    from magfusion.files.stream import whole_rows
+
+    if record.imu is not None:
+        time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
+        navigator.add_imu(time, gyro, accel)
+    if record.reference is not None:
+        time, field = whole_rows(record.reference.time, record.reference.field)
+        navigator.add_reference(time, field)
+    if record.magnetometer is not None:
+        time, field = whole_rows(record.magnetometer.time, record.magnetometer.field)
+        navigator.add_magnetometer(time, field)
+    if record.fields is not None:
+        raise InputError("--at-rest integrates samples of the magnetometer; leave fields out")
+
+
+def rest_content(state: RestState) -> dict[str, Any]:
+    """Return a state of a rest as it is written; what is not known is null."""
+    from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
+    from magfusion.model.quaternion import of_matrices
+
+    trust, names = state.trust, () if state.samples is None else state.samples.channels
+    heard = zip(names, state.heard.tolist(), strict=False)
+    gain = zip(names, state.gain.tolist(), strict=False)
+    told: dict[str, Any] = {
+        "time": state.time,
+        "started": state.found is not None,
+        "lost": False,
+        "standing": state.standing,
+        "rest_s": state.duration,
+        "reset_counter": 0,
+        "verdict": str(trust.verdict) if state.standing else None,
+        "reasons": [{"code": f.code, "text": f.text} for f in trust.reasons],
+        "remarks": [{"code": f.code, "text": f.text} for f in trust.remarks],
+        "heard": list(dict.fromkeys(name for (name, _), one in heard if one)),
+        "reference_gain": {f"{b}_{t}": g for (b, t), g in gain if np.isfinite(g)},
+        "position": None,
+    }
+    if state.found is None:
+        return told
+    fixes, levels = state.found.fixes, state.found.states
+    rival = fixes.cost[0, 1] - fixes.cost[0, 0] if fixes.cost.shape[1] > 1 else np.inf
+    cov, rotation = fixes.pose_cov[0, 0], fixes.world_from_body[0, 0]
+    known = bool(fixes.determined[0, 0])
+    told |= {
+        "excluded": list(levels.excluded[0]),
+        "protection_level_m": _finite(levels.protection_level_m[0]),
+        "protection_level_deg": _finite(levels.protection_level_deg[0]),
+        "ambiguous": bool(rival < AMBIGUOUS_CHI_SQUARE),
+        "lost": str(trust.verdict) == "failed",
+        "velocity": [0.0, 0.0, 0.0],
+    }
+    if not known or told["lost"]:
+        return told
+    world = rotation @ cov[3:, 3:] @ rotation.T
+    return told | {
+        "position": fixes.position_world[0, 0].tolist(),
+        "quaternion": of_matrices(rotation[None])[:, 0].tolist(),
+        "sigma": {
+            "position": np.sqrt(np.diagonal(world)).tolist(),
+            "rotation_body": np.sqrt(np.diagonal(cov[:3, :3])).tolist(),
+        },
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

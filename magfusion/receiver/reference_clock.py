@@ -1,0 +1,80 @@
+"""The clock of a reference in a stream: a line through the lags of stretches, as they come."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.model.samples import Waveform
+from magfusion.receiver.reference import BLOCK, FINER, NO_LAG, Lag, beside, correlations, peak_of
+from magfusion.units import Array
+
+MEMORY = 0.9  # of what earlier stretches weigh, in each later one
+LAG_SIGMA, RATE_SIGMA = 1e-3, 1e-4  # s, and as a share: of a lag that is found, of any clock
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Lags that were found, and the line through them.
+
+    Parameters
+    ----------
+    weight : float
+        Of all lags.
+    time, lag : float
+        Weighted means (s).
+    square, product : float
+        Weighted sums of the squares of times, and of times by lags, about the means (s^2).
+    """
+
+    weight: float = 0.0
+    time: float = 0.0
+    lag: float = 0.0
+    square: float = 0.0
+    product: float = 0.0
+
+    def heard(self, time: float, lag: float) -> "Clock":
+        """Return it with the lag that was found at a time (s)."""
+        old = MEMORY * self.weight
+        weight = old + 1.0
+        off_time, off_lag = time - self.time, lag - self.lag
+        share = old / weight
+        return Clock(
+            weight,
+            self.time + off_time / weight,
+            self.lag + off_lag / weight,
+            MEMORY * self.square + share * off_time**2,
+            MEMORY * self.product + share * off_time * off_lag,
+        )
+
+    @property
+    def line(self) -> Lag | None:
+        """The lag by time; None before any was found."""
+        if self.weight == 0.0:
+            return None
+        rate = self.product / (self.square + (LAG_SIGMA / RATE_SIGMA) ** 2)
+        return Lag(self.lag - rate * self.time, rate)
+
+
+def lag_in(waveform: Waveform, reference: Waveform, lines_hz: Array) -> tuple[float, float] | None:
+    """Return when, and by how much, a reference lags in a stretch (s); None where it is not heard.
+
+    Parameters
+    ----------
+    lines_hz : ndarray
+        Tones and mains (Hz), which are left out.
+    """
+    step = float(np.median(np.diff(waveform.time)))
+    size = int(BLOCK / step) // 2 * 2
+    starts = np.arange(0, len(waveform) - size + 1, size)
+    even, there = beside(waveform, reference, NO_LAG)
+    if not len(starts) or not np.any(there):
+        return None
+    found = peak_of(correlations(waveform.measured_sensor, even, starts, size, step, lines_hz))
+    if found is None:
+        return None
+    mean, best, lags = found
+    at = int(np.clip(best, 1, len(mean) - 2))
+    before, here, after = mean[at - 1 : at + 2]
+    finer = 0.5 * (before - after) / min(before - 2.0 * here + after, -1e-300)
+    middle = float(waveform.time[starts].mean()) + 0.5 * size * step
+    return middle, float(lags[at] + np.clip(finer, -0.5, 0.5)) * step / FINER
