@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from magfusion.estimation.integrity.fix_separation import separate_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.audibility import tones_of
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -228,6 +229,30 @@ def test_the_bound_holds_for_every_kind_of_beacon() -> None:
     assert np.allclose(np.linalg.norm(bound.worst_world, axis=1), 1.0, rtol=1e-9, atol=0)
 
 
+def test_the_noise_factor_of_a_beacon_is_its_noise() -> None:
+    site = room()
+    factors = tuple(replace(b, noise_factor=3.0) for b in site.beacons)
+    loud = sigma(replace(site, beacons=factors))
+    assert np.allclose(loud, sigma(with_noise(site, 3.0)), rtol=1e-9, atol=0)
+    one = replace(site, beacons=(*factors[:1], *site.beacons[1:]))
+    assert np.all((sigma(one) > sigma(site)) & (sigma(one) < loud))
+
+
+def test_a_planned_beacon_shares_its_frequency_with_none() -> None:
+    site = room(2)
+    first = replace(site.beacons[0], name="other", position_world=np.array([1.0, 2.0, 2.0]))
+    both = replace(site, beacons=(*site.beacons, first))
+    planned = replace(site, beacons=(*site.beacons, replace(first, planned=True)))
+    assert tones_of(both).reused
+    assert not tones_of(planned).reused
+    np.testing.assert_array_equal(tones_of(planned).of_channel, [0, 1, 2])
+    # What it tells is what it would tell at another frequency, which hardly weakens it.
+    tuned = replace(first, frequency_hz=first.frequency_hz + 1e-6)
+    apart = sigma(replace(site, beacons=(*site.beacons, tuned)))
+    assert np.allclose(sigma(planned), apart, rtol=1e-6, atol=0)
+    assert np.any(sigma(both) > 1.5 * apart)
+
+
 def test_one_more_beacon_helps_most_where_it_is_put() -> None:
     site = room(2)
 
@@ -238,7 +263,7 @@ def test_one_more_beacon_helps_most_where_it_is_put() -> None:
     assert found.after < found.before
     assert found.before == bound(site, POINTS).position_quantile(0.5)
     for place in boundary_places(DEMO_BOX_WORLD):
-        other = replace(site.beacons[0], name="other", position_world=place)
+        other = replace(site.beacons[0], name="other", position_world=place, planned=True)
         extended = replace(site, beacons=(*site.beacons, other))
         assert found.after <= bound(extended, POINTS).position_quantile(0.5)
 

@@ -48,11 +48,19 @@ def are_many(site: Site) -> bool:
 
 
 def tones_of(site: Site) -> Tones:
-    """Return the tones of a site; those of time slots are told apart by when they are sent."""
+    """Return the tones of a site; those of time slots are told apart by when they are sent.
+
+    A beacon that is only planned will have frequencies of its own.
+    """
     frequencies = tone_frequencies(site)
     if any(slot is not None for beacon in site.beacons for _, slot in beacon.tones):
         return Tones(frequencies, np.arange(len(frequencies)))
-    _, first, of_channel = np.unique(frequencies, return_index=True, return_inverse=True)
+    apart = np.array([k if b.planned else -1 for k, b in enumerate(site.beacons) for _ in b.tones])
+    if np.any(apart >= 0):
+        each = np.stack([apart, frequencies], axis=1)
+        _, first, of_channel = np.unique(each, axis=0, return_index=True, return_inverse=True)
+    else:
+        _, first, of_channel = np.unique(frequencies, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))

@@ -159,6 +159,8 @@ class Beacon:
         directions and without end; one for all beacons of a site.
     rotor : Rotor, optional
         Of which its coils are made, where it is a magnet on a shaft.
+    planned : bool
+        Whether its frequency is yet to be chosen, so that it shares it with no other.
     """
 
     name: str
@@ -177,6 +179,7 @@ class Beacon:
     warming: Warming | None = None
     conductivity: float = 0.0
     rotor: Rotor | None = None
+    planned: bool = False
 
     @cached_property
     def tones(self) -> tuple[tuple[float, int | None], ...]:

@@ -267,19 +267,8 @@ def boundary_places(box_world: Array) -> Array:
 def _copy(site: Site, place: Array) -> Beacon:
     names = {b.name for b in site.beacons}
     name = next(n for n in ("extra", *(f"extra {i}" for i in range(len(names)))) if n not in names)
-    copy = replace(site.beacons[0], name=name, position_world=place)
-    if any(slot is not None for _, slot in copy.tones):
-        return copy
     # It will have a frequency of its own, at which the field is what it is at the first's.
-    coils = tuple(
-        c if c.frequency_hz is None else replace(c, frequency_hz=_above(c.frequency_hz))
-        for c in copy.coils
-    )
-    return replace(copy, frequency_hz=_above(copy.frequency_hz), coils=coils)
-
-
-def _above(frequency_hz: float) -> float:
-    return float(np.nextafter(frequency_hz, np.inf))
+    return replace(site.beacons[0], name=name, position_world=place, planned=True)
 
 
 def _quantile(sigma: Array, share: float) -> float:

@@ -64,12 +64,14 @@ def phasor_variance(site: Site, window: float) -> Array:
 
     A tone fitted to ``N = T rate`` samples of variance ``d^2 rate / 2`` (``d`` the one-sided
     density) has the variance ``2 / N`` of theirs in its cosine and in its sine: ``d^2 / T``,
-    whatever the rate.  Coils driven in turn share the window.
+    whatever the rate.  Coils driven in turn share the window.  What a beacon's `noise_factor` says
+    of its phasors counts.
     """
     slots = [slot for b in site.beacons for _, slot in b.tones]
     turns = 1 + max((slot for slot in slots if slot is not None), default=0)
     dwell = np.array([window if slot is None else window / turns for slot in slots])
-    return site.platform.magnetometer.noise_density**2 / dwell
+    factor = np.array([beacon.noise_factor for beacon in site.beacons for _ in beacon.tones])
+    return factor**2 * (site.platform.magnetometer.noise_density**2 / dwell)
 
 
 def whitened(
