@@ -14,7 +14,7 @@ from magfusion.jobs.coverage import write_points
 from magfusion.jobs.settings import Command, RandomSettings, RiskSettings, argument, option
 from magfusion.jobs.simulate import box_option
 from magfusion.model.progress import Report, quiet
-from magfusion.model.site import Site
+from magfusion.model.site import Beacon, Site
 
 if TYPE_CHECKING:
     from magfusion.model.hall import Hall
@@ -227,8 +227,8 @@ def _points(hall: Hall, spacing: float) -> Array:
     if not 0 < len(points) <= MOST_POINTS:
         raise InputError(
             f"--spacing {spacing:g} gives {len(points)} points where it is to be navigated; 1 to"
-            f" {MOST_POINTS} can be compared, so choose another spacing, or another margin_m in the"
-            " hall's use"
+            f" {MOST_POINTS} can be compared, so choose another spacing, or in the hall's use another"
+            " margin_m, or a polygon_m that lies in the hall"
         )
     return points
 
@@ -243,8 +243,10 @@ def _task(settings: DesignSettings, site: Site, hall: Hall, spacing: float) -> T
     moment = settings.moment
     if settings.moment_budget is not None:
         moment = settings.moment_budget / settings.beacons
+    kept = _kept(site, settings.keep)
+    _check_turns(settings, kept, template)
     return Task(
-        site=_kept(site, settings.keep),
+        site=kept,
         template=template if moment is None else with_moment(template, moment),
         count=settings.beacons,
         places=mounting_places(hall, settings.grid or spacing),
@@ -257,6 +259,26 @@ def _task(settings: DesignSettings, site: Site, hall: Hall, spacing: float) -> T
         clearance=settings.clearance,
         budgeted=settings.moment_budget is not None,
     )
+
+
+def _check_turns(settings: DesignSettings, kept: Site, template: Beacon) -> None:
+    """Refuse beacons in time slots beside others, and a window that does not hold a cycle."""
+    from magfusion.results.design.turns import cycle_of, is_in_turn
+
+    in_turn = [beacon for beacon in (*kept.beacons, template) if is_in_turn(beacon)]
+    if kept.beacons and in_turn:
+        raise InputError(
+            f"--keep: beacon {in_turn[0].name} is driven in time slots, and a cycle is designed as"
+            " a whole; leave --keep out, or plan by coverage --extra-beacon"
+        )
+    if not is_in_turn(template):
+        return
+    cycle = cycle_of(template, settings.beacons)
+    if cycle is not None and settings.window < cycle * (1.0 - 1e-9):
+        raise InputError(
+            f"--window {settings.window:g} s does not hold a cycle of {settings.beacons} beacons in"
+            f" time slots; give --window {cycle:.3g} or more"
+        )
 
 
 def _kept(site: Site, keep: str | None) -> Site:

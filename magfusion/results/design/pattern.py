@@ -137,7 +137,7 @@ def template_of(site: Site, name: str | None) -> Beacon:
     Raises
     ------
     InputError
-        Where there is none of that name, or it is driven in time slots.
+        Where there is none of that name.
     """
     names = [beacon.name for beacon in site.beacons]
     if name is not None and name not in names:
@@ -145,12 +145,6 @@ def template_of(site: Site, name: str | None) -> Beacon:
             f"--template {name}: the site has no such beacon; it has {', '.join(names)}"
         )
     found = site.beacons[0 if name is None else names.index(name)]
-    for beacon in site.beacons:
-        if any(slot is not None for _, slot in beacon.tones):
-            raise InputError(
-                f"beacon {beacon.name} is driven in time slots, and design chooses frequencies;"
-                " remove the slots from its coils, or plan by coverage --extra-beacon"
-            )
     return replace(found, field_map=None, hemisphere_beacon=None, unknown=None)
 
 

@@ -30,6 +30,7 @@ from magfusion.results.design.pattern import (
     turned,
 )
 from magfusion.results.design.tuning import assigned, divided
+from magfusion.results.design.turns import all_in_turn, in_turn, is_in_turn
 from magfusion.results.pose_information import NEAREST
 from magfusion.units import Array
 
@@ -127,8 +128,12 @@ def designed(
     InputError
         Where nothing may be mounted, or not so many so far apart.
     """
-    tones, free = frequencies_for(task.template, task.count, task.band, task.site.beacons)
-    plain = tuned(task.template, tones[len(tones) // 2])
+    tones, free = np.zeros((0, 0)), np.zeros(0)
+    if is_in_turn(task.template):
+        plain = in_turn(task.template, task.count - 1, task.count)
+    else:
+        tones, free = frequencies_for(task.template, task.count, task.band, task.site.beacons)
+        plain = tuned(task.template, tones[len(tones) // 2])
     candidates = candidates_of(task, plain)
     information = LayoutInformation(
         task.site,
@@ -159,8 +164,8 @@ def designed(
     median = None
     if worst:
         middle = drawn[int(np.argsort(worst, kind="stable")[(len(worst) - 1) // 2])]
-        own = [tuned(candidates.beacons[c], t) for c, t in zip(middle or (), tones, strict=True)]
-        median = with_beacons(task.site, _named(own, task.site))
+        own = _apart(task, [candidates.beacons[c] for c in middle or ()], tones)
+        median = with_beacons(task.site, _named(list(own), task.site))
     return Design(
         with_beacons(task.site, new),
         new,
@@ -213,6 +218,13 @@ def with_moment(beacon: Beacon, moment: float) -> Beacon:
     return stronger(beacon, moment / peak_moment(beacon))
 
 
+def _apart(task: Task, chosen: list[Beacon], tones: Array) -> tuple[Beacon, ...]:
+    """Return beacons with what tells them apart: tones, or time slots, of their own."""
+    if is_in_turn(task.template):
+        return all_in_turn(task.template, chosen)
+    return tuple(tuned(b, t) for b, t in zip(chosen, tones, strict=True))
+
+
 def _finished(
     task: Task,
     information: LayoutInformation,
@@ -222,9 +234,11 @@ def _finished(
     in_time: Callable[[], bool],
 ) -> tuple[Beacon, ...]:
     """Return the beacons chosen with their own frequencies, moments and names."""
-    beacons = tuple(tuned(b, t) for b, t in zip(chosen, tones, strict=True))
+    beacons = _apart(task, chosen, tones)
     response = task.site.platform.magnetometer.response
-    if response is not None or task.template.conductivity or conductivity_of(task.site):
+    if is_in_turn(task.template):
+        pass  # all have the template's carrier
+    elif response is not None or task.template.conductivity or conductivity_of(task.site):
         beacons = assigned(information, beacons, free, task.objective, in_time)
     if task.budgeted and len(beacons) > 1:
         beacons, _ = divided(information, beacons, task.objective, in_time)
