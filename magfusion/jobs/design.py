@@ -227,8 +227,8 @@ def _points(hall: Hall, spacing: float) -> Array:
     if not 0 < len(points) <= MOST_POINTS:
         raise InputError(
             f"--spacing {spacing:g} gives {len(points)} points where it is to be navigated; 1 to"
-            f" {MOST_POINTS} can be compared, so choose another spacing, or in the hall's use another"
-            " margin_m, or a polygon_m that lies in the hall"
+            f" {MOST_POINTS} can be compared, so choose another spacing, or in the hall's use"
+            " another margin_m, or a polygon_m that lies in the hall"
         )
     return points
 
