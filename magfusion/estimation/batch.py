@@ -22,6 +22,7 @@ from magfusion.estimation.measurements.signs import count_open
 from magfusion.estimation.measurements.zero_velocity import may_stand, quiet_before
 from magfusion.estimation.noise_tuning import Tuned, as_declared, noise_of, plausible, with_noise
 from magfusion.estimation.noise_tuning import settled as same_noise
+from magfusion.estimation.on_new_clock import on_new_clock
 from magfusion.estimation.passes import Passed, PassFile
 from magfusion.estimation.prepared import prepared
 from magfusion.estimation.relaxation import Step, part_of_the_way
@@ -234,6 +235,7 @@ def _solved(
             step = Step.of(step, before, states, old, calibration)
             moved = before, states, old, calibration
             states, calibration = part_of_the_way(*moved, graph.blocks, step.share)
+            states = on_new_clock(log, states, old, calibration, standing)
             del graph, found  # of a long log they are most of what there is
             give_back_memory()
             if passes is not None:
