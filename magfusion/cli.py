@@ -11,7 +11,7 @@ import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import MISSING, Field
 from importlib import import_module
 from pathlib import Path
@@ -23,6 +23,7 @@ from typer.main import get_command
 
 from magfusion.errors import EstimationError, InputError, InputErrors
 from magfusion.files.standard_streams import binary_output, occupy_closed, until_closed
+from magfusion.files.without_pandas import without_pandas
 from magfusion.jobs import GROUPS, JOBS
 from magfusion.jobs.settings import Command, Option, Settings, options
 from magfusion.model.progress import Report, quiet
@@ -49,7 +50,8 @@ def main(arguments: list[str] | None = None) -> None:
         warnings.simplefilter("ignore")  # a library's warnings are no sentence of ours
     occupy_closed()
     try:
-        with _terminated_as_interrupted(), until_closed():
+        alone = without_pandas() if arguments is None else nullcontext()
+        with _terminated_as_interrupted(), until_closed(), alone:
             status = application()(
                 args=given or ["--help"], prog_name="magfusion", standalone_mode=False, obj=given
             )
