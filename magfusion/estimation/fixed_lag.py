@@ -7,7 +7,6 @@ sees fit; here the time of an update is that of the window, whatever happens.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 
 import gtsam
 import numpy as np
@@ -178,9 +177,10 @@ class SlidingWindow:
         native, links = gtsam.NonlinearFactorGraph(), [n.link for n in nodes[1:] if n.link]
         for i, link in enumerate(links):
             native.add(inertial_factor(i, link.measurement))
-        own = chain.from_iterable((m.at(i) for m in n.measurements) for i, n in enumerate(nodes))
+        own = [(m, i) for i, n in enumerate(nodes) for m in n.measurements]
+        measured = tuple(joined((m for m, _ in own), (i for _, i in own)))
         acting = tuple(link for link in links if link.by_calibration is not None)
-        graph = Graph(native, tuple(joined(own)), None, self.blocks, len(nodes), acting)
+        graph = Graph(native, measured, None, self.blocks, len(nodes), acting)
         states = [n.state for n in nodes]
         linear = graph.linearized(Estimate(values_of(states), states[0].calibration))
         linear.push_back(self._prior_factor(states[0]))

@@ -7,6 +7,8 @@ dataclass with these methods; nothing else changes.
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
+from functools import cache
+from itertools import repeat
 from typing import Self
 
 import numpy as np
@@ -159,19 +161,37 @@ class Measurement(ABC):
         return replace(self, epoch=np.full(len(self.epoch), epoch))
 
 
-def joined(parts: Iterable[Measurement]) -> list[Measurement]:
-    """Return measurements of the same kind as one, so that a call serves them all."""
-    kinds: dict[str, list[Measurement]] = {}
-    for part in parts:
-        named = {f.name: getattr(part, f.name) for f in fields(part) if f.compare}
-        shared = {k: v for k, v in named.items() if not isinstance(v, np.ndarray)}
-        kinds.setdefault(f"{type(part).__qualname__} {shared}", []).append(part)
+def joined(parts: Iterable[Measurement], epochs: Iterable[int] | None = None) -> list[Measurement]:
+    """Return measurements of the same kind as one, so that a call serves them all.
+
+    Parameters
+    ----------
+    epochs : iterable of int, optional
+        Of each part, in place of its own.
+    """
+    kinds: dict[str, list[tuple[Measurement, IntArray]]] = {}
+    for part, epoch in zip(parts, repeat(None) if epochs is None else epochs, strict=False):
+        own = part.epoch if epoch is None else np.full(len(part.epoch), epoch)
+        kinds.setdefault(_kind(part), []).append((part, own))
     out = []
     for alike in kinds.values():
-        arrays = [k for k, v in vars(alike[0]).items() if isinstance(v, np.ndarray)]
-        whole = {k: np.concatenate([getattr(m, k) for m in alike]) for k in arrays}
-        out.append(replace(alike[0], **whole))
+        first = alike[0][0]
+        arrays = [k for k, v in vars(first).items() if isinstance(v, np.ndarray)]
+        whole = {k: np.concatenate([getattr(m, k) for m, _ in alike]) for k in arrays}
+        whole["epoch"] = np.concatenate([epoch for _, epoch in alike])
+        out.append(replace(first, **whole))
     return out
+
+
+def _kind(part: Measurement) -> str:
+    values = ((name, getattr(part, name)) for name in _compared(type(part)))
+    shared = {name: value for name, value in values if not isinstance(value, np.ndarray)}
+    return f"{type(part).__qualname__} {shared}"
+
+
+@cache
+def _compared(kind: type[Measurement]) -> tuple[str, ...]:
+    return tuple(f.name for f in fields(kind) if f.compare)
 
 
 def group_distances(rows: Rows, cov: Array) -> Array:
