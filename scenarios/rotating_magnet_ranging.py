@@ -8,12 +8,18 @@ Two cases.  ``crossing``: about 25 m apart, any direction, wells that converge b
 ``pair``: a steam-assisted pair, 5 m apart over 80 m.  The field of the magnet is that of a stack
 that is turned sample by sample, with tilt, whirl and slip, at a speed that drifts; in layers of
 ground (empymod); through the steel of a casing that is not as declared, which is magnetised along
-as well; beside a rail; at depths that scatter and stretch.  The estimator knows none of this, but
-what a driller would declare.
+as well; with a rail beside each place of the sensor; at depths that scatter and stretch.
 
-The rule, stated before the run: over all draws of ``crossing`` with the angle measured the root
-mean square of the distance's error is at most 0.6 % of the distance, a fifth of what is published;
-and the mean NEES of the six numbers of the pose lies between 4 and 8.
+What is declared is what is drawn, otherwise no NEES says anything: the moment, the scale of the
+depths, the shaft's slip and the casing's wall, permeability and conductivity are drawn with their
+declared sigmas.  That of a window's depth follows from that of a reading.  The thin wall's formula
+errs by about the wall over its radius, 0.1.  What rails and layers do is calculated without any
+estimate, over draws of other seeds (``--left-out``), and declared, rounded: as ``model_error`` its
+root mean square over all places of the magnet, as its length where its correlation falls to 1/e.
+
+The rule, stated before the run: over all draws with the angle measured the mean NEES of the six
+numbers of the pose lies between 4 and 8 in both cases; and of ``crossing`` the root mean square of
+the distance's error is at most 0.6 % of the distance, a fifth of what is published.
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +30,7 @@ from harness import conclude, rms, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.ranging import Ranged, find_range
-from magfusion.estimation.ranging_model import RangingWindows
+from magfusion.estimation.ranging_data import SHARE, RangingWindows
 from magfusion.estimation.ranging_windows import DepthErrors, ranging_log
 from magfusion.estimation.relative_wells import Wells
 from magfusion.model.physics.casing import Casing
@@ -34,7 +40,7 @@ from magfusion.model.site import Beacon, BeaconSigma, Site, rotor_coils
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.layers import Layers
 from magfusion.simulation.pipe import Pipe, Steel
-from magfusion.simulation.rotor import Pass, Shaft, Surroundings, simulate_passes
+from magfusion.simulation.rotor import Pass, Shaft, Surroundings, passing_phasor, simulate_passes
 from magfusion.units import Array
 
 PUBLISHED, BETTER = 0.03, 5.0
@@ -43,9 +49,21 @@ MOMENT, MOMENT_SIGMA = 300.0, 0.02  # A m^2, relative
 SPEED_HZ, NOISE = 3.0, 2e-11  # Hz, T/sqrt(Hz)
 RATE_HZ = 50.0
 RADIUS, WALL, STRETCH, READING = 0.09, 0.01, 5e-4, 0.02  # m, m, relative, m
+PERMEABILITY, STEEL_CONDUCTIVITY = 100.0, 5e6  # relative, S/m
+STEEL_SIGMA = 0.05, 0.2, 0.1  # of the logarithms of wall, permeability and conductivity
+THIN, THIN_PHASE = 0.1, 0.03  # by which the thin wall's formula errs, relative and in rad
+ELLIPSE = 0.005  # of the moment's circle, each of two numbers
+# Of a window's depth: readings each second, linear in between, at three places of the window.
+WINDOW_DEPTH = READING * float(np.sqrt(2.0 / 3.0 * np.sum(SHARE**2)))
 LAYERS = Layers((300.0, 20.0, -15.0), (0.02, 0.005, 0.1))
 CONDUCTIVITY = 0.01  # S/m, as declared
-RAIL = 15.0  # m, from the sensor, sideways
+RAIL_FROM, RAIL_TO, RAIL_LENGTH = 4.0, 8.0, 20.0  # m, from the sensor, sideways
+LEFT_OUT_SEED, LEFT_OUT_DRAWS, LEFT_OUT_PLACES = 9001, 10, 121
+
+
+CASING = Casing(
+    RADIUS - 0.5 * WALL, WALL, PERMEABILITY, STEEL_CONDUCTIVITY, THIN, THIN_PHASE, *STEEL_SIGMA
+)
 
 
 @dataclass(frozen=True)
@@ -66,8 +84,8 @@ class Case:
         Of the magnet along its well (m/s).
     window : float
         (s)
-    model_error : float
-        As declared.
+    model_error, model_error_length : float
+        As declared: by ``--left-out``; the length in m.
     segment : float
         Of the simulated steel (m).
     """
@@ -80,11 +98,12 @@ class Case:
     speed: float
     window: float
     model_error: float
+    model_error_length: float
     segment: float
 
 
-CROSSING = Case("crossing", 25.0, 15.0, 30.0, 0.04, 0.1, 10.0, 0.005, 0.5)
-PAIR = Case("pair", 5.0, 80.0, 10.0, 0.005, 0.03, 10.0, 0.01, 0.25)
+CROSSING = Case("crossing", 25.0, 15.0, 30.0, 0.04, 0.1, 10.0, 3e-4, 17.0, 0.5)
+PAIR = Case("pair", 5.0, 80.0, 10.0, 0.005, 0.03, 10.0, 2e-4, 5.0, 0.25)
 
 
 @dataclass(frozen=True)
@@ -103,7 +122,9 @@ def declared_site(*, cased: bool, axis: Array | None = None) -> Site:
     """Return what a driller declares."""
     plain = demo_site()
     first = np.array([1.0, 0.0, 0.0]) if axis is None else axis
-    rotor = Rotor(MOMENT, first, np.array([0.0, 0.0, 1.0]))
+    rotor = Rotor(
+        MOMENT, first, np.array([0.0, 0.0, 1.0]), ellipse_sigma=ELLIPSE, length=Shaft.length
+    )
     sigma = BeaconSigma(np.zeros(3), np.zeros(3), np.full(2, MOMENT_SIGMA))
     beacon = Beacon(
         "bit",
@@ -123,10 +144,21 @@ def declared_site(*, cased: bool, axis: Array | None = None) -> Site:
         matrix=np.eye(3),
         offset=np.zeros(3),
         noise_density=NOISE,
-        casing=Casing(RADIUS - 0.5 * WALL, WALL) if cased else None,
+        casing=CASING if cased else None,
     )
     platform = replace(plain.platform, magnetometer=sensor)
-    return replace(plain, beacons=(beacon,), platform=platform, model_error_length=5.0)
+    return replace(plain, beacons=(beacon,), platform=platform)
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """Two wells and what is about them; the frame of the sensor's high side in the world."""
+
+    site: Site
+    shaft: Shaft
+    passes: tuple[Pass, ...]
+    around: Surroundings
+    side_world: Array  # (3, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,9 +171,8 @@ class Scene:
     stretch: float
 
 
-def draw(case: Case, config: Config, seed: int) -> Scene:
-    """Draw two wells, and what the sensor records in two passes."""
-    rng = np.random.default_rng([seed, 19])
+def draw_world(case: Case, config: Config, rng: np.random.Generator) -> World:
+    """Draw two wells."""
     site = declared_site(cased=False)
     rotor = site.beacons[0].rotor
     assert rotor is not None
@@ -167,33 +198,91 @@ def draw(case: Case, config: Config, seed: int) -> Scene:
         roll = Rotation.from_euler("x", rng.uniform(-np.pi, np.pi)).as_matrix()
         start = middle + low * along
         passes.append(Pass(place, sensor, side @ roll, start, rotor_world, (low, high), case.speed))
-    shaft = Shaft(angle_start=rng.uniform(0.0, 6.0), slip=0.01, whirl=0.01, drift_hz=0.1)
-    stretch = STRETCH * rng.standard_normal()
+    # An error of the angle twice a turn makes an ellipse of half its size.
+    first, second = 2.0 * ELLIPSE * rng.standard_normal(2)
+    shaft = Shaft(
+        angle_start=rng.uniform(0.0, 6.0),
+        slip=float(np.hypot(first, second)),
+        slip_phase=float(np.arctan2(second, first)),
+        whirl=0.01,
+        drift_hz=0.1,
+    )
     around = Surroundings(
         LAYERS if config.layers else None,
-        _steel(case, side, rng) if config.steel else None,
-        stretch,
+        _steel(case, side, angle, rng) if config.steel else None,
+        STRETCH * rng.standard_normal(),
         READING,
     )
-    log = simulate_passes(site, shaft, tuple(passes), around, RATE_HZ, rng, encoder=config.encoder)
-    return Scene(log, tuple(passes), side, stretch)
+    return World(site, shaft, tuple(passes), around, side)
 
 
-def _steel(case: Case, side: Array, rng: np.random.Generator) -> Steel:
-    """Return the casing about the sensor, not quite as declared, and a rail."""
+def draw(case: Case, config: Config, seed: int) -> Scene:
+    """Draw two wells, and what the sensor records in two passes."""
+    rng = np.random.default_rng([seed, 19])
+    own = draw_world(case, config, rng)
+    log = simulate_passes(
+        own.site, own.shaft, own.passes, own.around, RATE_HZ, rng, encoder=config.encoder
+    )
+    return Scene(log, own.passes, own.side_world, own.around.depth_scale)
+
+
+def _steel(case: Case, side: Array, angle: float, rng: np.random.Generator) -> Steel:
+    """Return the casing about the sensor, not quite as declared, and rails off the magnet's way."""
     half = 0.5 * case.apart + case.reach + case.distance
+    wall, permeability, conductivity = np.exp(STEEL_SIGMA * rng.standard_normal(3)) * [
+        WALL,
+        PERMEABILITY,
+        STEEL_CONDUCTIVITY,
+    ]
     casing = Pipe(
         -half * side[:, 0],
         half * side[:, 0],
         RADIUS,
-        WALL * np.exp(0.05 * rng.standard_normal()),
-        100.0 * np.exp(0.2 * rng.standard_normal()),
-        5e6 * np.exp(0.1 * rng.standard_normal()),
+        float(wall),
+        float(permeability),
+        float(conductivity),
         case.segment,
     )
-    aside = side @ np.array([0.0, RAIL, 3.0])
-    rail = Pipe(aside - 10.0 * side[:, 0], aside + 10.0 * side[:, 0], 0.045, 0.045)
-    return Steel((casing, rail), about=0)
+    rails = []
+    for place in (-0.5 * case.apart, 0.5 * case.apart):
+        away = angle + rng.uniform(0.5 * np.pi, 1.5 * np.pi)
+        across = rng.uniform(RAIL_FROM, RAIL_TO) * np.array([0.0, -np.sin(away), np.cos(away)])
+        ends = [
+            side @ (across + np.array([place + end * RAIL_LENGTH, 0.0, 0.0])) for end in (-0.5, 0.5)
+        ]
+        rails.append(Pipe(ends[0], ends[1], 0.045, 0.045))
+    return Steel((casing, *rails), about=0)
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What rails and layers do to the field, without any estimate."""
+
+    case: str
+    share: float
+    length_m: float
+
+
+def left_out(case: Case) -> LeftOut:
+    """Return it over draws of seeds that are ranged nowhere."""
+    power, alike, step = 0.0, np.zeros(LEFT_OUT_PLACES), 0.0
+    for seed in range(LEFT_OUT_SEED, LEFT_OUT_SEED + LEFT_OUT_DRAWS):
+        own = draw_world(case, Config(), np.random.default_rng([seed, 19]))
+        assert own.around.steel is not None
+        casing = replace(own.around.steel, pipes=own.around.steel.pipes[:1])
+        plain = replace(own.around, steel=casing, layers=None)
+        for one in own.passes:
+            depth = np.linspace(*one.depth, LEFT_OUT_PLACES)
+            whole = passing_phasor(own.site, own.shaft, one, own.around, depth)
+            known = passing_phasor(own.site, own.shaft, one, plain, depth)
+            error = (whole - known) / np.linalg.norm(whole, axis=1)[:, None]
+            power += float(np.mean(np.sum(np.abs(error) ** 2, axis=1)))
+            for lag in range(LEFT_OUT_PLACES):
+                product = np.sum(error[: len(depth) - lag] * error[lag:].conj(), axis=1)
+                alike[lag] += float(np.mean(product.real))
+            step = float(depth[1] - depth[0])
+    apart = int(np.argmax(alike < alike[0] / np.e))
+    return LeftOut(case.name, float(np.sqrt(power / (2 * LEFT_OUT_DRAWS))), apart * step)
 
 
 @dataclass(frozen=True)
@@ -267,8 +356,12 @@ def nees(error: Array, found: Ranged, *, measured: bool) -> float:
 def run_one(case: Case, config: Config, seed: int) -> Row:
     """Draw, find, compare."""
     scene = draw(case, config, seed)
-    site = replace(declared_site(cased=config.steel), model_error=case.model_error)
-    told = ranging_log(scene.log, site, case.window, errors=DepthErrors(READING, STRETCH))
+    site = replace(
+        declared_site(cased=config.steel),
+        model_error=case.model_error,
+        model_error_length=case.model_error_length,
+    )
+    told = ranging_log(scene.log, site, case.window, errors=DepthErrors(WINDOW_DEPTH, STRETCH))
     found = find_range(site, told.windows)
     wells = Wells(found, told.windows, np.array([1.0, 0.0, 0.0]))
     errors, distances, sigmas = [], [], []
@@ -299,8 +392,9 @@ def judged(rows: list[Row]) -> Judgement:
     """Judge the draws of a case."""
     share = np.array([row.error_m / row.distance_m for row in rows])
     mean = float(np.mean([row.nees for row in rows]))
-    first, ruled = rows[0], (CROSSING.name, "measured")
-    good = rms(share) <= PUBLISHED / BETTER and LEAST_NEES <= mean <= MOST_NEES
+    first, good = rows[0], LEAST_NEES <= mean <= MOST_NEES
+    if first.case == CROSSING.name:
+        good = good and rms(share) <= PUBLISHED / BETTER
     return Judgement(
         first.case,
         first.angle,
@@ -310,7 +404,7 @@ def judged(rows: list[Row]) -> Judgement:
         rms(np.array([row.direction_error_deg for row in rows])),
         rms(np.array([row.depth_error_m for row in rows])),
         mean,
-        good if (first.case, first.angle) == ruled else None,
+        good if first.angle == "measured" else None,
     )
 
 
@@ -341,14 +435,19 @@ def report(rows: list[Row], found: list[Judgement]) -> str:
 def main() -> None:
     """Range in both cases, with the angle measured and followed."""
     parser = scenario_parser(__doc__, Config.seed, output=None)
-    parser.add_argument("--runs", type=int, default=Config.runs, help="of the rule's case")
-    parser.add_argument("--others", type=int, default=Config.others, help="of each other case")
+    parser.add_argument("--runs", type=int, default=Config.runs, help="of each case of the rule")
+    parser.add_argument("--others", type=int, default=Config.others, help="with a followed angle")
+    parser.add_argument("--left-out", action="store_true", help="what the model leaves out, only")
     given = parser.parse_args()
+    if given.left_out:
+        for one in (left_out(CROSSING), left_out(PAIR)):
+            print(f"{one.case}: {100.0 * one.share:.3f} %, alike over {one.length_m:.1f} m")
+        return
     rows, found = list[Row](), list[Judgement]()
     for case in (CROSSING, PAIR):
         for encoder in (True, False):
             config = Config(seed=given.seed, encoder=encoder)
-            runs = given.runs if case is CROSSING and encoder else given.others
+            runs = given.runs if encoder else given.others
             own = [run_one(case, config, given.seed + k) for k in range(runs)]
             rows += own
             found += [judged(own)] if own else []

@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.estimation.ranging_model import POSE, RangingModel, RangingWindows
+from magfusion.estimation.ranging_data import POSE, RangingWindows
+from magfusion.estimation.ranging_model import RangingModel
+from magfusion.estimation.ranging_starts import starts
 from magfusion.estimation.solve.batched import (
     Normal,
     Solution,
@@ -79,16 +81,16 @@ def find_range(site: Site, windows: RangingWindows) -> Ranged:
     site : Site
         Its only beacon is a rotor.
     """
-    model = RangingModel(site, windows)
     every = max(len(windows.fields) // THINNED, 1)
     thin = RangingModel(site, windows.rows(slice(every // 2, None, every)))
-    tried = _solved(thin, thin.starts()[:KEPT], PASSES)
-    found = _solved(model, tried.state[:FOLLOWED], PASSES_OF_BEST)
-    order = np.arange(len(found.state))
-    best = found.state[order[0]][None]
+    tried = _solved(thin, starts(thin)[:KEPT], PASSES)
+    found = _solved(RangingModel(site, windows), tried.state[:FOLLOWED], PASSES_OF_BEST)
+    # Weighed about the likeliest: its rivals by the same weights, as a likelihood asks.
+    model = RangingModel(site, windows, about=found.state[0])
+    found = _solved(model, found.state, PASSES_OF_BEST)
+    best = found.state[:1]
     error, _ = model.residuals(best)
-    elsewhere = _elsewhere(model, found.state[order], windows)
-    rival = found.cost[order][elsewhere]
+    rival = found.cost[_elsewhere(model, found.state, windows)]
     used = 2 * 3 * int(np.sum(windows.fields.valid))
     used -= 0 if windows.angle_known else len(windows.fields) + POSE - 5
     return Ranged(
@@ -97,12 +99,12 @@ def find_range(site: Site, windows: RangingWindows) -> Ranged:
         names=model.names,
         values=best[0, 12:],
         prior_sigma=model.prior,
-        cov=np.linalg.pinv(found.information[order[0]], hermitian=True),
+        cov=np.linalg.pinv(found.information[0], hermitian=True),
         chi_square=float(np.sum(error**2)),
         freedom=max(used - POSE, 1),
-        rival_chi_square=float(np.min(rival - found.cost[order[0]], initial=np.inf)),
+        rival_chi_square=float(np.min(rival - found.cost[0], initial=np.inf)),
         residual=error[0],
-        converged=bool(found.converged[order[0]]),
+        converged=bool(found.converged[0]),
     )
 
 

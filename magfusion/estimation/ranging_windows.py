@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.estimation.ranging_model import WITHIN, RangingWindows
+from magfusion.estimation.ranging_data import WITHIN, RangingWindows
 from magfusion.model.samples import Log
 from magfusion.model.site import Beacon, Site
 from magfusion.receiver.rotor import demodulate_rotor

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.estimation.ranging import Ranged
-from magfusion.estimation.ranging_model import FIRST, POSE, RangingWindows
+from magfusion.estimation.ranging_data import FIRST, POSE, RangingWindows
 from magfusion.model.field import skew
 from magfusion.units import Array
 

@@ -9,6 +9,8 @@ from magfusion.files.yaml_files import StrictModel
 from magfusion.model.physics.casing import Casing
 from magfusion.units import DEGREE
 
+_STEEL = ("wall_sigma", "permeability_sigma", "conductivity_sigma")
+_Share = Annotated[float, between(0.0, 1.0)]
 _AboveZero = Annotated[float, Field(gt=0.0)]
 
 
@@ -21,6 +23,9 @@ class CasingEntry(StrictModel):
     conductivity_s_m: Annotated[_AboveZero, between(1.0, 1e9)] = Casing.conductivity
     log_gain_sigma: Annotated[_AboveZero, between(1e-6, 10.0)] = Casing.log_gain_sigma
     phase_sigma_deg: Annotated[_AboveZero, between(1e-6, 360.0)] = Casing.phase_sigma / DEGREE
+    wall_sigma: _Share = Casing.wall_sigma
+    permeability_sigma: _Share = Casing.permeability_sigma
+    conductivity_sigma: _Share = Casing.conductivity_sigma
 
     def casing(self) -> Casing:
         """Return what the entry says."""
@@ -31,6 +36,9 @@ class CasingEntry(StrictModel):
             self.conductivity_s_m,
             self.log_gain_sigma,
             self.phase_sigma_deg * DEGREE,
+            self.wall_sigma,
+            self.permeability_sigma,
+            self.conductivity_sigma,
         )
 
 
@@ -46,5 +54,6 @@ def casing_entry(casing: Casing | None) -> dict[str, Any]:
             "conductivity_s_m": float(casing.conductivity),
             "log_gain_sigma": float(casing.log_gain_sigma),
             "phase_sigma_deg": float(f"{casing.phase_sigma / DEGREE:.15g}"),
+            **{name: float(s) for name, s in zip(_STEEL, casing.steel_sigma, strict=True) if s},
         }
     }

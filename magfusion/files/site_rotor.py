@@ -50,6 +50,7 @@ class RotorEntry(StrictModel):
     ellipse_sigma: Annotated[float, Field(ge=0.0, le=1.0)] = Rotor.ellipse_sigma
     speed_sigma_hz: _Speed = Rotor.speed_sigma_hz
     speed_walk_hz_rts: _Speed = Rotor.speed_walk_hz_rts
+    length_m: Annotated[float, between(0.0, 10.0)] = Rotor.length
 
     @model_validator(mode="after")
     def _zero_across_the_axis(self) -> Self:
@@ -74,6 +75,7 @@ class RotorEntry(StrictModel):
             ellipse_sigma=self.ellipse_sigma,
             speed_sigma_hz=self.speed_sigma_hz,
             speed_walk_hz_rts=self.speed_walk_hz_rts,
+            length=self.length_m,
         )
 
 
@@ -88,6 +90,8 @@ def rotor_entry(rotor: Rotor, log_scale: float) -> dict[str, Any]:
         "speed_sigma_hz": float(rotor.speed_sigma_hz),
         "speed_walk_hz_rts": float(rotor.speed_walk_hz_rts),
     }
+    if rotor.length:
+        entry["length_m"] = float(rotor.length)
     if rotor.tilt:
         entry["tilt_deg"] = float(rotor.tilt / DEGREE)
     if rotor.harmonics:

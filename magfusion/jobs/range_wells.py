@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 LEAST_SNR = 5.0  # of the strongest window
 VAGUE = 0.2  # of the distance
-NEAR = 10.0  # m; between magnet and casing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,10 +63,6 @@ def run_range(settings: RangeSettings, output: Path) -> Figures:
     rotor = site.beacons[0].rotor
     assert rotor is not None
     wells = Wells(found, told.windows, rotor.axis_beacon, excess)
-    if site.platform.magnetometer.casing is not None:
-        near, wider = _near_casing(wells, told)
-        trust |= near
-        wells = Wells(found, told.windows, rotor.axis_beacon, excess * wider)
     windows, fields = told.windows, told.windows.fields
     magnet = windows.magnet[:, 1] + windows.magnet_from
     sensor = windows.sensor + windows.sensor_from
@@ -153,27 +148,6 @@ def _judged(log: Log, told: RangingLog, found: Ranged) -> tuple[Trust, float]:
         )
         findings.append(Finding("geometry", text, Verdict.TRUSTWORTHY))
     return trust | Trust(tuple(findings)), excess
-
-
-def _near_casing(wells: Wells, told: RangingLog) -> tuple[Trust, float]:
-    """Return what is to be said of a magnet near a casing, and by what the covariance is widened.
-
-    The casing's poles are known to first order in its steel over the square of the distance.
-    """
-    import numpy as np
-
-    from magfusion.model.trust import Finding, Trust
-
-    places = np.unique(told.windows.sensor + told.windows.sensor_from)
-    distance = min(wells.abreast(float(place)).distance for place in places)
-    if distance >= NEAR:
-        return Trust(), 1.0
-    text = (
-        f"The magnet goes by the casing at {distance:.3g} m: what that gathers along itself is"
-        f" known to first order only nearer than {NEAR:g} m, and the sigmas have been widened."
-        " Declare a model_error of several per cent."
-    )
-    return Trust((Finding("iron", text),)), (NEAR / distance) ** 2
 
 
 def _vague(wells: Wells, sensor: float) -> Trust:

@@ -51,6 +51,8 @@ class Rotor:
         Of the speed about the declared frequency, where nobody measures the angle.
     speed_walk_hz_rts : float
         What it gains in a second, one sigma, likewise.
+    length : float
+        Of the magnets along the shaft (m).
     """
 
     moment: float
@@ -61,6 +63,7 @@ class Rotor:
     ellipse_sigma: float = 0.005
     speed_sigma_hz: float = 0.1
     speed_walk_hz_rts: float = 0.01
+    length: float = 0.0
 
     @property
     def turning_moments(self) -> Array:

@@ -8,15 +8,18 @@ uniform field, across and along; the estimators' formula for a thin wall (Kaden)
 """
 
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.special import ive, kve
 
 from magfusion.units import MU0_OVER_4PI, AnyArray, Array, ComplexArray
 
 MU0 = 4.0 * np.pi * MU0_OVER_4PI
+FINE, LEAST_CURVE = 0.5, 4  # of the radius, between poles; segments of a curve
 STEEL_PERMEABILITY, STEEL_CONDUCTIVITY = 100.0, 5e6  # relative, S/m
 
 
@@ -215,14 +218,31 @@ def _dipole_tensor(offset: Array) -> Array:
 def _ring_field(pipe: Pipe, place: float) -> Array:
     """Return the field along the axis of each segment's poles, over its moment, shape (n,).
 
-    At a place on the axis (m from the start); the poles between two segments lie on the tube's
-    wall, spread over a segment's length.
+    At a place on the axis (m from the start); the poles lie in the middle of the wall.  Between
+    segments the moment is a smooth curve through theirs, for the poles nearest to a place on the
+    axis are not farther from it than the radius.
     """
-    edges = np.linspace(0.0, pipe.length, len(pipe.centres_world()) + 1)
+    count = len(pipe.centres_world())
+    finer = max(int(np.ceil(pipe.span / (FINE * pipe.radius))), 1) if count > LEAST_CURVE else 1
+    edges = np.linspace(0.0, pipe.length, count * finer + 1)
+    span = float(edges[1])
     offset = place - edges
-    near, far = (np.hypot(offset + side * pipe.span, pipe.radius) for side in (-0.5, 0.5))
-    pole = (1.0 / near - 1.0 / far) / pipe.span
-    return np.asarray(MU0_OVER_4PI * (pole[1:] - pole[:-1]) / pipe.span)
+    wall = pipe.radius - 0.5 * pipe.wall
+    near, far = (np.hypot(offset + side * span, wall) for side in (-0.5, 0.5))
+    pole = (1.0 / near - 1.0 / far) / span
+    ring = MU0_OVER_4PI * (pole[1:] - pole[:-1]) / pipe.span
+    if finer == 1:
+        return np.asarray(ring)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    return np.asarray(ring @ _curve(count, pipe.span, tuple(middle.tolist())))
+
+
+@cache
+def _curve(count: int, span: float, place: tuple[float, ...]) -> Array:
+    """Return the curve through values at segments at places, over each value (places, n)."""
+    centres = span * (np.arange(count) + 0.5)
+    inside = np.clip(place, centres[0], centres[-1])
+    return np.asarray(CubicSpline(centres, np.eye(count))(inside))
 
 
 def inside_world(pipe: Pipe, outside_world: AnyArray, frequency_hz: float) -> ComplexArray:

@@ -36,6 +36,8 @@ class Shaft:
         Of correlation (s).
     slip : float
         Amplitude of the angle's error twice a turn, as of a joint that is bent (rad).
+    slip_phase : float
+        (rad)
     whirl : float
         By which the shaft's axis circles against its turning (rad).
     length : float
@@ -48,6 +50,7 @@ class Shaft:
     drift_hz: float = 0.05
     drift_time: float = 20.0
     slip: float = 0.0
+    slip_phase: float = 0.0
     whirl: float = 0.0
     length: float = 0.3
     encoder_sigma: float = 2e-3
@@ -103,7 +106,7 @@ def turned_moment(rotor: Rotor, shaft: Shaft, angle: Array) -> Array:
     """Return the moment at angles of the shaft, rotor axes, shape (n, 3) (A m^2)."""
     axis, zero = rotor.axis_beacon, rotor.zero_beacon
     across = np.cross(axis, zero)
-    true = (angle + shaft.slip * np.sin(2.0 * angle))[:, None]
+    true = (angle + shaft.slip * np.sin(2.0 * angle + shaft.slip_phase))[:, None]
     moment = np.cos(rotor.tilt) * (zero * np.cos(true) + across * np.sin(true))
     moment = rotor.moment * (moment + np.sin(rotor.tilt) * axis)
     # Backward whirl: the shaft leans by a small angle about a direction that circles against it.
@@ -194,6 +197,35 @@ def simulate_passes(
     )
 
 
+def passing_phasor(
+    site: Site, shaft: Shaft, own: Pass, around: Surroundings, depth: Array
+) -> ComplexArray:
+    """Return the phasor of once a turn at the sensor, world axes, shape (n, 3) (T).
+
+    Parameters
+    ----------
+    depth : ndarray, shape (n,)
+        Of the magnet (m).
+    """
+    rotor = site.beacons[0].rotor
+    assert rotor is not None
+    axis_world, share = own.world_from_rotor @ rotor.axis_beacon, _parts(rotor, shaft)[1]
+    magnet_world = own.start_world + (depth - own.depth[0])[:, None] * axis_world
+    moment_world = own.world_from_rotor @ share
+    out = np.zeros((len(depth), 3), dtype=np.complex128)
+    for along in _stack(shaft):
+        offset = own.sensor_world - magnet_world - along * axis_world
+        each = [dipole_field(offset, part) for part in (moment_world.real, moment_world.imag)]
+        out += (each[0] + 1j * each[1]) / len(_stack(shaft))
+    added = _added(site.beacons[0].frequency_hz, share, rotor, own, around, depth, _stack(shaft))
+    return out if added is None else out + added
+
+
+def _stack(shaft: Shaft) -> Array:
+    """Return where the parts of the stack are along the shaft (m)."""
+    return np.asarray(shaft.length * (np.arange(4) - 1.5) / 4.0)
+
+
 def _measured(
     site: Site,
     shaft: Shaft,
@@ -210,12 +242,13 @@ def _measured(
     magnet_world = own.start_world + (depth - own.depth[0])[:, None] * axis_world
     moment_world = turned_moment(rotor, shaft, angle) @ own.world_from_rotor.T
     field_world = np.zeros_like(magnet_world)
-    stack = shaft.length * (np.arange(4) - 1.5) / 4.0
+    stack = _stack(shaft)
     for along in stack:
         offset = own.sensor_world - magnet_world - along * axis_world
         field_world += dipole_field(offset, moment_world / len(stack))
     for order, share in _parts(rotor, shaft).items():
-        added = _added(site.beacons[0].frequency_hz * order, share, rotor, own, around, depth)
+        tone_hz = site.beacons[0].frequency_hz * order
+        added = _added(tone_hz, share, rotor, own, around, depth, stack)
         if added is not None:
             field_world += np.real(added * np.exp(1j * order * angle)[:, None])
     if site.earth_field_world is not None:
@@ -247,6 +280,7 @@ def _added(
     own: Pass,
     around: Surroundings,
     depth: Array,
+    stack: Array,
 ) -> ComplexArray | None:
     """Return the phasor that layers and steel add at each sample, shape (n, 3) (T).
 
@@ -260,7 +294,7 @@ def _added(
     axis_world = own.world_from_rotor @ rotor.axis_beacon
     travel = (own.sensor_world - own.start_world) @ axis_world
     nearest = float(np.linalg.norm(own.sensor_world - own.start_world - travel * axis_world))
-    low, high = float(np.min(depth)), float(np.max(depth))
+    low, high = float(np.min(depth) + np.min(stack)), float(np.max(depth) + np.max(stack))
     count = int(np.ceil((high - low) / (NODES_APART * max(nearest, 1.0)))) + 8
     nodes = np.linspace(low, high, count)
     at_world = own.start_world + (nodes - own.depth[0])[:, None] * axis_world
@@ -276,7 +310,8 @@ def _added(
         seen = around.steel.seen_world(*flat, own.sensor_world, frequency_hz)
         seen = seen.reshape(plain.shape)
     out = np.einsum("k,nka->na", share, seen - plain)
-    return np.asarray(CubicSpline(nodes, out)(depth))
+    course = CubicSpline(nodes, out)
+    return np.asarray(np.mean([course(depth + along) for along in stack], axis=0))
 
 
 def _ground(

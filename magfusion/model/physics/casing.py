@@ -1,18 +1,22 @@
-"""What a steel tube about a sensor lets through of fields that alternate.
+"""What a steel tube about a sensor lets through of fields that alternate, and gathers.
 
-Source: H. Kaden, Wirbelstroeme und Schirmung in der Nachrichtentechnik, 2nd ed. (1959), of a long
-tube whose wall is thin against its radius, in a field that is uniform about it; in English e.g. in
-S. Celozzi, R. Araneo and G. Lovat, Electromagnetic Shielding (2008).
+What comes through is after H. Kaden, Wirbelstroeme und Schirmung in der Nachrichtentechnik, 2nd ed.
+(1959), of a long tube whose wall is thin against its radius, in a field that is uniform about it;
+in English e.g. in S. Celozzi, R. Araneo and G. Lovat, Electromagnetic Shielding (2008).
 """
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial.legendre import leggauss
+from scipy.special import k0
 
-from magfusion.units import MU0_OVER_4PI
+from magfusion.units import MU0_OVER_4PI, Array, ComplexArray
 
-LENGTH = 10.0  # m; over which fields between two wells change, about
+STEEL = ("wall", "permeability", "conductivity")
+MOST = 2.0  # by which a logarithm may be wrong; beyond, a search is lost
+WAVES = 128  # wave numbers that the response along a tube is summed over
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,14 @@ class Casing:
     conductivity: float = 5e6
     log_gain_sigma: float = 0.3
     phase_sigma: float = 0.3
+    wall_sigma: float = 0.0
+    permeability_sigma: float = 0.0
+    conductivity_sigma: float = 0.0
+
+    @property
+    def steel_sigma(self) -> Array:
+        """Of the logarithms of `STEEL`, shape (3,)."""
+        return np.array([self.wall_sigma, self.permeability_sigma, self.conductivity_sigma])
 
 
 class Transmission(NamedTuple):
@@ -49,34 +61,95 @@ class Transmission(NamedTuple):
     along: complex
 
 
-def tube_transmission(casing: Casing, frequency_hz: float) -> Transmission:
-    """Return what comes through a tube's wall.
+class Response(NamedTuple):
+    """What tubes do, each with its own change of the steel.
+
+    ``strength`` is the cross section of the wall times its permeability as the field enters it
+    from both sides, less one, over 2 pi (m^2).  ``by_steel`` has the derivatives of the logarithms
+    of across, along and strength by those of `STEEL`.
+    """
+
+    across: ComplexArray  # (k,)
+    along: ComplexArray  # (k,)
+    strength: ComplexArray  # (k,)
+    by_steel: ComplexArray  # (3, k, 3)
+
+
+def tube_response(casing: Casing, frequency_hz: float, change: Array) -> Response:
+    """Return what a tube lets through and gathers.
 
     With ``g = (1 + j) / skin depth`` and ``K = g radius / permeability``: along
     ``1 / (cosh g d + K sinh(g d) / 2)``, across ``1 / (cosh g d + (K + 1 / K) sinh(g d) / 2)``,
     d the wall; of a steady field across ``1 / (1 + permeability d / (2 radius))``.
+
+    Parameters
+    ----------
+    change : ndarray, shape (k, 3)
+        Of the logarithms of `STEEL`.
     """
-    mu = 4.0 * np.pi * MU0_OVER_4PI * casing.permeability
-    decay = np.sqrt(2j * np.pi * frequency_hz * mu * casing.conductivity)
-    through = decay * casing.wall
-    ratio = decay * casing.radius / casing.permeability
-    along = np.cosh(through) + 0.5 * ratio * np.sinh(through)
-    across = along + 0.5 * np.sinh(through) / ratio
-    return Transmission(complex(1.0 / across), complex(1.0 / along))
+    wall, permeability, conductivity = (
+        np.exp(np.clip(change, -MOST, MOST))
+        * [casing.wall, casing.permeability, casing.conductivity]
+    ).T
+    mu = 4.0 * np.pi * MU0_OVER_4PI * permeability
+    decay = np.sqrt(2j * np.pi * frequency_hz * mu * conductivity)
+    through, ratio = decay * wall, decay * casing.radius / permeability
+    by_through, by_ratio = np.array([1.0, 0.5, 0.5]), np.array([0.0, -0.5, 0.5])
+    cosh, sinh = np.cosh(through), np.sinh(through)
+    along = cosh + 0.5 * ratio * sinh
+    across = along + 0.5 * sinh / ratio
+    along_by = ((sinh + 0.5 * ratio * cosh) * through)[:, None] * by_through
+    along_by = along_by + (0.5 * ratio * sinh)[:, None] * by_ratio
+    across_by = along_by + (0.5 * cosh * through / ratio)[:, None] * by_through
+    across_by = across_by - (0.5 * sinh / ratio)[:, None] * by_ratio
+    enters = np.tanh(0.5 * through) / (0.5 * through)
+    slope = 1.0 / np.cosh(0.5 * through) ** 2 - enters
+    sides, sides_by = 0.5 * (1.0 + 1.0 / along), -0.5 * along_by / along[:, None] ** 2
+    drawn = permeability * enters * sides
+    drawn_by = (permeability * slope * sides)[:, None] * by_through
+    drawn_by = drawn_by + drawn[:, None] * np.array([0.0, 1.0, 0.0])
+    drawn_by = drawn_by + (permeability * enters)[:, None] * sides_by
+    by_steel = np.stack(
+        [
+            -across_by / across[:, None],
+            -along_by / along[:, None],
+            np.array([1.0, 0.0, 0.0]) + drawn_by / (drawn - 1.0)[:, None],
+        ]
+    )
+    return Response(1.0 / across, 1.0 / along, casing.radius * wall * (drawn - 1.0), by_steel)
 
 
-def tube_gathering(casing: Casing, frequency_hz: float, length: float = LENGTH) -> complex:
-    """Return by how much of its second derivative the field along a tube grows inside (m^2).
+def tube_transmission(casing: Casing, frequency_hz: float) -> Transmission:
+    """Return what comes through a tube's wall, of its steel as it is declared."""
+    whole = tube_response(casing, frequency_hz, np.zeros((1, 3)))
+    return Transmission(complex(whole.across[0]), complex(whole.along[0]))
 
-    The wall, magnetised along by a field that changes along it, has poles where it does: to first
-    order ``steel (wall - 1) (log(2 length / radius) - 1) / 2 pi`` times that derivative, steel the
-    cross section, wall the permeability as the field enters the wall from both sides, length that
-    over which the field changes, of which only the logarithm matters.
+
+def gathering_weights(
+    strength: ComplexArray, radius: float, place: Array
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return what a long tube adds along its axis, as a sum over the field outside it.
+
+    A wall that is magnetised along has poles where that changes, whose field magnetises it again.
+    Of a wave of number q along the tube a ring of poles answers ``-N / (1 + N)``, with
+    ``N = strength q^2 K0(q radius)``: to all orders, for a tube has no place that is not like
+    another.  Places must be closer than the field changes: a dipole's at a distance d has no waves
+    shorter than about d.
+
+    Parameters
+    ----------
+    strength : complex ndarray, shape (k,)
+        Of `Response` (m^2).
+    place : ndarray, shape (m,)
+        Evenly along the tube, from where the field is seen (m).
+
+    Returns
+    -------
+    weights, by_log_strength : complex ndarray, shape (k, m)
     """
-    mu = 4.0 * np.pi * MU0_OVER_4PI * casing.permeability
-    half = 0.5 * np.sqrt(2j * np.pi * frequency_hz * mu * casing.conductivity) * casing.wall
-    enters = np.tanh(half) / half if frequency_hz else 1.0
-    sides = 0.5 * (1.0 + tube_transmission(casing, frequency_hz).along)
-    steel = 2.0 * np.pi * casing.radius * casing.wall
-    gathered = steel * (casing.permeability * enters * sides - 1.0)
-    return complex(gathered * (np.log(2.0 * length / casing.radius) - 1.0) / (2.0 * np.pi))
+    apart = float(place[1] - place[0])
+    node, share = leggauss(WAVES)
+    number = 0.5 * np.pi / apart * (1.0 + node)
+    wave = 0.5 * share * np.cos(np.outer(place, number))  # (m, waves)
+    poles = strength[:, None] * number**2 * k0(number * radius)
+    return (-poles / (1.0 + poles)) @ wave.T, (-poles / (1.0 + poles) ** 2) @ wave.T

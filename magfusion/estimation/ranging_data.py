@@ -1,0 +1,88 @@
+"""What a sensor at rest measured of a magnet that turned and went by, in windows."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.model.samples import FieldSamples
+from magfusion.units import Array
+
+# Gauss and Legendre's points of a window, over its length from its middle: it is moved through.
+WITHIN, SHARE = np.sqrt(0.6) * np.array([-0.5, 0.0, 0.5]), np.array([5.0, 8.0, 5.0]) / 18.0
+FIRST = np.array([1.0, 0.0, 0.0])  # axis of the sensor's body, down its hole
+POSE = 6
+BESIDE = 1.0  # m; between places of the sensor that are one
+
+
+@dataclass(frozen=True, eq=False)
+class RangingWindows:
+    """What was measured while a magnet went by.
+
+    Parameters
+    ----------
+    fields : FieldSamples
+        Of one rotor, by its angle.
+    angle_known : bool
+        Whether that was measured; otherwise each window has a phase of its own.
+    magnet : ndarray, shape (n, 3)
+        Depth of the magnet at the points `WITHIN` each window (m), from ``magnet_from``.
+    sensor : ndarray, shape (n,)
+        Depth of the sensor (m), from ``sensor_from``.
+    roll : ndarray, shape (n,)
+        Of the sensor about its hole, from its high side (rad).
+    depth_sigma : float
+        Of a window's depth, each by itself (m).
+    depth_scale_sigma : float
+        Of all, relative.
+    """
+
+    fields: FieldSamples
+    angle_known: bool
+    magnet: Array
+    sensor: Array
+    roll: Array
+    magnet_from: float
+    sensor_from: float
+    depth_sigma: float = 0.0
+    depth_scale_sigma: float = 1e-3
+
+    def rows(self, kept: slice) -> "RangingWindows":
+        """Return some windows."""
+        return replace(
+            self,
+            fields=self.fields.rows(kept),
+            magnet=self.magnet[kept],
+            sensor=self.sensor[kept],
+            roll=self.roll[kept],
+        )
+
+    def spread(self, length: float) -> "RangingWindows":
+        """Return the same of a magnet that is so long (m): it is where it goes, and beside.
+
+        What a window sees of a way and of a length along it is the mean over both, by the sum of
+        their second moments.
+        """
+        half = 0.5 * (self.magnet[:, 2] - self.magnet[:, 0])
+        wider = np.hypot(half, WITHIN[2] * length) - np.abs(half)
+        aside = np.where(half < 0.0, -wider, wider)[:, None] * np.sign(WITHIN)
+        return replace(self, magnet=self.magnet + aside) if length else self
+
+    @property
+    def seen(self) -> Array:
+        """Size of each phasor, zero where it is not valid, shape (n, tones) (T)."""
+        size = np.linalg.norm(self.fields.phasor_sensor, axis=-1)
+        return np.where(self.fields.valid, size, 0.0)
+
+    @property
+    def reach(self) -> Array:
+        """How far the magnet moves while it is heard at half its strength, shape (tones,) (m).
+
+        In one pass; of a dipole that is about twice the distance.
+        """
+        size, out = self.seen, []
+        for own in size.T:
+            strongest = int(np.argmax(own))
+            beside = np.abs(self.sensor - self.sensor[strongest]) < BESIDE
+            heard = self.magnet[beside & (own > 0.5 * own[strongest]), 1]
+            out.append(max(float(np.ptp(heard)) if len(heard) else 0.0, 0.1))
+        return np.array(out)
