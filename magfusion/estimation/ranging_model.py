@@ -81,7 +81,11 @@ class RangingModel:
     def _course(self, state: Array) -> Course:
         phasor, by = self.predicted(state[None])
         way = -state[:9].reshape(3, 3).T @ self.axis  # of the sensor from the magnet, side's axes
-        return Course(phasor[0], by[0, ..., 3:POSE] @ way)
+        slope, gathered = by[0, ..., 3:POSE] @ way, np.zeros(phasor.shape[1:3])
+        if self.casing is not None:
+            column = by[0, ..., POSE + self.names.index("log_gather")]
+            gathered = np.linalg.norm(column, axis=-1) / np.linalg.norm(phasor[0], axis=-1)
+        return Course(phasor[0], slope, gathered)
 
     def predicted(self, state: Array) -> tuple[ComplexArray, ComplexArray]:
         """Return phasors (k, n, tones, 3) of states (k, 12 + unknowns), and their Jacobian."""

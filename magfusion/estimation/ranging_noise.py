@@ -13,6 +13,9 @@ from magfusion.estimation.ranging_data import RangingWindows
 from magfusion.model.site import Site
 from magfusion.units import Array, ComplexArray
 
+# Of what a casing gathers: joints, couplings and uneven steel make no tube without end.
+GATHERED_ERROR = 0.01
+
 
 @dataclass(frozen=True, eq=False)
 class Course:
@@ -22,10 +25,13 @@ class Course:
     ----------
     phasor, slope : complex ndarray, shape (n, tones, 3)
         (T) and (T/m).
+    gathered : ndarray, shape (n, tones)
+        Share of the field that goes with the strength of a casing's poles.
     """
 
     phasor: ComplexArray
     slope: ComplexArray
+    gathered: Array
 
 
 def apart(phasor: ComplexArray) -> Array:
@@ -63,7 +69,10 @@ def whitening(site: Site, windows: RangingWindows, course: Course | None = None)
         size = np.linalg.norm(course.phasor, axis=-1) / np.sqrt(2.0)
     alike = _alike(site, windows)
     for t in range(tones):
-        error = _model_error(site) ** 2 / 3.0 * alike * np.outer(size[:, t], size[:, t])
+        left = _model_error(site) * size[:, t]
+        if course is not None:
+            left = np.hypot(left, GATHERED_ERROR * course.gathered[:, t] * size[:, t])
+        error = alike * np.outer(left, left) / 3.0
         for part in range(6):
             cov[:, t, part, :, t, part] = error
         for own in (slice(0, 3), slice(3, 6)):
