@@ -24,6 +24,7 @@ from magfusion.estimation.integrity.recovery import (
     Attempts,
     agreed_fix,
     at_fix,
+    corroborated,
     explains,
     prior_of,
     restarted,
@@ -307,6 +308,8 @@ class EpochUpdate:
         """Give the pose up that explains nothing any more, and start from a fix."""
         state = predicted.state
         if not self._attempts.due(state.time):
+            return False
+        if not corroborated(found.samples):
             return False
         fix = agreed_fix(found.samples, state.calibration)
         if fix is None or not fix.fixes.determined[0, 0]:

@@ -139,6 +139,16 @@ def explains(fix: AgreedFix, samples: FieldSamples, calibration: Calibration) ->
     return bool(np.sqrt(np.mean(share**2)) < EXPLAINED)
 
 
+def corroborated(samples: FieldSamples) -> bool:
+    """Tell whether an epoch has more than one beacon to begin at again, where the site has more.
+
+    A state is lost because a beacon contradicts it: alone, that may be the Earth's field in a turn.
+    """
+    beacons = {name for name, _ in samples.channels}
+    heard = {name for (name, _), on in zip(samples.channels, samples.valid[0], strict=True) if on}
+    return len(heard) > 1 or len(beacons) == 1
+
+
 def agreed_fix(
     samples: FieldSamples, calibration: Calibration, prior: Trajectory | None = None
 ) -> AgreedFix | None:
