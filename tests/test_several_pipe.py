@@ -112,9 +112,10 @@ def test_one_that_is_late_changes_no_state(
     assert len(found) == len(expected)
     for one, other in zip(found, expected, strict=True):
         assert abs(one["time"] - other["time"]) < 1e-9
-        np.testing.assert_allclose(one["position"], other["position"], rtol=0.0, atol=1e-9)
+        # The start's passes end at a share of a sigma: what rounding makes of that is below 0.1 um.
+        np.testing.assert_allclose(one["position"], other["position"], rtol=0.0, atol=1e-7)
         np.testing.assert_allclose(
-            one["sigma"]["position"], other["sigma"]["position"], rtol=1e-6, atol=0.0
+            one["sigma"]["position"], other["sigma"]["position"], rtol=1e-5, atol=0.0
         )
 
 

@@ -233,4 +233,4 @@ def likeliest(
         return slope
 
     limits = np.log(np.stack([least, np.full(len(parts), MOST)], axis=1))
-    return minimise_bounded(cost, start, limits, steps=100, decrease=1e-9, gradient=gradient)
+    return minimise_bounded(cost, start, limits, steps=200, decrease=1e-14, gradient=gradient)

@@ -83,6 +83,7 @@ class OnlineWitness:
     _elsewhere_times: int
     _began: float
     _beginning: Judgement
+    _borrowed: dict[str, Array]
     _prior_at: float
     _prior: Judgement
 
@@ -96,7 +97,7 @@ class OnlineWitness:
         self._began, self._prior_at, self._prior = 0.0, -np.inf, Judgement()
         self._beginning = Judgement()
         self._declared: Calibration | None = None
-        self._borrowed: Mapping[str, Array] = {}
+        self._borrowed = {}
 
     # What is heard
 
@@ -108,7 +109,7 @@ class OnlineWitness:
         borrowed : mapping of str to ndarray
             Variance that estimated parameters have of what was only considered.
         """
-        self._began, self._beginning, self._borrowed = time, said, borrowed
+        self._began, self._beginning, self._borrowed = time, said, dict(borrowed)
 
     def hear(self, state: State, gate: Gate, heard: Heard) -> None:
         """Take in an epoch: the state after it, and what its gate said."""
