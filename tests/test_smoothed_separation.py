@@ -7,10 +7,8 @@ import pytest
 from scipy.stats import binom
 from small_problem import SIGMA, SmallLog
 
-from magfusion.estimation import considered, factors
+from magfusion.estimation import chain_system, considered, factors, marginals
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.graph import marginals
-from magfusion.estimation.integrity import smoothed_separation
 from magfusion.estimation.integrity.separation import protection_levels
 from magfusion.estimation.integrity.smoothed_exclusion import SLACK, separated_smooth
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
@@ -147,15 +145,19 @@ def test_the_sweep_agrees_with_the_graph_and_with_a_log_without_the_beacon() -> 
         )
 
 
+def _marginals(result: Smoothed) -> tuple[Array, Array, Array]:
+    return marginals.marginals(result.graph, result.estimate, result.uncertain)
+
+
 def test_piece_by_piece_a_log_is_separated_as_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     result = _smoothed(_walk(1))
-    known = separate_smoothed(result), marginals(result.graph, result.estimate, result.uncertain)
-    for module in (factors, smoothed_separation):
+    known = separate_smoothed(result), _marginals(result)
+    for module in (factors, chain_system):
         monkeypatch.setattr(module, "PIECE", 7)
-    monkeypatch.setattr(smoothed_separation, "AT_ONCE", 1.0)  # one beacon at once
-    monkeypatch.setattr(smoothed_separation, "KEPT", 1.0)
+    monkeypatch.setattr(chain_system, "AT_ONCE", 1.0)  # one beacon at once, nothing kept
+    monkeypatch.setattr(chain_system, "KEPT", 1.0)
     monkeypatch.setattr(considered, "AT_ONCE", 1.0)  # and one parameter that is held
-    found = separate_smoothed(result), marginals(result.graph, result.estimate, result.uncertain)
+    found = separate_smoothed(result), _marginals(result)
     assert known[0] is not None
     assert found[0] is not None
     for name, value in vars(known[0]).items():
@@ -238,3 +240,15 @@ def test_clean_logs_have_alarms_no_more_often_than_promised() -> None:
         beyond += bool(np.any(error > level_m))
     assert alarmed <= binom.isf(1e-3, logs, 0.02)
     assert beyond == 0
+
+
+def test_the_chain_gives_the_covariance_of_the_tree(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = _smoothed(_walk(1))
+    chain = _marginals(result)
+    monkeypatch.setattr(marginals, "AGREED", 0.0)  # so that the tree is asked for all
+    tree = _marginals(result)
+    sigma = np.sqrt(np.einsum("nii->ni", tree[0]))
+    apart = np.abs(chain[0] - tree[0]) / (sigma[:, :, None] * sigma[:, None])
+    assert 0.0 < np.max(apart) < 1e-9
+    for one, other in zip(chain[1:], tree[1:], strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9 * float(np.max(np.abs(other))))

@@ -19,9 +19,9 @@ from magfusion.estimation.graph import (
     Estimate,
     Graph,
     initial_estimate,
-    marginals,
     read_states,
 )
+from magfusion.estimation.marginals import marginals
 from magfusion.estimation.measurements.measurement import robust_weight
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.solve.bordered import optimise

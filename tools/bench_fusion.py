@@ -36,9 +36,9 @@ from magfusion.estimation.graph import (
     Estimate,
     Graph,
     initial_estimate,
-    marginals,
 )
 from magfusion.estimation.inertial import inertial_graph
+from magfusion.estimation.marginals import marginals
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.preintegration import cut_at_epochs, preintegrate
 from magfusion.estimation.solve.bordered import Optimised, optimise

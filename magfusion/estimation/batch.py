@@ -8,11 +8,12 @@ from gtsam.symbol_shorthand import V
 
 from magfusion.errors import InputError
 from magfusion.estimation.convergence import last_move, refuse_open, settled_at
-from magfusion.estimation.graph import Estimate, Graph, initial_estimate, marginals, read_states
+from magfusion.estimation.graph import Estimate, Graph, initial_estimate, read_states
 from magfusion.estimation.hearing import heard_site
 from magfusion.estimation.initialization.chain import Start
 from magfusion.estimation.integrity.mending import mended
 from magfusion.estimation.log_graph import PreparedLog, graph_of
+from magfusion.estimation.marginals import marginals
 from magfusion.estimation.measurements.earth import EarthField, check_earth, disturbed
 from magfusion.estimation.measurements.field_error import field_errors
 from magfusion.estimation.measurements.measurement import Measurement

@@ -20,7 +20,6 @@ from magfusion.estimation.factors import (
 from magfusion.estimation.inertial import ROWS, Link
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.prior_factor import PriorShift, prior_factor
-from magfusion.estimation.solve.bordered import eliminate, last_marginal
 from magfusion.estimation.solve.ordering import nested_dissection
 from magfusion.estimation.state import states_in
 from magfusion.model.parameters import (
@@ -334,42 +333,3 @@ def read_states(values: gtsam.Values, time: Array) -> Trajectory:
         accel_bias_body=biases[:, :3],
         gyro_bias_body=biases[:, 3:],
     )
-
-
-def marginals(
-    graph: Graph, estimate: Estimate, considered: tuple[Block, ...] = ()
-) -> tuple[Array, Array, Array]:
-    """Return the posterior covariance of every pose and of the calibration.
-
-    Parameters
-    ----------
-    considered : tuple of Block
-        Uncertain parameters that were not estimated: what their errors do to the estimate is added
-        (a consider covariance).
-
-    Returns
-    -------
-    pose_cov : ndarray, shape (n, 6, 6)
-        Calibration marginalised, its gauge included.
-    calibration_cov : ndarray, shape (dimension, dimension)
-    calibration_response : ndarray, shape (dimension, considered)
-        What one sigma of what is considered does to the calibration: its part of that covariance.
-    """
-    linear, ordering = graph.linearized(estimate), graph.ordering
-    tree = eliminate(linear, ordering)
-    poses = np.array([tree.marginalCovariance(X(i)) for i in range(graph.epochs)])
-    calibration = last_marginal(tree, linear, ordering) if graph.blocks else np.zeros((0, 0))
-    response = np.zeros((len(calibration), 0))
-    del tree, linear  # of a long log they are as much again as what follows
-    if considered and graph.measurements:
-        keys, by_pose, by_calibration = [X(i) for i in range(graph.epochs)], [], []
-        for step in graph.responses(estimate, considered):
-            by_pose.append(step.vector(keys).reshape(-1, 6))
-            if graph.blocks:
-                by_calibration.append(step.at(CALIBRATION_KEY))
-        every = np.array(by_pose)
-        poses += np.einsum("hni,hnj->nij", every, every)
-        if graph.blocks:
-            response = np.array(by_calibration).T
-            calibration += response @ response.T
-    return poses, calibration, response

@@ -1,157 +1,19 @@
 """The smoothed trajectory without each beacon: alarms and protection levels by state."""
 
-from collections import defaultdict
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from itertools import islice
-from typing import NamedTuple
-
-import gtsam
 import numpy as np
 
+from magfusion.estimation import chain_system as chains
 from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.chain_system import FieldRows, Normal, chain_system
 from magfusion.estimation.convergence import OPEN_ROTATION
-from magfusion.estimation.factors import CALIBRATION_KEY, CONSIDERED_KEY, PIECE, Factors
-from magfusion.estimation.graph import Estimate, Graph
 from magfusion.estimation.integrity.separation import Separation
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.solve.chain import Chain, ChainSolution, solve_chain
-from magfusion.estimation.state import MOTION, states_in
-from magfusion.model.parameters import Block, difference, dimension
-from magfusion.model.prior import prior_sqrt_covariance, prior_sqrt_information
-from magfusion.units import Array, BoolArray, IntArray
+from magfusion.estimation.solve.chain import ChainSolution, solve_chain
+from magfusion.units import Array, BoolArray
 
-AT_ONCE = 2e8  # bytes; variants are solved in groups of so much
-KEPT = 1e8  # bytes of rows; what is more is made anew for every group
 # A prior that keeps what is open finite: far wider than anything that is of use.
 OPEN = np.repeat([30.0, 300.0, 300.0, 30.0, 3.0], 3)  # rad, m, m/s, m/s^2, rad/s
-_FIRST, _WIDTH = {"x": 0, "v": 6, "b": 9}, {"x": 6, "v": 3, "b": 6}  # in a state's tangent vector
-
-
-class _Normal:
-    """Normal equations of a chain that grow by rows.
-
-    The right sides are the step, then what one sigma of each considered parameter does.
-    """
-
-    def __init__(self, states: int, calibration: int, considered: int) -> None:
-        self.diagonal = np.zeros((states, MOTION, MOTION))
-        self.following = np.zeros((max(states - 1, 0), MOTION, MOTION))
-        self.sides = np.zeros((states, MOTION, 1 + considered + calibration))
-        self.corner = np.zeros((calibration, calibration))
-        self.right_border = np.zeros((calibration, 1 + considered))
-
-    @property
-    def right(self) -> Array:
-        """Right sides, shape (states, 15, 1 + considered)."""
-        return self.sides[..., : self.right_border.shape[1]]
-
-    @property
-    def border(self) -> Array:
-        """By the calibration, shape (states, 15, calibration)."""
-        return self.sides[..., self.right_border.shape[1] :]
-
-    def variants(self, count: int) -> tuple[Chain, list["_Normal"]]:
-        """Return so many copies as one chain, and each of them to add rows of fields to."""
-        copies = {
-            name: np.repeat(value[None], 1 if name == "following" else count, axis=0)
-            for name, value in vars(self).items()
-        }
-        own = []
-        for k in range(count):
-            one = object.__new__(_Normal)
-            for name, value in copies.items():
-                setattr(one, name, value[0 if name == "following" else k])
-            own.append(one)
-        return Chain.of_sides(**copies), own
-
-    def add(
-        self, epoch: IntArray, own: Array, after: Array | None, border: Array, right: Array
-    ) -> None:
-        """Add rows of some states, each at most once.
-
-        Parameters
-        ----------
-        epoch : int ndarray, shape (m,)
-        own, after : ndarray, shape (m, rows, 15)
-            By the state, and by the next.
-        border : ndarray, shape (m, rows, calibration)
-        right : ndarray, shape (m, rows, 1 + considered)
-        """
-        back = np.swapaxes(own, 1, 2)
-        self.diagonal[epoch] += back @ own
-        self.border[epoch] += back @ border
-        self.right[epoch] += back @ right
-        self.corner += np.einsum("mrc,mrd->cd", border, border, optimize=True)
-        self.right_border += np.einsum("mrc,mrd->cd", border, right, optimize=True)
-        if after is not None:
-            ahead = np.swapaxes(after, 1, 2)
-            self.diagonal[epoch + 1] += ahead @ after
-            self.following[epoch] += back @ after
-            self.border[epoch + 1] += ahead @ border
-            self.right[epoch + 1] += ahead @ right
-
-
-class _Piece(NamedTuple):
-    """Rows of some epochs, shape (m, groups, components, k), weighed as they were last."""
-
-    epoch: IntArray
-    by_state: Array
-    by_calibration: Array
-    right: Array
-
-    def added_to(self, normal: _Normal, kept: BoolArray | slice = slice(None)) -> None:
-        """Add the rows of some channels, shape (channels,)."""
-        flat = []
-        for part in (self.by_state, self.by_calibration, self.right):
-            own = part[:, kept]
-            flat.append(own.reshape(len(own), own.shape[1] * own.shape[2], own.shape[3]))
-        # A measurement may have several rows of one state.
-        for once in _each_once(self.epoch):
-            normal.add(self.epoch[once], flat[0][once], None, flat[1][once], flat[2][once])
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """The rows of a measurement, made piece by piece: those of a log of hours take much memory.
-
-    Parameters
-    ----------
-    spread : ndarray, shape (dimension, considered)
-        What makes a step of what is considered out of unit noise.
-    """
-
-    factors: Factors
-    estimate: Estimate
-    considered: tuple[Block, ...]
-    spread: Array
-    known: list[_Piece] = field(default_factory=list)
-
-    def pieces(self) -> Iterator[_Piece]:
-        """Yield all rows; the first of them are kept for the next time."""
-        yield from self.known
-        size, states = sum(_size(one) for one in self.known), states_in(self.estimate.values)
-        calibration = self.estimate.calibration
-        for factors in islice(self.factors.pieces(), len(self.known), None):
-            found = factors.rows(states, calibration, factors.blocks)
-            jacobian = found.jacobian(dimension(factors.blocks))
-            right = np.zeros((*found.error.shape, 1 + len(self.spread)))
-            right[..., 0] = -found.error
-            if len(self.spread):
-                by_other = factors.rows(states, calibration, self.considered).by_calibration
-                if by_other is not None:
-                    right[..., 1:] = -by_other @ self.spread
-            by_state, by_calibration = jacobian[..., :MOTION], jacobian[..., MOTION:]
-            piece = _Piece(factors.measurement.epoch, by_state, by_calibration, right)
-            size += _size(piece)
-            if size < KEPT:
-                self.known.append(piece)
-            yield piece
-
-
-def _size(piece: _Piece) -> int:
-    return piece.by_state.nbytes + piece.by_calibration.nbytes + piece.right.nbytes
 
 
 def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Separation | None:
@@ -173,7 +35,9 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
     site = result.declared.site
     owner = site.sensor if by_magnetometer else site.owner
     every = range(len(site.platform.magnetometers if by_magnetometer else site.beacons))
-    rest, rows = _linear(graph, result.estimate, result.uncertain)
+    rest, rows = chain_system(graph, result.estimate, result.uncertain)
+    assert rows is not None
+    rest.diagonal += np.diag(1.0 / OPEN**2)
     kept = np.array([owner >= 0, *(owner != j for j in every)])
     heard, square, count = np.zeros(len(owner), dtype=bool), np.zeros(len(owner)), 0
     for piece in rows.pieces():
@@ -202,7 +66,7 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
 
 
 def _without_each(
-    rest: _Normal, rows: _Rows, kept: BoolArray, square: Array
+    rest: Normal, rows: FieldRows, kept: BoolArray, square: Array
 ) -> tuple[tuple[Array, Array, Array], Array]:
     """Solve variants with some of the channels, shape (h, channels); and what they leave.
 
@@ -215,7 +79,7 @@ def _without_each(
         Sum of squares.
     """
     per_variant = 8.0 * 4.0 * (rest.diagonal.size + rest.border.size + rest.right.size)
-    group = max(1, int(AT_ONCE / per_variant))
+    group = max(1, int(chains.AT_ONCE / per_variant))
     steps, covs, aparts, costs = [], [], [], []
     whole: tuple[Array, Array] | None = None
     for first in range(0, len(kept), group):
@@ -236,95 +100,10 @@ def _without_each(
     return (np.array(steps), np.array(covs), np.array(aparts)), np.concatenate(costs)
 
 
-def _solved(rest: _Normal, rows: _Rows, some: BoolArray) -> ChainSolution:
+def _solved(rest: Normal, rows: FieldRows, some: BoolArray) -> ChainSolution:
     """Solve some variants at once."""
     chain, variants = rest.variants(len(some))
     for piece in rows.pieces():
         for normal, channels in zip(variants, some, strict=True):
             piece.added_to(normal, channels)
     return solve_chain(chain, 6)
-
-
-def _linear(
-    graph: Graph, estimate: Estimate, considered: tuple[Block, ...]
-) -> tuple[_Normal, _Rows]:
-    """Return the normal equations of all but the fields, and the rows of the fields."""
-    assert graph.declared is not None
-    size, others = dimension(graph.blocks), dimension(considered)
-    spread = prior_sqrt_covariance(graph.declared.site, considered) if others else np.zeros((0, 0))
-    normal = _Normal(graph.epochs, size, others)
-    normal.diagonal += np.diag(1.0 / OPEN**2)
-    if size:
-        whitening = prior_sqrt_information(graph.declared.site, graph.blocks)
-        step = difference(graph.declared, estimate.calibration, graph.blocks)
-        normal.corner += whitening.T @ whitening
-        normal.right_border[:, 0] -= whitening.T @ (whitening @ step)
-        if graph.shift is not None:
-            by = graph.shift.by_considered
-            normal.right_border[:, 1 : 1 + by.shape[1]] += whitening.T @ (whitening @ by)
-    for own in _native_rows(graph, estimate, spread, size):
-        normal.add(*own)
-    fields: _Rows | None = None
-    for factors in graph.factors:
-        rows = _Rows(factors, estimate, considered, spread)
-        if isinstance(factors.measurement, FieldPhasors):
-            fields = rows
-            continue
-        for piece in rows.pieces():
-            piece.added_to(normal)
-    assert fields is not None
-    return normal, fields
-
-
-def _each_once(epoch: IntArray) -> Iterator[IntArray]:
-    """Yield rows in groups in which no state comes twice."""
-    left = np.arange(len(epoch))
-    while len(left):
-        _, first = np.unique(epoch[left], return_index=True)
-        yield left[first]
-        left = np.delete(left, first)
-
-
-def _native_rows(
-    graph: Graph, estimate: Estimate, spread: Array, size: int
-) -> Iterator[tuple[IntArray, Array, Array | None, Array, Array]]:
-    """Yield the rows of inertial factors and priors of the motion, those alike together."""
-    linear = graph.inertial(estimate, graph.by_considered(spread) if len(spread) else None)
-    kinds: dict[tuple[tuple[str, int], ...], list[tuple[int, Array, Array]]] = defaultdict(list)
-    for i in range(linear.size()):
-        factor = linear.at(i)
-        assert isinstance(factor, gtsam.JacobianFactor)
-        symbols = [gtsam.Symbol(key) for key in list(factor.keys())]
-        names = [(chr(symbol.chr()), symbol.index()) for symbol in symbols]
-        first = min(index for name, index in names if name in _FIRST)
-        kind = tuple((name, index - first if name in _FIRST else 0) for name, index in names)
-        kinds[kind].append((first, factor.getA(), factor.getb()))
-    apart = {chr(gtsam.Symbol(CALIBRATION_KEY).chr()): size}
-    apart[chr(gtsam.Symbol(CONSIDERED_KEY).chr())] = len(spread)
-    for kind, found in (
-        (kind, every[begin : begin + PIECE])
-        for kind, every in kinds.items()
-        for begin in range(0, len(every), PIECE)
-    ):
-        jacobian = np.array([by for _, by, _ in found])
-        rows = jacobian.shape[:2]
-        own, after = np.zeros((*rows, MOTION)), np.zeros((*rows, MOTION))
-        border, right = np.zeros((*rows, size)), np.zeros((*rows, 1 + len(spread)))
-        right[..., 0] = np.array([b for _, _, b in found])
-        column = 0
-        for name, later in kind:
-            width = _WIDTH[name] if name in _WIDTH else apart[name]
-            part = jacobian[..., column : column + width]
-            column += width
-            if name in _FIRST:
-                target = own if later == 0 else after
-                target[..., _FIRST[name] : _FIRST[name] + width] = part
-            elif name == "c":
-                border[...] = part
-            else:
-                right[..., 1:] = -part
-        epoch = np.array([first for first, _, _ in found])
-        linked = any(later for _, later in kind)
-        for once in _each_once(epoch):
-            ahead = after[once] if linked else None
-            yield epoch[once], own[once], ahead, border[once], right[once]

@@ -54,6 +54,7 @@ class ChainSolution(NamedTuple):
     states: Array  # (h, n, k, r) of the first k of each state
     border: Array  # (h, c, r)
     cov: Array  # (h, n, k, k) of the same
+    border_cov: Array  # (h, c, c)
     explained: Array  # (h,) of the sum of squares, by the solution for the first right side
 
 
@@ -93,7 +94,7 @@ def solve_chain(chain: Chain, kept: int) -> ChainSolution:
     alone, by_border = solved[..., :count], solved[..., count:]
     explained = np.einsum("hns,hns->h", first, alone[..., 0])
     if not chain.corner.shape[1]:
-        return ChainSolution(alone[:, :, :kept], chain.right_border, own, explained)
+        return ChainSolution(alone[:, :, :kept], chain.right_border, own, chain.corner, explained)
     # What the states leave of the border.
     left = np.swapaxes(outer.reshape(len(outer), n * size, -1), 1, 2)
     taken = left @ solved.reshape(len(outer), n * size, -1)
@@ -105,7 +106,7 @@ def solve_chain(chain: Chain, kept: int) -> ChainSolution:
     # The border explains what the states leave of it.
     explained += np.einsum("hc,hc->h", rest[..., 0], border[..., 0])
     cov = own + part @ corner[:, None] @ np.swapaxes(part, -1, -2)
-    return ChainSolution(states, border, cov, explained)
+    return ChainSolution(states, border, cov, corner, explained)
 
 
 def _inverse(matrix: Array) -> Array:

@@ -1,0 +1,242 @@
+"""The linear system of a solved graph as normal equations of a chain of states with a border.
+
+GTSAM's elimination serves any graph; here all states of a log are one chain, so that the covariance
+of every state, and what else is asked of all of them, come of one sweep (`solve.chain`).
+"""
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from magfusion.estimation.factors import CALIBRATION_KEY, CONSIDERED_KEY, PIECE, Factors
+from magfusion.estimation.graph import Estimate, Graph
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.solve.chain import Chain
+from magfusion.estimation.state import MOTION, states_in
+from magfusion.model.parameters import Block, difference, dimension
+from magfusion.model.prior import prior_sqrt_covariance, prior_sqrt_information
+from magfusion.units import Array, BoolArray, IntArray
+
+AT_ONCE = 2e8  # bytes; variants are solved in groups of so much
+KEPT = 1e8  # bytes of rows; what is more is made anew for every group
+_FIRST, _WIDTH = {"x": 0, "v": 6, "b": 9}, {"x": 6, "v": 3, "b": 6}  # in a state's tangent vector
+
+
+class Normal:
+    """Normal equations of a chain that grow by rows.
+
+    The right sides are the step, then what one sigma of each considered parameter does.
+    """
+
+    def __init__(self, states: int, calibration: int, considered: int) -> None:
+        self.diagonal = np.zeros((states, MOTION, MOTION))
+        self.following = np.zeros((max(states - 1, 0), MOTION, MOTION))
+        self.sides = np.zeros((states, MOTION, 1 + considered + calibration))
+        self.corner = np.zeros((calibration, calibration))
+        self.right_border = np.zeros((calibration, 1 + considered))
+
+    @property
+    def right(self) -> Array:
+        """Right sides, shape (states, 15, 1 + considered)."""
+        return self.sides[..., : self.right_border.shape[1]]
+
+    @property
+    def border(self) -> Array:
+        """By the calibration, shape (states, 15, calibration)."""
+        return self.sides[..., self.right_border.shape[1] :]
+
+    def chain(self) -> Chain:
+        """Return the equations as a chain of one variant: solving it overwrites them."""
+        return Chain.of_sides(**{name: value[None] for name, value in vars(self).items()})
+
+    def variants(self, count: int) -> tuple[Chain, list["Normal"]]:
+        """Return so many copies as one chain, and each of them to add rows of fields to."""
+        copies = {
+            name: np.repeat(value[None], 1 if name == "following" else count, axis=0)
+            for name, value in vars(self).items()
+        }
+        own = []
+        for k in range(count):
+            one = object.__new__(Normal)
+            for name, value in copies.items():
+                setattr(one, name, value[0 if name == "following" else k])
+            own.append(one)
+        return Chain.of_sides(**copies), own
+
+    def add(
+        self, epoch: IntArray, own: Array, after: Array | None, border: Array, right: Array
+    ) -> None:
+        """Add rows of some states, each at most once.
+
+        Parameters
+        ----------
+        epoch : int ndarray, shape (m,)
+        own, after : ndarray, shape (m, rows, 15)
+            By the state, and by the next.
+        border : ndarray, shape (m, rows, calibration)
+        right : ndarray, shape (m, rows, 1 + considered)
+        """
+        back = np.swapaxes(own, 1, 2)
+        self.diagonal[epoch] += back @ own
+        self.border[epoch] += back @ border
+        self.right[epoch] += back @ right
+        self.corner += np.einsum("mrc,mrd->cd", border, border, optimize=True)
+        self.right_border += np.einsum("mrc,mrd->cd", border, right, optimize=True)
+        if after is not None:
+            ahead = np.swapaxes(after, 1, 2)
+            self.diagonal[epoch + 1] += ahead @ after
+            self.following[epoch] += back @ after
+            self.border[epoch + 1] += ahead @ border
+            self.right[epoch + 1] += ahead @ right
+
+
+class Piece(NamedTuple):
+    """Rows of some epochs, shape (m, groups, components, k), weighed as they were last."""
+
+    epoch: IntArray
+    by_state: Array
+    by_calibration: Array
+    right: Array
+
+    def added_to(self, normal: Normal, kept: BoolArray | slice = slice(None)) -> None:
+        """Add the rows of some channels, shape (channels,)."""
+        flat = []
+        for part in (self.by_state, self.by_calibration, self.right):
+            own = part[:, kept]
+            flat.append(own.reshape(len(own), own.shape[1] * own.shape[2], own.shape[3]))
+        # A measurement may have several rows of one state.
+        for once in _each_once(self.epoch):
+            normal.add(self.epoch[once], flat[0][once], None, flat[1][once], flat[2][once])
+
+
+@dataclass(frozen=True, eq=False)
+class FieldRows:
+    """The rows of a measurement, made piece by piece: those of a log of hours take much memory.
+
+    Parameters
+    ----------
+    spread : ndarray, shape (dimension, considered)
+        What makes a step of what is considered out of unit noise.
+    """
+
+    factors: Factors
+    estimate: Estimate
+    considered: tuple[Block, ...]
+    spread: Array
+    known: list[Piece] = field(default_factory=list)
+
+    def pieces(self) -> Iterator[Piece]:
+        """Yield all rows; the first of them are kept for the next time."""
+        yield from self.known
+        size, states = sum(_size(one) for one in self.known), states_in(self.estimate.values)
+        calibration = self.estimate.calibration
+        for factors in islice(self.factors.pieces(), len(self.known), None):
+            found = factors.rows(states, calibration, factors.blocks)
+            jacobian = found.jacobian(dimension(factors.blocks))
+            right = np.zeros((*found.error.shape, 1 + len(self.spread)))
+            right[..., 0] = -found.error
+            if len(self.spread):
+                by_other = factors.rows(states, calibration, self.considered).by_calibration
+                if by_other is not None:
+                    right[..., 1:] = -by_other @ self.spread
+            by_state, by_calibration = jacobian[..., :MOTION], jacobian[..., MOTION:]
+            piece = Piece(factors.measurement.epoch, by_state, by_calibration, right)
+            size += _size(piece)
+            if size < KEPT:
+                self.known.append(piece)
+            yield piece
+
+
+def _size(piece: Piece) -> int:
+    return piece.by_state.nbytes + piece.by_calibration.nbytes + piece.right.nbytes
+
+
+def chain_system(
+    graph: Graph, estimate: Estimate, considered: tuple[Block, ...]
+) -> tuple[Normal, FieldRows | None]:
+    """Return the normal equations of all but the fields, and the rows of the fields.
+
+    Of a log that has one calibration all along, whose prior is in the graph.
+    """
+    assert graph.declared is not None
+    size, others = dimension(graph.blocks), dimension(considered)
+    spread = prior_sqrt_covariance(graph.declared.site, considered) if others else np.zeros((0, 0))
+    normal = Normal(graph.epochs, size, others)
+    if size:
+        whitening = prior_sqrt_information(graph.declared.site, graph.blocks)
+        step = difference(graph.declared, estimate.calibration, graph.blocks)
+        normal.corner += whitening.T @ whitening
+        normal.right_border[:, 0] -= whitening.T @ (whitening @ step)
+        if graph.shift is not None:
+            by = graph.shift.by_considered
+            normal.right_border[:, 1 : 1 + by.shape[1]] += whitening.T @ (whitening @ by)
+    for own in _native_rows(graph, estimate, spread, size):
+        normal.add(*own)
+    fields: FieldRows | None = None
+    for factors in graph.factors:
+        rows = FieldRows(factors, estimate, considered, spread)
+        if isinstance(factors.measurement, FieldPhasors):
+            fields = rows
+            continue
+        for piece in rows.pieces():
+            piece.added_to(normal)
+    return normal, fields
+
+
+def _each_once(epoch: IntArray) -> Iterator[IntArray]:
+    """Yield rows in groups in which no state comes twice."""
+    left = np.arange(len(epoch))
+    while len(left):
+        _, first = np.unique(epoch[left], return_index=True)
+        yield left[first]
+        left = np.delete(left, first)
+
+
+def _native_rows(
+    graph: Graph, estimate: Estimate, spread: Array, size: int
+) -> Iterator[tuple[IntArray, Array, Array | None, Array, Array]]:
+    """Yield the rows of inertial factors and priors of the motion, those alike together."""
+    linear = graph.inertial(estimate, graph.by_considered(spread) if len(spread) else None)
+    kinds: dict[tuple[tuple[str, int], ...], list[tuple[int, Array, Array]]] = defaultdict(list)
+    for i in range(linear.size()):
+        factor = linear.at(i)
+        assert isinstance(factor, gtsam.JacobianFactor)
+        symbols = [gtsam.Symbol(key) for key in list(factor.keys())]
+        names = [(chr(symbol.chr()), symbol.index()) for symbol in symbols]
+        first = min(index for name, index in names if name in _FIRST)
+        kind = tuple((name, index - first if name in _FIRST else 0) for name, index in names)
+        kinds[kind].append((first, factor.getA(), factor.getb()))
+    apart = {chr(gtsam.Symbol(CALIBRATION_KEY).chr()): size}
+    apart[chr(gtsam.Symbol(CONSIDERED_KEY).chr())] = len(spread)
+    for kind, found in (
+        (kind, every[begin : begin + PIECE])
+        for kind, every in kinds.items()
+        for begin in range(0, len(every), PIECE)
+    ):
+        jacobian = np.array([by for _, by, _ in found])
+        rows = jacobian.shape[:2]
+        own, after = np.zeros((*rows, MOTION)), np.zeros((*rows, MOTION))
+        border, right = np.zeros((*rows, size)), np.zeros((*rows, 1 + len(spread)))
+        right[..., 0] = np.array([b for _, _, b in found])
+        column = 0
+        for name, later in kind:
+            width = _WIDTH[name] if name in _WIDTH else apart[name]
+            part = jacobian[..., column : column + width]
+            column += width
+            if name in _FIRST:
+                target = own if later == 0 else after
+                target[..., _FIRST[name] : _FIRST[name] + width] = part
+            elif name == "c":
+                border[...] = part
+            else:
+                right[..., 1:] = -part
+        epoch = np.array([first for first, _, _ in found])
+        linked = any(later for _, later in kind)
+        for once in _each_once(epoch):
+            ahead = after[once] if linked else None
+            yield epoch[once], own[once], ahead, border[once], right[once]
