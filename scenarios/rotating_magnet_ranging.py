@@ -14,8 +14,9 @@ What is declared is what is drawn, otherwise no NEES says anything: the moment, 
 depths, the shaft's slip and the casing's wall, permeability and conductivity are drawn with their
 declared sigmas.  That of a window's depth follows from that of a reading.  The thin wall's formula
 errs by about the wall over its radius, 0.1.  What rails and layers do is calculated without any
-estimate, over draws of other seeds (``--left-out``), and declared, rounded: as ``model_error`` its
-root mean square over all places of the magnet, as its length where its correlation falls to 1/e.
+estimate, over draws of other seeds (``ranging_left_out.py``), and declared, rounded: as
+``model_error`` its root mean square over all places of the magnet, as its length where its
+correlation falls to 1/e.
 
 The rule, stated before the run: over all draws with the angle measured the mean NEES of the six
 numbers of the pose lies between 4 and 8 in both cases; and of ``crossing`` the root mean square of
@@ -27,7 +28,6 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 from harness import conclude, rms, scenario_parser
-from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.ranging import Ranged, find_range
 from magfusion.estimation.ranging_data import SHARE, RangingWindows
@@ -40,7 +40,8 @@ from magfusion.model.site import Beacon, BeaconSigma, Site, rotor_coils
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.layers import Layers
 from magfusion.simulation.pipe import Pipe, Steel
-from magfusion.simulation.rotor import Pass, Shaft, Surroundings, passing_phasor, simulate_passes
+from magfusion.simulation.rotor import Pass, Shaft, Surroundings, simulate_passes
+from magfusion.simulation.wells import TwoWells, drawn_steel
 from magfusion.units import Array
 
 PUBLISHED, BETTER = 0.03, 5.0
@@ -58,7 +59,6 @@ WINDOW_DEPTH = READING * float(np.sqrt(2.0 / 3.0 * np.sum(SHARE**2)))
 LAYERS = Layers((300.0, 20.0, -15.0), (0.02, 0.005, 0.1))
 CONDUCTIVITY = 0.01  # S/m, as declared
 RAIL_FROM, RAIL_TO, RAIL_LENGTH = 4.0, 8.0, 20.0  # m, from the sensor, sideways
-LEFT_OUT_SEED, LEFT_OUT_DRAWS, LEFT_OUT_PLACES = 9001, 10, 121
 
 
 CASING = Casing(
@@ -85,7 +85,7 @@ class Case:
     window : float
         (s)
     model_error, model_error_length : float
-        As declared: by ``--left-out``; the length in m.
+        As declared: by ``ranging_left_out.py``; the length in m.
     segment : float
         Of the simulated steel (m).
     """
@@ -152,13 +152,13 @@ def declared_site(*, cased: bool, axis: Array | None = None) -> Site:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Two wells and what is about them; the frame of the sensor's high side in the world."""
+    """Two wells and what is about them."""
 
     site: Site
     shaft: Shaft
+    wells: TwoWells
     passes: tuple[Pass, ...]
     around: Surroundings
-    side_world: Array  # (3, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,8 +166,8 @@ class Scene:
     """A log, and where the sensor truly is from the magnet."""
 
     log: Log
+    wells: TwoWells
     passes: tuple[Pass, ...]
-    side_world: Array  # (3, 3), world from the frame of the sensor's high side
     stretch: float
 
 
@@ -180,24 +180,14 @@ def draw_world(case: Case, config: Config, rng: np.random.Generator) -> World:
     tilted = replace(rotor, moment=moment, tilt=float(np.deg2rad(2.0) * rng.standard_normal()))
     beacon = replace(site.beacons[0], rotor=tilted)
     site = replace(site, beacons=(beacon,))
-    # The sensor's well goes east, a little down; x of the side's frame down the hole, z up.
-    side = Rotation.from_euler("y", rng.normal(0.0, 0.02)).as_matrix()
+    dip = rng.normal(0.0, 0.02)  # the sensor's well goes a little down
     angle = rng.uniform(0.0, 2.0 * np.pi) if case is CROSSING else rng.normal(0.0, 0.1)
     distance = case.distance * rng.uniform(0.9, 1.1)
-    across = side @ np.array([0.0, -np.sin(angle), np.cos(angle)])
-    lean = Rotation.from_rotvec(side @ np.array([0.0, *rng.normal(0.0, case.converge, 2)]))
-    turn = Rotation.from_rotvec(side[:, 0] * rng.uniform(-np.pi, np.pi))
-    rotor_world = (lean * turn).as_matrix() @ side
-    along = rotor_world[:, 0]
-    middle = distance * across + rng.uniform(-2.0, 2.0) * along  # of the magnet, at depth zero
-    passes = []
-    for place in (-0.5 * case.apart, 0.5 * case.apart):
-        sensor = place * side[:, 0]
-        abreast = float((sensor - middle) @ along)
-        low, high = abreast - case.reach, abreast + case.reach
-        roll = Rotation.from_euler("x", rng.uniform(-np.pi, np.pi)).as_matrix()
-        start = middle + low * along
-        passes.append(Pass(place, sensor, side @ roll, start, rotor_world, (low, high), case.speed))
+    right, up = rng.normal(0.0, case.converge, 2)
+    turn, ahead = rng.uniform(-np.pi, np.pi), rng.uniform(-2.0, 2.0)
+    way = case.apart, case.reach, case.speed
+    wells = TwoWells(distance, angle, dip, (right, up), turn, ahead, *way)
+    passes = wells.passes(rng.uniform(-np.pi, np.pi, 2))
     # An error of the angle twice a turn makes an ellipse of half its size.
     first, second = 2.0 * ELLIPSE * rng.standard_normal(2)
     shaft = Shaft(
@@ -209,11 +199,11 @@ def draw_world(case: Case, config: Config, rng: np.random.Generator) -> World:
     )
     around = Surroundings(
         LAYERS if config.layers else None,
-        _steel(case, side, angle, rng) if config.steel else None,
+        _steel(case, wells, rng) if config.steel else None,
         STRETCH * rng.standard_normal(),
         READING,
     )
-    return World(site, shaft, tuple(passes), around, side)
+    return World(site, shaft, wells, passes, around)
 
 
 def draw(case: Case, config: Config, seed: int) -> Scene:
@@ -223,66 +213,25 @@ def draw(case: Case, config: Config, seed: int) -> Scene:
     log = simulate_passes(
         own.site, own.shaft, own.passes, own.around, RATE_HZ, rng, encoder=config.encoder
     )
-    return Scene(log, own.passes, own.side_world, own.around.depth_scale)
+    return Scene(log, own.wells, own.passes, own.around.depth_scale)
 
 
-def _steel(case: Case, side: Array, angle: float, rng: np.random.Generator) -> Steel:
+def _steel(case: Case, wells: TwoWells, rng: np.random.Generator) -> Steel:
     """Return the casing about the sensor, not quite as declared, and rails off the magnet's way."""
+    true = drawn_steel(CASING, rng)
+    steel = true.wall, true.permeability, true.conductivity
     half = 0.5 * case.apart + case.reach + case.distance
-    wall, permeability, conductivity = np.exp(STEEL_SIGMA * rng.standard_normal(3)) * [
-        WALL,
-        PERMEABILITY,
-        STEEL_CONDUCTIVITY,
-    ]
-    casing = Pipe(
-        -half * side[:, 0],
-        half * side[:, 0],
-        RADIUS,
-        float(wall),
-        float(permeability),
-        float(conductivity),
-        case.segment,
-    )
+    casing = wells.casing(half, RADIUS, steel, case.segment)
     rails = []
     for place in (-0.5 * case.apart, 0.5 * case.apart):
-        away = angle + rng.uniform(0.5 * np.pi, 1.5 * np.pi)
+        away = wells.direction + rng.uniform(0.5 * np.pi, 1.5 * np.pi)
         across = rng.uniform(RAIL_FROM, RAIL_TO) * np.array([0.0, -np.sin(away), np.cos(away)])
         ends = [
-            side @ (across + np.array([place + end * RAIL_LENGTH, 0.0, 0.0])) for end in (-0.5, 0.5)
+            wells.side_world @ (across + np.array([place + end * RAIL_LENGTH, 0.0, 0.0]))
+            for end in (-0.5, 0.5)
         ]
         rails.append(Pipe(ends[0], ends[1], 0.045, 0.045))
     return Steel((casing, *rails), about=0)
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """What rails and layers do to the field, without any estimate."""
-
-    case: str
-    share: float
-    length_m: float
-
-
-def left_out(case: Case) -> LeftOut:
-    """Return it over draws of seeds that are ranged nowhere."""
-    power, alike, step = 0.0, np.zeros(LEFT_OUT_PLACES), 0.0
-    for seed in range(LEFT_OUT_SEED, LEFT_OUT_SEED + LEFT_OUT_DRAWS):
-        own = draw_world(case, Config(), np.random.default_rng([seed, 19]))
-        assert own.around.steel is not None
-        casing = replace(own.around.steel, pipes=own.around.steel.pipes[:1])
-        plain = replace(own.around, steel=casing, layers=None)
-        for one in own.passes:
-            depth = np.linspace(*one.depth, LEFT_OUT_PLACES)
-            whole = passing_phasor(own.site, own.shaft, one, own.around, depth)
-            known = passing_phasor(own.site, own.shaft, one, plain, depth)
-            error = (whole - known) / np.linalg.norm(whole, axis=1)[:, None]
-            power += float(np.mean(np.sum(np.abs(error) ** 2, axis=1)))
-            for lag in range(LEFT_OUT_PLACES):
-                product = np.sum(error[: len(depth) - lag] * error[lag:].conj(), axis=1)
-                alike[lag] += float(np.mean(product.real))
-            step = float(depth[1] - depth[0])
-    apart = int(np.argmax(alike < alike[0] / np.e))
-    return LeftOut(case.name, float(np.sqrt(power / (2 * LEFT_OUT_DRAWS))), apart * step)
 
 
 @dataclass(frozen=True)
@@ -324,22 +273,10 @@ def pose_error(scene: Scene, windows: RangingWindows, found: Ranged) -> Array:
     depth = windows.magnet_from / (1.0 + scene.stretch)
     magnet = own.start_world + (depth - own.depth[0]) * rotor_world[:, 0]
     place = rotor_world.T @ (own.sensor_world - magnet)
-    true = gtsam.Pose3(gtsam.Rot3(rotor_world.T @ scene.side_world), place)
+    true = gtsam.Pose3(gtsam.Rot3(rotor_world.T @ scene.wells.side_world), place)
     estimated = gtsam.Pose3(gtsam.Rot3(found.world_from_body), found.position_world)
     # Along a screw: what is open, a turn about the magnet's axis, is one, however far.
     return np.asarray(gtsam.Pose3.Logmap(true.between(estimated)))
-
-
-def true_place(scene: Scene, own: Pass) -> tuple[float, float, float]:
-    """Return distance (m), direction from the high side (rad), and depth when abreast (m)."""
-    along = own.world_from_rotor[:, 0]
-    offset = own.start_world - own.sensor_world
-    travel = -float(offset @ along)
-    right, up = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]) @ (
-        scene.side_world.T @ (offset + travel * along)
-    )
-    distance = float(np.linalg.norm(offset + travel * along))
-    return distance, float(np.arctan2(right, up)), own.depth[0] + travel
 
 
 def nees(error: Array, found: Ranged, *, measured: bool) -> float:
@@ -366,7 +303,7 @@ def run_one(case: Case, config: Config, seed: int) -> Row:
     wells = Wells(found, told.windows, np.array([1.0, 0.0, 0.0]))
     errors, distances, sigmas = [], [], []
     for own in scene.passes:
-        distance, direction, depth = true_place(scene, own)
+        distance, direction, depth = scene.wells.abreast(own)
         one = wells.abreast(own.sensor_depth)
         turned = np.angle(np.exp(1j * (one.direction - direction)))
         errors.append([one.distance - distance, np.rad2deg(turned), one.depth - depth])
@@ -437,12 +374,7 @@ def main() -> None:
     parser = scenario_parser(__doc__, Config.seed, output=None)
     parser.add_argument("--runs", type=int, default=Config.runs, help="of each case of the rule")
     parser.add_argument("--others", type=int, default=Config.others, help="with a followed angle")
-    parser.add_argument("--left-out", action="store_true", help="what the model leaves out, only")
     given = parser.parse_args()
-    if given.left_out:
-        for one in (left_out(CROSSING), left_out(PAIR)):
-            print(f"{one.case}: {100.0 * one.share:.3f} %, alike over {one.length_m:.1f} m")
-        return
     rows, found = list[Row](), list[Judgement]()
     for case in (CROSSING, PAIR):
         for encoder in (True, False):

@@ -102,7 +102,7 @@ def test_wells_are_those_of_the_poses_and_their_sigmas_of_differences(
     assert scenario.nees(error, found, measured=True) < 22.5  # one in a thousand
     for own in scene.passes:
         one = Wells(found, windows, axis).abreast(own.sensor_depth)
-        true = scenario.true_place(scene, own)
+        true = scene.wells.abreast(own)
         assert abs(one.distance - true[0]) < 4.0 * one.distance_sigma
         turned = np.angle(np.exp(1j * (one.direction - true[1])))
         assert abs(turned) < 4.0 * one.direction_sigma
@@ -160,7 +160,7 @@ def test_the_job_says_it_in_the_words_of_a_driller(scene: scenario.Scene, tmp_pa
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["verdict"] == "trustworthy"
     for k, own in enumerate(scene.passes, start=1):
-        distance, direction, depth = scenario.true_place(scene, own)
+        distance, direction, depth = scene.wells.abreast(own)
         assert report[f"place_{k}_distance_m"] == pytest.approx(distance, abs=0.05)
         assert report[f"place_{k}_high_side_deg"] == pytest.approx(
             np.rad2deg(direction) % 360.0, abs=1.0

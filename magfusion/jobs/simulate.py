@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from magfusion.errors import InputError
-from magfusion.jobs.settings import Command, RandomSettings, option
+from magfusion.jobs.settings import Command, option
+from magfusion.jobs.simulate_passes import ShaftSettings, is_for_ranging, run_passes
 from magfusion.results.figures import Figure, Figures, Section, heading
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ LATE = 0.037  # s; the clock of a reference
 
 
 @dataclass(frozen=True, kw_only=True)
-class SimulateSettings(RandomSettings):
+class SimulateSettings(ShaftSettings):
     """What is simulated."""
 
     site: Path | None = option(None, "Site file", note="default: the demo's four beacons")
@@ -147,7 +148,13 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
     from magfusion.simulation.slots import Multiplexer
     from magfusion.simulation.waveform import usual_rate_hz
 
-    site = demo_site() if settings.site is None else load_site(settings.site, several=True)
+    site = demo_site()
+    if settings.site is not None:
+        site = load_site(settings.site, several=True, unknown=True)
+        if is_for_ranging(site):
+            return _passes(settings, site, output)
+        site = load_site(settings.site, several=True)
+    _refuse_wells(settings, site)
     box = box_option(settings.box)
     reference = reference_option(settings.reference)
     if reference is not None:
@@ -174,6 +181,45 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
         ),
     )
     return run_simulate(site, config, output, settings.seed)
+
+
+def _passes(settings: SimulateSettings, site: Site, output: Path) -> Figures:
+    """Simulate passes of a magnet in a well, where nothing else is asked for."""
+    from magfusion.simulation.layers import layers_option
+
+    usual = SimulateSettings(seed=settings.seed)
+    without = ("motion", "box", "iron", "ambient", "drift", "storms", "reference", "random_field")
+    for name in without:
+        if getattr(settings, name) != getattr(usual, name):
+            raise InputError(
+                f"--{name.replace('_', '-')}: the magnet of {settings.site} goes through a well, of"
+                " which nothing of the kind is simulated; leave it out, or survey the beacon (no"
+                " unknown) for a platform that moves"
+            )
+    if site.platform.further:
+        raise InputError(
+            f"{settings.site}: platform.magnetometers: a well is ranged by one sensor; describe one"
+        )
+    return run_passes(
+        site,
+        settings,
+        output,
+        rate_hz=settings.rate,
+        perturb=settings.perturb,
+        layers=None if settings.ground is None else layers_option(settings.ground),
+    )
+
+
+def _refuse_wells(settings: SimulateSettings, site: Site) -> None:
+    if settings.wells is not None:
+        raise InputError(
+            "--wells: is of a site whose only beacon has rotor and unknown: pose; leave it out"
+        )
+    if any(one.casing is not None for one in site.platform.magnetometers):
+        raise InputError(
+            f"{settings.site}: casing: is simulated of a sensor in a well alone, whose site's only"
+            " beacon has rotor and unknown: pose; leave it out"
+        )
 
 
 def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) -> Figures:

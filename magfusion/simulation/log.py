@@ -2,18 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from datetime import date
 from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.model.correlation import Component, Correlation
 from magfusion.model.marks import Marks
-from magfusion.model.physics.earth import earth_field_world
 from magfusion.model.samples import FieldSamples, Log, Waveform
-from magfusion.model.site import Beacon, Magnetometer, Site
+from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.disturbance import Ambient, Bending, Spheres, draw_bending, draw_spheres
 from magfusion.simulation.field import Drives, phasors_world, synchronised_drives
@@ -27,11 +24,12 @@ from magfusion.simulation.motion import (
     static_motion,
     turning_motion,
 )
+from magfusion.simulation.perturbed import perturb_site as perturb_site
+from magfusion.simulation.perturbed import with_earth_field
 from magfusion.simulation.slots import Multiplexer, draw_marks, is_multiplexed
 from magfusion.simulation.waveform import Mains, beacons_world, simulate_waveform
 from magfusion.units import Array
 
-Draw = Callable[[str, str, str, Array], Array]
 EPOCH_NS = 1_700_000_000_000_000_000
 
 MotionKind = Literal["walk", "turn", "static"]
@@ -160,7 +158,7 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         If the configuration or the site cannot be simulated.
     """
     calibration_rng, motion_rng, imu_rng, magnetometer_rng, iron_rng, field_rng = rng.spawn(6)
-    declared = _with_earth_field(site)
+    declared = with_earth_field(site)
     true_site = perturb_site(declared, calibration_rng) if config.perturb else declared
     true_site = _with_instruments(true_site, config)
     drives = draw_drives(true_site, calibration_rng)
@@ -328,93 +326,12 @@ def simulate_fields(
     )
 
 
-def perturb_site(site: Site, rng: np.random.Generator) -> Site:
-    """Return a site whose calibration is drawn from the priors that the given one declares.
-
-    Rotations are perturbed on the right, in beacon and in sensor axes; positions in world axes
-    (beacons) and in body axes (magnetometer); moments and the ground's conductivity by the
-    exponential of their logarithm's.
-    What goes together is drawn together.
-    """
-    draw = _draws(site.correlation, rng)
-    beacons = tuple(_perturb_beacon(beacon, draw) for beacon in site.beacons)
-    sensors = site.platform.magnetometers
-    alone = len(sensors) == 1
-    drawn = tuple(_perturb_magnetometer(s, draw, None if alone else s.name) for s in sensors)
-    platform = site.platform.carrying(drawn)
-    if site.log_conductivity_sigma:
-        error = draw("ground", "ground", "conductivity", np.array([site.log_conductivity_sigma]))
-        beacons = tuple(replace(b, conductivity=b.conductivity * np.exp(error[0])) for b in beacons)
-    return replace(site, beacons=beacons, platform=platform)
-
-
 def draw_drives(site: Site, rng: np.random.Generator) -> Drives:
     """Return a random phase per tone and drift for every beacon that is not synchronised."""
     free = np.array([not beacon.synchronised for beacon in site.beacons], dtype=bool)
     tones = [len(beacon.tones) for beacon in site.beacons]
     phase = rng.uniform(-np.pi, np.pi, sum(tones)) * np.repeat(free, tones)
     return Drives(phase, rng.normal(0.0, site.clock.drift_sigma, len(free)) * free)
-
-
-def _draws(correlation: Correlation | None, rng: np.random.Generator) -> Draw:
-    """Return a function that draws the error of a parameter, in unison with its relatives."""
-    own: dict[Component, float] = {}
-    if correlation is not None:
-        unit = rng.standard_normal(len(correlation.parameters))
-        drawn = np.linalg.cholesky(correlation.coefficients) @ unit
-        own = dict(zip(correlation.parameters, drawn.tolist(), strict=True))
-
-    def draw(group: str, owner: str, kind: str, sigma: Array) -> Array:
-        error = rng.normal(0.0, sigma)
-        for i, at in enumerate(np.ndindex(sigma.shape)):
-            known = own.get(Component(group, owner, kind, i))
-            error[at] = error[at] if known is None else sigma[at] * known
-        return error
-
-    return draw
-
-
-def _perturb_beacon(beacon: Beacon, draw: Draw) -> Beacon:
-    name, sigma = beacon.name, beacon.sigma
-    turn = Rotation.from_rotvec(draw("beacons", name, "rotation", sigma.rotation_beacon))
-    factors = np.exp(draw("moments", name, "log_moment", sigma.log_moment))
-    error = draw("beacons", name, "position", sigma.position_world)
-    return replace(
-        beacon,
-        position_world=beacon.position_world + error,
-        world_from_beacon=beacon.world_from_beacon @ turn.as_matrix(),
-        coils=tuple(
-            replace(coil, moment_beacon=factor * coil.moment_beacon)
-            for coil, factor in zip(beacon.coils, factors, strict=True)
-        ),
-    )
-
-
-def _perturb_magnetometer(magnetometer: Magnetometer, draw: Draw, name: str | None) -> Magnetometer:
-    sigma, sensor, own = magnetometer.sigma, name or "sensor", name or "magnetometer"
-    turn = Rotation.from_rotvec(draw("extrinsics", sensor, "rotation", sigma.rotation_sensor))
-    matrix = draw("magnetometer", own, "matrix", sigma.matrix)
-    offset = draw("magnetometer", own, "offset", sigma.offset)
-    lever = draw("extrinsics", sensor, "position", sigma.position_body)
-    if sigma.clock_offset:
-        late = draw("time-offset", own, "clock_offset", np.array([sigma.clock_offset]))
-        magnetometer = replace(magnetometer, clock_offset=magnetometer.clock_offset + late[0])
-    return replace(
-        magnetometer,
-        matrix=magnetometer.matrix + matrix,
-        offset=magnetometer.offset + offset,
-        body_from_sensor=magnetometer.body_from_sensor @ turn.as_matrix(),
-        position_body=magnetometer.position_body + lever,
-    )
-
-
-def _with_earth_field(site: Site) -> Site:
-    place = site.location
-    if site.earth_field_world is not None or place is None:
-        return site
-    day = date.fromisoformat(place.date)
-    field_world = earth_field_world(place.latitude_deg, place.longitude_deg, place.height_m, day)
-    return replace(site, earth_field_world=field_world)
 
 
 def _with_instruments(site: Site, config: SimulationConfig) -> Site:

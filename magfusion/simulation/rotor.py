@@ -13,11 +13,12 @@ from scipy.interpolate import CubicSpline
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.samples import Depths, ImuSamples, Log, RotorAngles, Waveform
 from magfusion.model.site import Rotor, Site
+from magfusion.simulation.ground import dipole_in_ground
 from magfusion.simulation.layers import Layers, layered_effect_at
 from magfusion.simulation.pipe import Steel
 from magfusion.units import Array, ComplexArray
 
-POINTS, ORDERS = 64, 4  # of a turn, and of its angle, from steady on
+POINTS, ORDERS = 64, 4  # of a turn, and of its angle, from steady on, beside the harmonics
 NEGLIGIBLE = 1e-6  # of the moment
 NODES_APART = 0.08  # of the distance, between places where steel and layers are calculated
 
@@ -100,6 +101,7 @@ class Surroundings:
     steel: Steel | None = None
     depth_scale: float = 0.0  # relative error of the magnet's depths
     depth_sigma: float = 0.0  # m, of each reading of them
+    conductivity: float = 0.0  # S/m, without end, where there are no layers
 
 
 def turned_moment(rotor: Rotor, shaft: Shaft, angle: Array) -> Array:
@@ -109,6 +111,8 @@ def turned_moment(rotor: Rotor, shaft: Shaft, angle: Array) -> Array:
     true = (angle + shaft.slip * np.sin(2.0 * angle + shaft.slip_phase))[:, None]
     moment = np.cos(rotor.tilt) * (zero * np.cos(true) + across * np.sin(true))
     moment = rotor.moment * (moment + np.sin(rotor.tilt) * axis)
+    for one in rotor.harmonics:
+        moment = moment + np.cos(one.order * true + one.phase) * one.moment_beacon
     # Backward whirl: the shaft leans by a small angle about a direction that circles against it.
     lean = shaft.whirl * (zero * np.cos(angle)[:, None] - across * np.sin(angle)[:, None])
     size = np.linalg.norm(lean, axis=1, keepdims=True)
@@ -262,10 +266,12 @@ def _measured(
 
 def _parts(rotor: Rotor, shaft: Shaft) -> dict[int, ComplexArray]:
     """Return the moment's phasor in each order of the angle, rotor axes, (3,) (A m^2)."""
-    angle = 2.0 * np.pi * np.arange(POINTS) / POINTS
+    orders = max((ORDERS, *(one.order + 2 for one in rotor.harmonics)))
+    points = max(POINTS, 4 * orders)
+    angle = 2.0 * np.pi * np.arange(points) / points
     moment = turned_moment(rotor, shaft, angle)
     out = {}
-    for order in range(ORDERS):
+    for order in range(orders):
         twice = 1.0 if order == 0 else 2.0
         part = twice * np.mean(moment * np.exp(-1j * order * angle)[:, None], axis=0)
         if np.linalg.norm(part) > NEGLIGIBLE * rotor.moment:
@@ -289,7 +295,7 @@ def _added(
     share : complex ndarray, shape (3,)
         Moment that alternates at the frequency, rotor axes (A m^2).
     """
-    if around.layers is None and around.steel is None:
+    if around.layers is None and around.steel is None and not around.conductivity:
         return None
     axis_world = own.world_from_rotor @ rotor.axis_beacon
     travel = (own.sensor_world - own.start_world) @ axis_world
@@ -303,6 +309,11 @@ def _added(
     seen = plain.astype(np.complex128)
     if around.layers is not None and frequency_hz:
         seen += _ground(frequency_hz, moments, at_world, own, around.layers)
+    elif around.conductivity and frequency_hz:
+        offset = own.sensor_world - at_world
+        for k, moment in enumerate(moments):
+            there = dipole_in_ground(offset, moment, frequency_hz, around.conductivity)
+            seen[:, k] += there - plain[:, k]
     if around.steel is not None:
         points = around.steel.points_world()
         driven = dipole_field((points[:, None] - at_world)[:, :, None], moments)

@@ -1,0 +1,235 @@
+"""What `simulate` makes of a magnet that turns in one well, and is to be ranged from another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from magfusion.errors import InputError
+from magfusion.jobs.settings import RandomSettings, option
+from magfusion.results.figures import Figure, Figures, heading
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from magfusion.files.wells_file import WellsEntry
+    from magfusion.model.site import Site
+    from magfusion.simulation.layers import Layers
+    from magfusion.simulation.pipe import Pipe
+    from magfusion.simulation.rotor import Pass, Shaft, Surroundings
+    from magfusion.simulation.wells import TwoWells
+
+LEAST_RATE_HZ, SAMPLES_PER_TURN = 50.0, 10.0
+LEAST_SHARE, MOST_SEGMENT = 0.05, 0.5  # of a segment of steel: of the distance, and in m
+LEAST_DRIFT_TIME = 1.0  # s
+AHEAD = 2.0  # m, at most, of the magnet from where it is abreast, in the middle of its depths
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShaftSettings(RandomSettings):
+    """How magnets on shafts turn, and two wells."""
+
+    wells: Path | None = option(
+        None,
+        "File of two wells, for a rotor whose pose is unknown",
+        note="default: 25 m apart, the magnet passes two places of the sensor",
+    )
+    shaft_drift: float | None = option(
+        None,
+        "Drift of a rotor's speed, rms, gained by its speed_walk_hz_rts",
+        unit="Hz",
+        least=0.0,
+        most=10.0,
+        note="default: its speed_sigma_hz",
+    )
+    shaft_whirl: float = option(
+        0.0, "By which a rotor's shaft leans and circles backward", unit="deg", least=0.0, most=30.0
+    )
+    encoder: bool = option(True, "Record the angles of rotors")
+    encoder_sigma: float = option(
+        0.1, "Of a recorded angle, 1 sigma", unit="deg", least=0.0, most=30.0
+    )
+
+
+def is_for_ranging(site: Site) -> bool:
+    """Return whether a site is of a magnet on a shaft that is to be found from another well."""
+    return (
+        len(site.beacons) == 1
+        and site.beacons[0].rotor is not None
+        and site.beacons[0].unknown == "pose"
+    )
+
+
+def drawn_shaft(site: Site, settings: ShaftSettings, rng: np.random.Generator) -> Shaft:
+    """Draw how a rotor turns: an angle that errs twice a turn makes an ellipse of half its size."""
+    import numpy as np
+
+    from magfusion.simulation.rotor import Shaft
+    from magfusion.units import DEGREE
+
+    rotor = site.beacons[0].rotor
+    assert rotor is not None
+    rms = rotor.speed_sigma_hz if settings.shaft_drift is None else settings.shaft_drift
+    first, second = 2.0 * rotor.ellipse_sigma * rng.standard_normal(2)
+    return Shaft(
+        angle_start=float(rng.uniform(0.0, 2.0 * np.pi)),
+        drift_hz=rms,
+        drift_time=max(2.0 * (rms / rotor.speed_walk_hz_rts) ** 2, LEAST_DRIFT_TIME),
+        slip=float(np.hypot(first, second)),
+        slip_phase=float(np.arctan2(second, first)),
+        whirl=settings.shaft_whirl * DEGREE,
+        length=rotor.length,
+        encoder_sigma=settings.encoder_sigma * DEGREE,
+    )
+
+
+def laid_wells(entry: WellsEntry, rng: np.random.Generator) -> TwoWells:
+    """Return the wells of a file; how the magnet is turned on its shaft is drawn."""
+    import numpy as np
+
+    from magfusion.simulation.wells import TwoWells, lean_of
+    from magfusion.units import DEGREE
+
+    return TwoWells(
+        distance=entry.distance_m,
+        direction=entry.high_side_deg * DEGREE,
+        dip=(90.0 - entry.inclination_deg) * DEGREE,
+        lean=lean_of(entry.leads_right_deg * DEGREE, entry.leads_up_deg * DEGREE),
+        turn=float(rng.uniform(-np.pi, np.pi)),
+        ahead=float(rng.uniform(-AHEAD, AHEAD)),
+        apart=entry.apart_m,
+        reach=entry.reach_m,
+        speed=entry.speed_m_s,
+        depth=entry.depth_m,
+    )
+
+
+def run_passes(
+    site: Site,
+    settings: ShaftSettings,
+    output: Path,
+    *,
+    rate_hz: float | None = None,
+    perturb: bool = True,
+    layers: Layers | None = None,
+    beside: tuple[Pipe, ...] = (),
+) -> Figures:
+    """Simulate what a sensor in a well records of a magnet that goes by in another.
+
+    Parameters
+    ----------
+    site : Site
+        As `is_for_ranging`.
+    rate_hz : float, optional
+        Of the magnetometer.
+    beside : tuple of Pipe
+        Steel beside the wells.
+    """
+    import numpy as np
+
+    from magfusion.files.log import write_log
+    from magfusion.files.site import save_site
+    from magfusion.files.wells_file import read_wells
+    from magfusion.jobs.inputs import claim
+    from magfusion.model.platform_motion import NO_IMU
+    from magfusion.model.samples import ImuSamples
+    from magfusion.model.trust import Trust
+    from magfusion.results.report import write_report
+    from magfusion.results.verdict import trust_figures
+    from magfusion.simulation.perturbed import perturb_site, with_earth_field
+    from magfusion.simulation.rotor import simulate_passes
+    from magfusion.simulation.waveform import LEAST_SAMPLES_PER_CYCLE
+
+    entry, claimed = read_wells(settings.wells), claim(output, "simulate")
+    rng = np.random.default_rng(settings.seed)
+    declared = with_earth_field(site)
+    true_site = perturb_site(declared, rng) if perturb else declared
+    rotor = true_site.beacons[0].rotor
+    assert rotor is not None
+    highest = max((1, *(one.order for one in rotor.harmonics)))
+    fastest_hz = highest * site.beacons[0].frequency_hz
+    rate_hz = rate_hz or max(LEAST_RATE_HZ, SAMPLES_PER_TURN * fastest_hz)
+    if rate_hz < LEAST_SAMPLES_PER_CYCLE * fastest_hz:
+        raise InputError(
+            f"--rate {rate_hz:g}: the rotor's fastest tone has {fastest_hz:g} Hz; give at least"
+            f" {LEAST_SAMPLES_PER_CYCLE * fastest_hz:g} Hz"
+        )
+    shaft, wells = drawn_shaft(true_site, settings, rng), laid_wells(entry, rng)
+    sensor = true_site.platform.magnetometer
+    rolls = rng.uniform(-np.pi, np.pi, 2)
+    passes = wells.passes(rolls, sensor.position_body, rotor.axis_beacon)
+    around = _around(true_site, wells, entry, layers, beside, rng, perturb=perturb)
+    log = simulate_passes(true_site, shaft, passes, around, rate_hz, rng, encoder=settings.encoder)
+    if site.platform.imu == NO_IMU:
+        log = replace(log, imu=ImuSamples.empty(), inertial=False)
+    figures = heading("simulate", log.name) | trust_figures(Trust())
+    figures |= _figures(settings, wells, passes, 1.0 + around.depth_scale)
+    with claimed as directory:
+        write_log(log, directory)
+        save_site(site, directory / "site.yaml")
+        save_site(true_site, directory / "true_site.yaml")
+        write_report(directory, figures)
+    return figures
+
+
+def _around(
+    site: Site,
+    wells: TwoWells,
+    entry: WellsEntry,
+    layers: Layers | None,
+    beside: tuple[Pipe, ...],
+    rng: np.random.Generator,
+    *,
+    perturb: bool,
+) -> Surroundings:
+    from magfusion.simulation.pipe import Steel
+    from magfusion.simulation.rotor import Surroundings
+    from magfusion.simulation.wells import drawn_steel
+
+    casing, steel = site.platform.magnetometer.casing, None
+    if casing is not None:
+        true = drawn_steel(casing, rng) if perturb else casing
+        half = 0.5 * wells.apart + wells.reach + wells.distance
+        radius = casing.radius + 0.5 * casing.wall
+        segment = min(LEAST_SHARE * wells.distance, MOST_SEGMENT)
+        made = true.wall, true.permeability, true.conductivity
+        steel = Steel((wells.casing(half, radius, made, segment), *beside), about=0)
+    elif beside:
+        steel = Steel(beside)
+    return Surroundings(
+        layers,
+        steel,
+        float(entry.depth_scale_sigma * rng.standard_normal()) if perturb else 0.0,
+        entry.depth_sigma_m,
+        site.beacons[0].conductivity,
+    )
+
+
+def _figures(
+    settings: ShaftSettings, wells: TwoWells, passes: tuple[Pass, ...], stretch: float
+) -> Figures:
+    """Return what is true, in the words of `range`; depths of the magnet as they are read."""
+    from magfusion.units import DEGREE
+
+    figures = [
+        Figure("seed", settings.seed),
+        Figure("passes", len(passes)),
+        Figure("duration_s", sum(one.duration for one in passes), "s"),
+        Figure("angle", "measured" if settings.encoder else "not recorded"),
+    ]
+    for k, one in enumerate(passes, start=1):
+        distance, direction, depth = wells.abreast(one)
+        rows = (
+            ("sensor_depth_m", one.sensor_depth, "m"),
+            ("distance_m", distance, "m"),
+            ("high_side_deg", direction / DEGREE % 360.0, "deg"),
+            ("abreast_depth_m", stretch * depth, "m"),
+        )
+        figures += [Figure(f"place_{k}_{name}", value, unit) for name, value, unit in rows]
+    right, up = wells.leads()
+    figures += [
+        Figure("leads_right_deg", right / DEGREE, "deg"),
+        Figure("leads_up_deg", up / DEGREE, "deg"),
+    ]
+    return Figures(*figures)
