@@ -2,16 +2,16 @@
 
 import numpy as np
 
+from magfusion.estimation.integrity.asked import Asked
 from magfusion.estimation.integrity.held import freed_by, gains
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.score_online import OnlineScore
 from magfusion.simulation.demo_site import demo_site
 
 KNOWN, UNKNOWN = 50.0, 1e-4  # by how many typical errors a direction is told of, squared
 
 
 def test_all_at_once_gain_what_each_alone_does() -> None:
-    rng, score = np.random.default_rng(4), OnlineScore(demo_site(), (), (), steady=False)
+    rng, score = np.random.default_rng(4), Asked(demo_site(), (), (), steady=False)
     size = len(score.unit)
     root = rng.standard_normal((size, size)) / np.sqrt(size)
     axes = np.linalg.qr(rng.standard_normal((size, size)))[0]
@@ -27,5 +27,6 @@ def test_all_at_once_gain_what_each_alone_does() -> None:
     expected = [0.0 if one is None else one.gain for one in alone]
     assert np.ptp(expected) > 100.0  # chi square; they differ
     np.testing.assert_allclose(gains(combine, information, gradient), expected, atol=1e-6)
+    np.testing.assert_allclose(score.gains(information, gradient), expected, atol=1e-6)
     nobody = gains(combine, 1e-6 * np.eye(size), gradient)
     np.testing.assert_array_equal(nobody, 0.0)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from conftest import Refuse, run_command
 from far_and_weak import FAR_AWAY, RATE_HZ, far_site, witnessed_log
+from rests_smoothed import Config, run
 
 from magfusion.estimation.at_rest import at_rest
 from magfusion.estimation.log_graph import overlap
@@ -118,3 +119,11 @@ def test_the_derivative_of_a_zero_rate_is_that_of_differences() -> None:
         step = 1e-6 * np.eye(6)[k]
         slope = (at(bias + step).error - at(bias - step).error) / 2e-6
         np.testing.assert_allclose(rows.by_bias[..., k], slope, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_all_rests_in_one_solution_know_more_than_each_and_no_more_than_is_so() -> None:
+    alone, _, together = run(Config(rest=150.0, runs=4, seed=30))
+    assert alone.told == together.told == 12
+    assert together.position_m < alone.position_m
+    assert 2.0 < together.nees < 11.0  # of four logs

@@ -180,10 +180,10 @@ class EpochUpdate:
         self, found: Measured, explained: State, *, asked: bool
     ) -> FieldPhasors | JointPhasors:
         """Weigh phasors by what is near; of those that the score asks of, all is predicted once."""
-        if asked:
-            self.score.foresee(found.phasors, explained)
         if isinstance(found.phasors, JointPhasors):  # of two beacons or more
             return found.phasors
+        if asked:
+            self.score.foresee(found.phasors, explained)
         return self.metal.weighed(found.phasors, explained, found.samples.valid[0])
 
     def _of_fields(self, found: Measured, known: State, step: float) -> list[Measurement]:

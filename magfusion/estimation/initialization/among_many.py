@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.settings import EstimatorSettings
 from magfusion.estimation.state import MOTION, State
 from magfusion.model.parameters import (
@@ -49,6 +50,22 @@ def among_all(
     cov[own] = cov[:, own] = 0.0
     cov[np.ix_(own, own)] = state.cov
     return replace(state, calibration=_whole(state, site), cov=cov)
+
+
+def score_among_all(
+    score: Score, known: tuple[Block, ...], site: Site, settings: EstimatorSettings
+) -> Score:
+    """Return the score of a start of some beacons as one whose calibration is of the whole site.
+
+    Parameters
+    ----------
+    known : tuple of Block
+        Of its calibration that is estimated; what was not heard did not respond.
+    """
+    estimated, _ = settings.blocks(site)
+    whole = np.zeros((dimension(estimated), score.by_calibration.shape[1]))
+    whole[_columns(estimated, [block.key for block in known])] = score.by_calibration
+    return replace(score, by_calibration=whole)
 
 
 def _key(block: Block, some: Site, site: Site) -> Key:

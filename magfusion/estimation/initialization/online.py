@@ -9,7 +9,7 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.demodulated_apart import each_alone
-from magfusion.estimation.initialization.among_many import among_all
+from magfusion.estimation.initialization.among_many import among_all, score_among_all
 from magfusion.estimation.initialization.handover import last_state
 from magfusion.estimation.integrity.judge import judged
 from magfusion.estimation.integrity.magnetometer_exclusion import Agreed, agreed
@@ -160,6 +160,8 @@ def find_online_start(
         if result.calibration.site.unheard or site.platform.further:
             known = (*result.blocks, *result.considered)
             state = among_all(state, known, site, settings)
+        if score is not None and result.calibration.site.unheard:
+            score = score_among_all(score, result.blocks, site, settings)
     except (EstimationError, InputError) as error:
         return NoStart(f"{error}.")
     except (RuntimeError, np.linalg.LinAlgError):

@@ -125,10 +125,12 @@ def gains(combine: Array, information: Array, gradient: Array) -> Array:
     ----------
     combine : ndarray, shape (suspects, h, columns)
         Of each, with columns of zeros where others have more.
+    information, gradient : ndarray, shape (h, h), (h,)
+        Or one of each suspect.
     """
     across = np.swapaxes(combine, 1, 2)
     value, vector = np.linalg.eigh(across @ information @ combine)
-    along = (np.swapaxes(vector, 1, 2) @ (across @ gradient)[..., None])[..., 0]
+    along = (np.swapaxes(vector, 1, 2) @ (across @ gradient[..., None]))[..., 0]
     kept = value > FARTHEST**-2
     chi_square = np.where(kept, along**2, 0.0) / np.where(kept, value, 1.0)
     return np.asarray(np.sum(chi_square - PER_PARAMETER * kept, axis=1))

@@ -7,27 +7,21 @@ innovations make the same information and gradient that `magfusion.estimation.in
 of a whole log, at the cost of one more product of matrices.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
-from magfusion.estimation.integrity.held import COVERED, Freed, finding_of, freed_by, gains
+from magfusion.estimation.integrity.asked import Asked, heard_in, of_beacons_named
+from magfusion.estimation.integrity.held import COVERED, Freed, finding_of, freed_by
 from magfusion.estimation.integrity.judgement import Judgement
 from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.statistics import SURE
-from magfusion.estimation.integrity.suspects import (
-    Inertial,
-    Stream,
-    Suspect,
-    held_blocks,
-    suspects,
-)
+from magfusion.estimation.integrity.suspects import Inertial, Stream
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.state import MOTION, State, states_of
-from magfusion.model.parameters import Block, dimension, prior_sigma
-from magfusion.model.prior import prior_sqrt_covariance
+from magfusion.model.audibility import are_many
+from magfusion.model.parameters import BeaconParameter, Block
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.units import Array
@@ -57,7 +51,7 @@ class Sums:
 
 
 class OnlineScore:
-    """Of everything that a running estimate holds.
+    """Of everything that a running estimate holds; of many beacons, those that it has just heard.
 
     Parameters
     ----------
@@ -68,6 +62,7 @@ class OnlineScore:
     """
 
     _sums: Sums | None
+    _heard_at: dict[str, float]
     _asked_at: float
     _said: Judgement
 
@@ -79,50 +74,33 @@ class OnlineScore:
         *,
         steady: bool,
     ) -> None:
-        self.site, self.held = site, held_blocks(site, estimated, steady=steady)
-        self.unit, self.size = prior_sigma(self.held), MOTION + dimension(estimated)
-        at = MOTION + dimension((*estimated, *considered))
-        self.blocks = tuple(
-            b._replace(columns=slice(at - MOTION + b.columns.start, at - MOTION + b.columns.stop))
-            for b in self.held
-        )
-        self.asked, self.whole = (*estimated, *considered, *self.blocks), at
-        self.spread = self._declared(considered)
+        self.site, self._tangent, self._steady = site, (estimated, considered), steady
         self._sums, self._asked_at, self._said = None, -np.inf, Judgement()
+        self._heard_at = {}
+        self._made = self._asked_of(() if are_many(site) else [b.name for b in site.beacons])
 
-    @cached_property
-    def suspects(self) -> tuple[Suspect, ...]:
-        """What one mistake would have wrong; of many beacons it takes gigabytes, so if asked."""
-        return tuple(suspects(self.site, self.held))
+    @property
+    def asked(self) -> Asked:
+        """What is asked at present."""
+        if are_many(self.site) and self._made.names != tuple(self._heard_at):
+            self._made = self._asked_of(self._heard_at)
+        return self._made
 
-    @cached_property
-    def _combine(self) -> Array:
-        most = max((one.combine.shape[1] for one in self.suspects), default=0)
-        every = np.zeros((len(self.suspects), dimension(self.held), most))
-        for room, one in zip(every, self.suspects, strict=True):
-            room[:, : one.combine.shape[1]] = one.combine
-        return every
-
-    def _declared(self, considered: tuple[Block, ...]) -> Array:
-        """Return a root of the covariance that the site declares of what is held."""
-        if not considered:
-            return np.zeros((len(self.unit), 0))
-        start = considered[0].columns.start
-        own = tuple(
-            b._replace(columns=slice(b.columns.start - start, b.columns.stop - start))
-            for b in considered
-        )
-        spread = prior_sqrt_covariance(self.site, own)
-        at, out = {b.key: b.columns for b in self.held}, np.zeros((len(self.unit), len(spread)))
-        for block in own:
-            if block.key in at:
-                out[at[block.key]] = spread[block.columns]
-        return out / self.unit[:, None]
+    def _asked_of(self, names: Iterable[str]) -> Asked:
+        estimated, considered = self._tangent
+        site = of_beacons_named(self.site, names)
+        return Asked(site, estimated, considered, steady=self._steady)
 
     def begin(self, score: Score | None, time: float) -> None:
         """Go on from the score of the smoothed beginning, at its last state (s)."""
-        alike = score is not None and [b.key for b in score.held] == [b.key for b in self.held]
-        if score is None or not alike or not self.held:
+        if score is None:
+            return
+        if are_many(self.site):
+            names = {b.owner for b in score.held if isinstance(b.parameter, BeaconParameter)}
+            self._heard_at = {b.name: time for b in self.site.beacons if b.name in names}
+        asked = self.asked
+        alike = [b.key for b in score.held] == [b.key for b in asked.held]
+        if not alike or not asked.held:
             return
         response = -np.concatenate([score.by_state[-1], score.by_calibration])
         self._sums = Sums(score.information, score.gradient, response, time)
@@ -137,7 +115,28 @@ class OnlineScore:
     def foresee(self, measurement: Measurement, predicted: State) -> None:
         """Predict a measurement for all that is asked: who asks for less of it finds it there."""
         if self._sums is not None:
-            measurement.linearize(states_of([predicted]), predicted.calibration, self.asked)
+            self._hear([measurement], predicted.time)
+            asked = self.asked.asked
+            measurement.linearize(states_of([predicted]), predicted.calibration, asked)
+
+    def _hear(self, measurements: Sequence[Measurement], time: float) -> None:
+        """Ask of those among many beacons that are heard, and no more of those long unheard."""
+        sums, before = self._sums, self.asked
+        if sums is None or not are_many(self.site):
+            return
+        known = self._heard_at | dict.fromkeys(heard_in(measurements, self.site), time)
+        kept = {name: known[name] for name in known if known[name] > time - MEMORY}
+        if kept.keys() <= self._heard_at.keys():  # nobody came: as cheap to go on asking
+            self._heard_at = {name: known[name] for name in self._heard_at}
+            return
+        self._heard_at = {b.name: kept[b.name] for b in self.site.beacons if b.name in kept}
+        asked = self.asked
+        here, there = asked.among(before)
+        information = np.zeros((len(asked.unit),) * 2)
+        gradient, response = information[0].copy(), np.zeros((asked.size, len(asked.unit)))
+        information[np.ix_(here, here)] = sums.information[np.ix_(there, there)]
+        gradient[here], response[:, here] = sums.gradient[there], sums.response[:, there]
+        self._sums = Sums(information, gradient, response, sums.time)
 
     def predict(self, before: State, after: State, transition: Array, imu: ImuSamples) -> None:
         """Carry the response on to a prediction.
@@ -152,16 +151,17 @@ class OnlineScore:
         sums = self._sums
         if sums is None:
             return
-        own = slice(0, self.size)
+        asked = self.asked
+        own = slice(0, asked.size)
         response = transition[own, own] @ sums.response
         if len(imu):
             time, gyro, accel = np.zeros(1), imu.gyro_body, imu.accel_body
             mean = ImuSamples(time, np.mean(gyro, axis=0)[None], np.mean(accel, axis=0)[None])
             stream = Stream(mean, np.stack([before.world_from_body, after.world_from_body]))
             by_bias = transition[:9, 9:MOTION]
-            for block in self.held:
+            for block in asked.held:
                 if isinstance(block.parameter, Inertial):
-                    unit = self.unit[block.columns]
+                    unit = asked.unit[block.columns]
                     bias = block.parameter.as_bias(stream)[0] * unit
                     response[:9, block.columns] -= by_bias @ bias
         kept = float(np.exp(-max(0.0, after.time - sums.time) / MEMORY))
@@ -171,30 +171,30 @@ class OnlineScore:
 
     def measured(self, measurements: Sequence[Measurement], predicted: State) -> None:
         """Take in the innovations of an epoch, as the gate has left them."""
-        sums = self._sums
+        self._hear(measurements, predicted.time)
+        sums, asked = self._sums, self.asked
         if sums is None or not measurements:
             return
         errors, jacobians = [], []
-        blocks, width = self.asked, self.whole - MOTION + len(self.unit)
+        blocks, width = asked.asked, asked.whole - MOTION + len(asked.unit)
         for measurement in measurements:
             rows = measurement.linearize(states_of([predicted]), predicted.calibration, blocks)
             rows, _ = rows.weighed(measurement.loss)
             jacobian = rows.jacobian(width).reshape(-1, MOTION + width)
-            told = np.any(jacobian[:, : self.whole] != 0.0, axis=1)
+            told = np.any(jacobian[:, : asked.whole] != 0.0, axis=1)
             errors.append(rows.error.reshape(-1)[told])
             jacobians.append(jacobian[told])
         error, jacobian = np.concatenate(errors), np.concatenate(jacobians)
         if not len(error):
             return
-        own, cov = slice(0, self.size), predicted.cov
-        by_state, by_held = jacobian[:, : self.whole], jacobian[:, self.whole :] * self.unit
+        own, cov = slice(0, asked.size), predicted.cov
+        by_state, by_held = jacobian[:, : asked.whole], jacobian[:, asked.whole :] * asked.unit
         across = by_state @ cov
         innovation = across @ by_state.T + np.eye(len(error))
         known = across[:, own] @ by_state[:, own].T
-        if self.size < self.whole:
-            rest = slice(self.size, self.whole)
-            learnt = np.linalg.solve(cov[rest, rest], cov[rest, own])
-            alone = cov[own, own] - cov[own, rest] @ learnt
+        if len(asked.rest):
+            learnt = np.linalg.solve(cov[np.ix_(asked.rest, asked.rest)], cov[asked.rest, own])
+            alone = cov[own, own] - cov[own, asked.rest] @ learnt
             known = by_state[:, own] @ alone @ by_state[:, own].T
         known = known + np.eye(len(error))
         shown = by_state[:, own] @ sums.response - by_held
@@ -216,24 +216,24 @@ class OnlineScore:
         return self._said
 
     def _ask(self, sums: Sums, state: State) -> Judgement:
-        pose_cov = state.cov[None, :6, :6]
+        pose_cov, asked = state.cov[None, :6, :6], self.asked
         information = 0.5 * (sums.information + sums.information.T)
         by = -sums.response
         score = Score(
-            self.held, information, sums.gradient, self.spread, by[None, :MOTION], by[MOTION:]
+            asked.held, information, sums.gradient, asked.spread, by[None, :MOTION], by[MOTION:]
         )
         information, gradient = score.with_declared()
-        asked = np.flatnonzero(gains(self._combine, information, gradient) > 0.0)
+        told = np.flatnonzero(asked.gains(information, gradient) > 0.0)
         found = (
-            freed_by(pose_cov, score, self.suspects[k], information, gradient)
-            for k in asked.tolist()
+            freed_by(pose_cov, score, asked.suspects[k], information, gradient)
+            for k in told.tolist()
         )
         likely = [one for one in found if one is not None and _speaks(one)]
         if not likely:
             return Judgement()
         cause = max(likely, key=lambda one: one.gain)
         turn, shift = np.linalg.norm(cause.moved[0].reshape(2, 3), axis=1)
-        finding = finding_of(self.site, score, cause)
+        finding = finding_of(asked.site, score, cause)
         return Judgement((finding,), turn=float(turn), shift=float(shift))
 
 
