@@ -1,6 +1,7 @@
 """Amplitudes without sign in estimators that follow the motion."""
 
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,13 @@ from scipy.spatial.transform import Rotation
 from magfusion.errors import InputError
 from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
 from magfusion.estimation.measurements.signs import along_axis, count_open, with_signs
+from magfusion.estimation.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.state import States
 from magfusion.files.log import write_log
+from magfusion.files.named_records import site_fields
 from magfusion.files.site import save_site
+from magfusion.files.stream import json_line, read_records
+from magfusion.files.stream_contents import fields_content
 from magfusion.model.parameters import Calibration, initial_calibration, predict_channels
 from magfusion.model.samples import FieldSamples, ImuSamples, Log
 from magfusion.model.trajectory import Trajectory
@@ -113,6 +118,43 @@ def test_jobs_that_take_no_amplitudes_say_so(
     save_site(calibration.site, tmp_path / "log" / "site.yaml")
     said = refuse("check", tmp_path / "log")
     assert "amplitudes without sign are taken by fix, smooth and navigate alone" in said
+
+
+def test_the_pipe_takes_amplitudes_as_a_log_has_them(calibration: Calibration) -> None:
+    site, samples = calibration.site, amplitudes(calibration, poses(), 1e-10)
+    lines = b"".join(json_line(fields_content(one)) for one in samples.epochs())
+    for number, numbered in enumerate(read_records(BytesIO(lines), "json")):
+        assert numbered.record is not None
+        assert numbered.record.fields is not None
+        found = along_axis(site_fields(numbered.record.fields, site), site)
+        one = samples.rows(slice(number, number + 1))
+        assert not found.signed
+        assert found.axes == one.axes
+        assert np.array_equal(found.phasor_sensor, one.phasor_sensor, equal_nan=True)
+        assert np.array_equal(found.phasor_cov, one.phasor_cov, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"amplitudes": {"C0": [-1e-9]}, "sigma": 1e-10}, "an amplitude has no sign"),
+        ({"sigma": 1e-10}, "either phasors or amplitudes"),
+        ({"amplitudes": {"C0": [1e-9]}}, "either sigma or covariance"),
+    ],
+)
+def test_what_is_no_record_of_amplitudes_is_refused(fields: dict[str, object], said: str) -> None:
+    line = json_line({"fields": {"time": 0.0, "window": 0.1, **fields}})
+    (found,) = read_records(BytesIO(line), "json")
+    assert found.record is None
+    assert said in found.refusal
+
+
+def test_amplitudes_among_phasors_are_refused(calibration: Calibration) -> None:
+    site, samples = calibration.site, amplitudes(calibration, poses(), 1e-10)
+    navigator = Navigator(site, NavigatorSettings("ekf"))
+    navigator.add_fields(samples.rows(slice(0, 1)))
+    with pytest.raises(InputError, match="amplitudes without sign come among phasors"):
+        navigator.add_fields(replace(samples.rows(slice(1, 2)), signed=True))
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from magfusion.errors import InputError
 from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
 from magfusion.estimation.integrity.detection import DetectionFilter
 from magfusion.estimation.integrity.freeze import Freeze
@@ -158,6 +159,10 @@ class Arrivals:
     def add_fields(self, samples: FieldSamples, steady: SteadyFields | None, after: float) -> int:
         """Take phasors, as `Navigator.add_fields`; return how many are not after a time (s)."""
         check_clock("fields", samples.time, self._newest)
+        if self.fields and self.fields[-1].signed != samples.signed:
+            raise InputError(
+                "fields: amplitudes without sign come among phasors; give one or other"
+            )
         late = 0
         for i in range(len(samples)):
             one = samples.rows(slice(i, i + 1))

@@ -106,6 +106,17 @@ def _phasor(value: object) -> ComplexArray:
     return out
 
 
+def _amplitudes(value: object) -> ComplexArray:
+    """Return the amplitudes of a beacon's tones, (tones, 3), in the first column."""
+    found = _series(value)
+    if np.any(found < 0.0):
+        text = "an amplitude has no sign; it should not be below zero, or be a phasor"
+        raise PydanticCustomError("amplitudes", text)
+    out = np.full((len(found), 3), np.nan, dtype=complex)
+    out[:, 0] = found
+    return out
+
+
 def _covariance(value: object) -> Array:
     what = "a list of symmetric, positive 3 x 3 matrices (T^2), one for each tone"
     found = _numbers(value, what)
@@ -164,7 +175,7 @@ class ReferenceRecord(_Arrays):
 
 
 class FieldsRecord(_Arrays):
-    """Phasors of one window; of every detected beacon, its tones.
+    """Phasors of one window, or amplitudes of one axis; of every detected beacon, its tones.
 
     ``sigma`` (T) is the standard deviation of each component's real and imaginary part;
     ``covariance`` takes its place where the axes differ; ``magnetometer`` is the name of the one of
@@ -173,7 +184,8 @@ class FieldsRecord(_Arrays):
 
     time: float = Field(ge=-LATEST, le=LATEST)
     window: float = Field(ge=1e-6, le=3600.0)
-    phasors: dict[str, Annotated[ComplexArray, PlainValidator(_phasor)]]
+    phasors: dict[str, Annotated[ComplexArray, PlainValidator(_phasor)]] | None = None
+    amplitudes: dict[str, Annotated[ComplexArray, PlainValidator(_amplitudes)]] | None = None
     sigma: float | None = Field(default=None, ge=1e-30, le=1.0)
     covariance: dict[str, Annotated[Array, PlainValidator(_covariance)]] | None = None
     magnetometer: str | None = None
@@ -182,12 +194,19 @@ class FieldsRecord(_Arrays):
     def _one_noise(self) -> "FieldsRecord":
         if (self.sigma is None) == (self.covariance is None):
             raise PydanticCustomError("noise", "it should have either sigma or covariance")
-        for name, phasor in self.phasors.items():
+        if (self.phasors is None) == (self.amplitudes is None):
+            raise PydanticCustomError("kind", "it should have either phasors or amplitudes")
+        for name, phasor in self.measured.items():
             cov = None if self.covariance is None else self.covariance.get(name)
             if self.covariance is not None and (cov is None or len(cov) != len(phasor)):
                 given = {"name": name}
                 raise PydanticCustomError("noise", "covariance lacks a tone of {name}", given)
         return self
+
+    @property
+    def measured(self) -> dict[str, ComplexArray]:
+        """Of each beacon the numbers of its tones, (tones, 3)."""
+        return self.phasors or self.amplitudes or {}
 
 
 class TemperatureRecord(StrictModel):
@@ -269,7 +288,7 @@ def field_samples(entry: FieldsRecord, channels: tuple[tuple[str, int], ...]) ->
     """
     phasor = np.full((len(channels), 3), np.nan, dtype=complex)
     cov = np.full((len(channels), 3, 3), np.nan)
-    for name, tones in entry.phasors.items():
+    for name, tones in entry.measured.items():
         for tone, value in enumerate(tones):
             if (name, tone) not in channels:
                 known = ", ".join(f"{b} tone {t}" for b, t in channels)
@@ -284,6 +303,8 @@ def field_samples(entry: FieldsRecord, channels: tuple[tuple[str, int], ...]) ->
         channels=channels,
         phasor_sensor=phasor[None],
         phasor_cov=cov[None],
+        axes="xyz" if entry.amplitudes is None else "x",
+        signed=entry.amplitudes is None,
     )
 
 

@@ -6,7 +6,6 @@ from typing import Any, BinaryIO
 import msgpack
 import numpy as np
 
-from magfusion.errors import InputError
 from magfusion.files.drive_columns import column_of
 from magfusion.files.stream import Format, json_line
 from magfusion.model.drive import DriveSamples
@@ -79,9 +78,8 @@ def fields_contents(samples: FieldSamples) -> Iterator[dict[str, Any]]:
 
 
 def fields_content(samples: FieldSamples) -> dict[str, Any]:
-    """Return the phasors of one window as a record, each with its covariance."""
-    if not samples.signed:
-        raise InputError("the pipe takes phasors, and no amplitudes; navigate the log itself")
+    """Return the phasors or amplitudes of one window as a record, each with its covariance."""
+    own = "xyz".index(samples.axes) if not samples.signed else 0
     phasors: dict[str, list[Any]] = {}
     covariance: dict[str, list[Any]] = {}
     tones: dict[str, dict[int, int]] = {}
@@ -95,11 +93,13 @@ def fields_content(samples: FieldSamples) -> dict[str, Any]:
         for tone in range(max(rows) + 1):
             if tone in rows and valid[rows[tone]]:
                 value = samples.phasor_sensor[0, rows[tone]]
-                phasors[name].append([_or_none(value.real), _or_none(value.imag)])
+                both = [_or_none(value.real), _or_none(value.imag)]
+                phasors[name].append(both if samples.signed else float(abs(value[own])))
                 covariance[name].append(samples.phasor_cov[0, rows[tone]].tolist())
             else:
                 phasors[name].append(None)
                 covariance[name].append(np.eye(3).tolist())
     time, window = float(samples.time[0]), float(samples.window[0])
-    content = {"time": time, "window": window, "phasors": phasors, "covariance": covariance}
+    kind = "phasors" if samples.signed else "amplitudes"
+    content = {"time": time, "window": window, kind: phasors, "covariance": covariance}
     return {"fields": content}

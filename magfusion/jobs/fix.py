@@ -205,12 +205,12 @@ def _run_coil(
     report: Report,
 ) -> Figures:
     """Fix a receiver of one axis, whose roll about it nothing tells."""
-    from magfusion.estimation.demodulation import phasors
+    from magfusion.estimation.demodulation import fix_inputs, phasors
     from magfusion.jobs.fix_coil import find_coil
     from magfusion.jobs.inputs import found_in, named, refuse_failed
 
     with named(job.log_path):
-        samples, _ = phasors(log, site, lockin)
+        samples, _ = fix_inputs(phasors(log, site, lockin)[0], log, site)
     found = find_coil(log, samples, site, free, report)
     with claimed as whole:
         directory = found_in(whole, found.trust)

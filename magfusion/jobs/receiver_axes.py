@@ -5,7 +5,6 @@ from pathlib import Path
 from magfusion.errors import InputError
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
-from magfusion.receiver.slots import has_schedule
 
 
 def check_axes(
@@ -22,11 +21,6 @@ def check_axes(
         raise InputError(
             f"{key} of a receiver of fewer than three axes neither warming nor coil_kappa_m2 is"
             " taken into account; leave them out"
-        )
-    if len(declared) < 3 and has_schedule(site):
-        raise InputError(
-            f"{key} coils in time slots are not yet told apart by a receiver of fewer than three"
-            " axes; drive them by tones at once"
         )
     for stream, found in (
         ("fields", None if fields is None else fields.axes if fields.signed else declared),

@@ -277,7 +277,7 @@ def _rested(
 
 def _with_gain(job: Job, log: Log, site: Site, settings: SmootherSettings) -> Site:
     """Return the site with the gain that the epochs of a receiver of one axis tell."""
-    from magfusion.estimation.demodulation import phasors
+    from magfusion.estimation.demodulation import fix_inputs, phasors
     from magfusion.estimation.snapshot.coil_gain import with_found_gain
     from magfusion.jobs.inputs import named
 
@@ -287,7 +287,8 @@ def _with_gain(job: Job, log: Log, site: Site, settings: SmootherSettings) -> Si
             " gains are known as platform.magnetometer.sigma.matrix"
         )
     with named(job.log_path):
-        return with_found_gain(phasors(log, site, settings.lockin)[0], site)
+        fields, _ = fix_inputs(phasors(log, site, settings.lockin)[0], log, site)
+        return with_found_gain(fields, site)
 
 
 def _agreed(

@@ -10,6 +10,7 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.estimation.integrity.judgement import JudgedState
 from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
+from magfusion.estimation.measurements.signs import along_axis
 from magfusion.estimation.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
 from magfusion.estimation.state_of_now import CarriedState
@@ -208,7 +209,7 @@ def _take_in(
         missing += Counter(magnetometer=len(record.magnetometer.time) - len(time))
         newest = max(newest, _last(time))
     if record.fields is not None:
-        navigator.add_fields(site_fields(record.fields, site))
+        navigator.add_fields(along_axis(site_fields(record.fields, site), site))
         newest = max(newest, record.fields.time)
     return newest
 

@@ -99,6 +99,9 @@ class FieldSamples:
         axis.
     magnetometers : tuple of str
         Name of the one that measures each channel; empty where there are not several.
+    turned : ndarray, shape (n, channels, 3, 3), optional
+        From the body's axes when each phasor was measured to those of ``time``, where phasors are
+        in the axes of then: of coils driven in turn, by a receiver that lacks axes.
     """
 
     time: Array
@@ -110,6 +113,7 @@ class FieldSamples:
     axes: str = "xyz"
     signed: bool = True
     magnetometers: tuple[str, ...] = ()
+    turned: Array | None = None
 
     def __post_init__(self) -> None:
         n, c = len(self.time), len(self.channels)
@@ -186,6 +190,7 @@ class FieldSamples:
             self.axes,
             self.signed,
             self.magnetometers,
+            None if self.turned is None else self.turned[kept],
         )
 
     def of_magnetometer(self, name: str) -> "FieldSamples":

@@ -4,6 +4,7 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.model.marks import SILENT, Marks
+from magfusion.model.quaternion import matrices
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site
 from magfusion.receiver.marked_bursts import LONGEST_EPOCH
@@ -37,8 +38,9 @@ def joins(site: Site, marks: Marks | None = None) -> bool:
 def whole_cycles(samples: FieldSamples, imu: ImuSamples, site: Site) -> FieldSamples:
     """Join the slots of each cycle to one row, as if they were simultaneous.
 
-    The fields are turned by the gyro to the mean time of the slots; where the body moves, what it
-    moves by within the cycle remains, for which ``ahead`` tells when each was measured.
+    The fields are turned by the gyro to the mean time of the slots, or, of a receiver that lacks
+    axes, ``turned`` tells by how much that is; where the body moves, what it moves by within the
+    cycle remains, for which ``ahead`` tells when each was measured.
 
     Parameters
     ----------
@@ -81,16 +83,29 @@ def cycles(
     epoch : int ndarray, shape (n,), optional
         The cycle of each row, increasing, where that is known.
     """
-    cycle = _cycle_of(samples, site) if epoch is None else np.unique(epoch, return_inverse=True)[1]
+    cycle = cycle_of(samples, site) if epoch is None else np.unique(epoch, return_inverse=True)[1]
     row, channel = np.nonzero(samples.valid)
     number = int(cycle[-1]) + 1
     time: Array = np.bincount(cycle, samples.time) / np.bincount(cycle)
-    still_from_measured = measured_from_still.back(samples.time[row])
-    turn = measured_from_still(time)[cycle[row]] @ still_from_measured
     phasor = np.full((number, *samples.phasor_sensor.shape[1:]), np.nan, dtype=np.complex128)
-    phasor[cycle[row], channel] = (turn @ samples.phasor_sensor[row, channel][..., None])[..., 0]
     cov = np.full((number, *samples.phasor_cov.shape[1:]), np.nan)
-    cov[cycle[row], channel] = turn @ samples.phasor_cov[row, channel] @ np.swapaxes(turn, 1, 2)
+    turned = None
+    if site.platform.magnetometer.lacking:
+        # Of what lies along the other axes nothing is known: no field can be turned.
+        still_from_body = matrices(measured_from_still.still_from_body(samples.time[row]))
+        still_from_epoch = matrices(measured_from_still.still_from_body(time))[cycle[row]]
+        turned = np.broadcast_to(np.eye(3), cov.shape).copy()
+        turned[cycle[row], channel] = np.swapaxes(still_from_epoch, 1, 2) @ still_from_body
+        phasor[cycle[row], channel] = samples.phasor_sensor[row, channel]
+        cov[cycle[row], channel] = samples.phasor_cov[row, channel]
+    else:
+        still_from_measured = measured_from_still.back(samples.time[row])
+        turn = measured_from_still(time)[cycle[row]] @ still_from_measured
+        phasor[cycle[row], channel] = (turn @ samples.phasor_sensor[row, channel][..., None])[
+            ..., 0
+        ]
+        own = samples.phasor_cov[row, channel]
+        cov[cycle[row], channel] = turn @ own @ np.swapaxes(turn, 1, 2)
     ahead = np.zeros((number, len(samples.channels)))
     ahead[cycle[row], channel] = samples.time[row] - time[cycle[row]]
     return FieldSamples(
@@ -100,6 +115,8 @@ def cycles(
         phasor_sensor=phasor,
         phasor_cov=cov,
         ahead=ahead,
+        axes=samples.axes,
+        turned=turned,
     )
 
 
@@ -114,7 +131,7 @@ def _lengths(samples: FieldSamples, cycle: IntArray, site: Site) -> Array:
     return np.asarray(end - begin)
 
 
-def _cycle_of(samples: FieldSamples, site: Site) -> IntArray:
+def cycle_of(samples: FieldSamples, site: Site) -> IntArray:
     """Return the cycle of each row, counted from the first: by the coils that it holds.
 
     A source whose clock runs away from the log's keeps no schedule for long.

@@ -44,7 +44,7 @@ from magfusion.receiver.slots import (
     slot_lockin,
     slot_settings_of,
 )
-from magfusion.receiver.turn import Turn, on_clock, turn_of
+from magfusion.receiver.turn import Turn, on_clock, slot_turn_of
 from magfusion.receiver.windows import LockinSettings, default_settings, sent_frequencies_hz
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -564,7 +564,7 @@ class SlotReceiver(Receiver):
         self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
     ) -> tuple[FieldSamples, IntArray]:
         """Return the phasors of driven slots, freed of what the silent ones tell."""
-        turn = turn_of(imu, site)
+        turn = slot_turn_of(imu, site)
         values = self._held(waveform, turn, windows, site)
         return demodulate_slots(values, turn, site, self.settings)
 
@@ -572,7 +572,7 @@ class SlotReceiver(Receiver):
         self, waveform: Waveform, imu: ImuSamples, windows: Windows, since: int
     ) -> tuple[FieldSamples, int]:
         """Return the phasors of slots from a number on, as `Receiver.pushed`."""
-        turn = turn_of(imu, self.site)
+        turn = slot_turn_of(imu, self.site)
         same = self._values.number[:, None] == windows.number
         known = self._values.rows(np.any(same, axis=1))
         fresh = windows.rows(~np.any(same, axis=0))
@@ -580,7 +580,7 @@ class SlotReceiver(Receiver):
         found, number = demodulate_slots(self._values, turn, self.site, self.settings)
         number, found = number[number >= since], found.rows(number >= since)
         seen = len(found)
-        if seen and self.joined:
+        if seen and self.joined and not self.site.platform.magnetometer.lacking:
             found = self._joined(found, number, turn)
         return found, seen
 

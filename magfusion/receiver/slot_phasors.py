@@ -340,10 +340,12 @@ def _rows(
     shape = (len(time), len(site.channels), 3)
     every = np.full(shape, np.nan, dtype=np.complex128)
     every[np.arange(len(time)), channel] = phasor
+    every[..., site.platform.magnetometer.lacking] = np.nan
     return FieldSamples(
         time=time,
         window=length,
         channels=site.channels,
         phasor_sensor=every,
         phasor_cov=np.full((*shape, 3), np.nan),
+        axes=site.platform.magnetometer.axes,
     )

@@ -96,6 +96,16 @@ def turn_of(imu: ImuSamples, site: Site) -> Turn:
     return Turn(body_turn_of(imu), measured_from_body(site))
 
 
+def slot_turn_of(imu: ImuSamples, site: Site) -> Turn:
+    """Return how the field of a slot turns; not at all where a receiver lacks axes.
+
+    What of a field lies along the others nobody measured, so that none can be turned into another.
+    """
+    if not site.platform.magnetometer.lacking:
+        return turn_of(imu, site)
+    return Turn(lambda time: np.tile([[1.0], [0.0], [0.0], [0.0]], (1, len(time))), np.eye(3))
+
+
 def body_turn_of(imu: ImuSamples) -> Callable[[Array], Array]:
     """Return what gives, at times (m,), the ``still_from_body`` of `turn_of`, shape (4, m).
 

@@ -25,7 +25,7 @@ from magfusion.model.marks import Marks
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
-from magfusion.receiver.cycles import cycles, joins
+from magfusion.receiver.cycles import cycle_of, cycles, joins
 from magfusion.receiver.receiver import Receiver
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.turn import on_clock, turn_of
@@ -215,13 +215,22 @@ def _of_cycles(log: Log, waveform: Waveform, site: Site, settings: EstimatorSett
     """Return the phasors of a slotted tracker, a cycle an epoch, and no more than a start needs."""
     receiver = Receiver.of(site, settings.lockin)
     _, found = receiver.whole(waveform, log.imu)
+    if site.platform.magnetometer.lacking:  # whose slots stay epochs of their own
+        cycle = cycle_of(found, site)
+        every = _every(int(cycle[-1]) + 1, found.time)
+        return replace(log, waveform=None, fields=found.rows((cycle[-1] - cycle) % every == 0))
     known = on_clock(log.imu, site.platform.imu.time_offset)
     epochs = cycles(found, turn_of(known, site), site)
-    if len(epochs) < 2:
-        raise InputError("magnetometer: no two cycles of time slots are usable; record longer")
-    every = max(1, int(len(epochs) / (START_RATE_HZ * float(np.ptp(epochs.time)) + 1.0)))
+    every = _every(len(epochs), epochs.time)
     rows = slice((len(epochs) - 1) % every, None, every)
     return replace(log, waveform=None, fields=epochs.rows(rows))
+
+
+def _every(count: int, time: Array) -> int:
+    """Return which of so many cycles a start is made of."""
+    if count < 2:
+        raise InputError("magnetometer: no two cycles of time slots are usable; record longer")
+    return max(1, int(count / (START_RATE_HZ * float(np.ptp(time)) + 1.0)))
 
 
 def _wider(result: Smoothed, honest: Smoothed) -> tuple[float, float]:

@@ -141,13 +141,15 @@ def _with_share(
     variance : ndarray, shape (channels,)
         (T^2)
     """
-    some = valid & np.any(phasors.sqrt_information[0], axis=(1, 2))
-    root = np.where(some[:, None, None], phasors.sqrt_information[0, :, :3, :3], np.eye(3))
+    given = phasors.sqrt_information[0, :, :3, :3]
+    some = np.any(given, axis=2) & valid[:, None]  # components that the receiver lacks are zero
+    root = given * some[:, :, None] + np.eye(3) * ~some[:, None]
     inverse = np.linalg.inv(root)
-    cov = inverse @ np.swapaxes(inverse, 1, 2)
-    more = variance[:, None, None] * np.eye(3)
+    cov = inverse @ np.swapaxes(inverse, 1, 2) * (some[:, :, None] & some[:, None])
+    more = variance[:, None, None] * np.eye(3) * some[:, None]
     before = np.ones(len(valid)) if phasors.excess is None else phasors.excess[0]
     own, wide = cov / before[:, None, None] + more, cov + alike * more
-    excess = np.trace(wide, axis1=1, axis2=2) / np.trace(own, axis1=1, axis2=2)
+    less, more_wide = (np.trace(part, axis1=1, axis2=2) for part in (own, wide))
+    excess = np.divide(more_wide, less, out=np.ones_like(less), where=less > 0.0)
     whitening = paired_whitening(wide[None], some[None])
     return replace(phasors, sqrt_information=whitening, excess=excess[None])

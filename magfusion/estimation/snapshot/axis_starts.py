@@ -57,7 +57,7 @@ def starts_on_grid(problem: Problem) -> tuple[State, int]:
     state = problem.start(rotation.reshape(-1, 3, 3), position.reshape(-1, 3))
     if np.any(asked.free):
         own = problem.rows(np.repeat(np.arange(n), count))
-        state = state._replace(phase=_phases(own, state, asked.free))
+        state = state._replace(phase=phases_of(own, state, asked.free))
     return state, count
 
 
@@ -110,7 +110,7 @@ def least_turn(from_vector: Array, to_vector: Array) -> Array:
     return np.asarray(turn.as_matrix().reshape(*to_vector.shape, 3))
 
 
-def _phases(problem: Problem, state: State, free: BoolArray) -> Array:
+def phases_of(problem: Problem, state: State, free: BoolArray) -> Array:
     """Return the drive phases with which states explain the phasors best, (m, channels)."""
     seen = predict_channels(problem.at(state), problem.time, state.rotation, state.position)
     measured = problem.measured[..., :3] + 1j * problem.measured[..., 3:]

@@ -248,6 +248,8 @@ class _Problem:
         field = predict_channels(self.calibration, self.epochs.time[epoch], attitude, place)
         size = np.linalg.norm(field, axis=2) * np.linalg.norm(axis, axis=1, keepdims=True)
         error = self._error(place) * size / np.sqrt(3.0)
+        if self.epochs.swing is not None:  # which way nobody knows: the roll is open
+            error = np.hypot(error, self.epochs.swing[epoch] * size / np.sqrt(2.0))
         return np.asarray(np.where(there, np.hypot(noise, error), 1.0))
 
     def normal(self, epoch: IntArray, state: Array, sigma: Array) -> Normal:

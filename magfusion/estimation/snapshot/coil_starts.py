@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magfusion.errors import EstimationError
+from magfusion.model.one_axis import axis_of
 from magfusion.model.parameters import Calibration, predict_channels
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Beacon, Magnetometer, MagnetometerSigma, Site
@@ -40,6 +41,8 @@ class CoilEpochs:
         Whether the phase tells the sign.
     parts : ndarray, shape (channels,), optional
         How many numbers each tells: two where its field turns and phases are known, else one.
+    swing : ndarray, shape (n, channels), optional
+        How far the coil had turned since, or would, where channels are measured in turn (rad).
     """
 
     time: Array
@@ -47,6 +50,7 @@ class CoilEpochs:
     sigma: Array
     signed: bool
     parts: IntArray | None = None
+    swing: Array | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -60,12 +64,14 @@ class CoilEpochs:
         if not signed:
             measured = np.where(np.isfinite(measured), np.abs(measured), np.nan)
         parts = np.concatenate([_turning(beacon) for beacon in site.beacons]) if signed else None
-        return CoilEpochs(fields.time, measured.astype(np.complex128), sigma, signed, parts)
+        own = fields.time, measured.astype(np.complex128), sigma, signed, parts
+        return CoilEpochs(*own, _swing(fields, site.platform.magnetometer))
 
     def rows(self, kept: BoolArray | slice) -> "CoilEpochs":
         """Return some epochs."""
         own = self.time[kept], self.measured[kept], self.sigma[kept]
-        return CoilEpochs(*own, self.signed, self.parts)
+        swing = None if self.swing is None else self.swing[kept]
+        return CoilEpochs(*own, self.signed, self.parts, swing)
 
     @property
     def heard(self) -> IntArray:
@@ -77,6 +83,14 @@ class CoilEpochs:
         """How many numbers each row tells, shape (n,)."""
         parts = 1 if self.parts is None else self.parts
         return np.asarray(np.sum(np.isfinite(self.measured) * parts, axis=1))
+
+
+def _swing(fields: FieldSamples, sensor: Magnetometer) -> Array | None:
+    """Return by how much the one axis swings to where it is at the time of the epoch."""
+    if fields.turned is None:
+        return None
+    axis = axis_of(sensor)
+    return np.asarray(np.linalg.norm(fields.turned @ axis - axis, axis=-1))
 
 
 def _turning(beacon: Beacon) -> IntArray:

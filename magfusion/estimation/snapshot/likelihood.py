@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from magfusion.estimation.snapshot.axis_starts import mirrored, starts_on_grid, with_least_roll
 from magfusion.estimation.snapshot.candidates import attitudes, positions
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
+from magfusion.estimation.snapshot.lone_starts import stands_alone, starts_about_one
 from magfusion.estimation.snapshot.many import fix_parts, parts_heard
 from magfusion.estimation.snapshot.place import outside
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA, Epochs, Problem, State, epochs_of
@@ -143,6 +144,8 @@ def _solved(epochs: Epochs) -> Fixes:
 
 def _starts_of_axes(epochs: Epochs) -> tuple[State, int]:
     """Return the most likely states of epochs that lack components, so many rows an epoch."""
+    if stands_alone(epochs.problem.calibration.site):
+        return _lone_starts(epochs.problem)
     start, count = starts_on_grid(epochs.problem)
     n = len(epochs.samples)
     epoch = np.repeat(np.arange(n), count)
@@ -155,6 +158,18 @@ def _starts_of_axes(epochs: Epochs) -> tuple[State, int]:
     again = solved_from(soft.rows(np.repeat(np.arange(n), order.shape[1])), behind).state
     both = (np.stack(pair, axis=1) for pair in zip(ahead, again, strict=True))
     return State(*(part.reshape(-1, *part.shape[2:]) for part in both)), 2 * order.shape[1]
+
+
+def _lone_starts(problem: Problem) -> tuple[State, int]:
+    """Return the states that differ of those that a lone source leaves open."""
+    start, count = starts_about_one(problem)
+    n = len(problem.time)
+    rough = solved_from(_softened(problem).rows(np.repeat(np.arange(n), count)), start)
+    turn, place = rough.state.rotation, rough.state.position
+    parts = turn.reshape(n, count, 3, 3), place.reshape(n, count, 3)
+    order, _ = _ranked(*parts, rough.cost.reshape(n, count))
+    kept = (order + count * np.arange(n)[:, None]).ravel()
+    return rough.state.rows(kept), order.shape[1]
 
 
 def _softened(problem: Problem) -> Problem:

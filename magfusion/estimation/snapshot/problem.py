@@ -70,6 +70,8 @@ class Problem:
         Nuisances found beside the pose.
     prior : optional
         Poses with their whitening.
+    turned : ndarray, shape (m, channels, 3, 3), optional
+        As of `magfusion.model.samples.FieldSamples`.
     """
 
     calibration: Calibration
@@ -80,6 +82,7 @@ class Problem:
     blocks: tuple[Block, ...]
     gravity: Gravity | None
     prior: Prior | None
+    turned: Array | None = None
 
     def rows(self, chosen: Chosen) -> "Problem":
         """Return some rows, or rows repeated."""
@@ -91,6 +94,7 @@ class Problem:
             noise=None if self.noise is None else self.noise[chosen],
             gravity=None if self.gravity is None else self.gravity.rows(chosen),
             prior=None if self.prior is None else self.prior.rows(chosen),
+            turned=None if self.turned is None else self.turned[chosen],
         )
 
     @property
@@ -206,6 +210,7 @@ def epochs_of(
             blocks=blocks,
             gravity=None if gravity is None else gravity.rows(rows),
             prior=None if known is None else known.rows(rows),
+            turned=some.turned,
         )
         yield Epochs(problem, some, survey_error)
 

@@ -6,21 +6,19 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.snapshot.apart import linearized, predicted
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA, Problem, State, epochs_of
 from magfusion.estimation.snapshot.survey_error import honest_covariance, survey_jacobians, whitened
 from magfusion.estimation.solve.batched import Normal, minimise, open_inverse
 from magfusion.model.field import skew
 from magfusion.model.field_map import block_diagonal
-from magfusion.model.noise import stacked
 from magfusion.model.parameters import (
     GAIN,
     PHASE,
     Calibration,
     Parameter,
     dimension,
-    linearize_channels,
-    predict_channels,
 )
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trajectory import Trajectory
@@ -134,8 +132,9 @@ def _cost_of(known: Columns | None, problem: Problem) -> Array:
 
 def cost(problem: Problem, state: State) -> Array:
     """Return the squared residual of each row, shape (m,), in units of its sigma."""
-    phasor = predict_channels(problem.at(state), problem.time, state.rotation, state.position)
-    error = whitened(problem.sqrt_information, (stacked(phasor) - problem.measured)[..., None])
+    error = whitened(
+        problem.sqrt_information, (predicted(problem, state) - problem.measured)[..., None]
+    )
     total = np.einsum("mij,mij->m", error, error)
     for _, known in _known(problem, state):
         total += np.einsum("mi,mi->m", known, known)
@@ -185,9 +184,7 @@ def _pose_difference(rotation0: Array, position0: Array, rotation: Array, positi
 
 def _columns(problem: Problem, state: State) -> Array:
     """Return the whitened rows of the field: Jacobian, then residual as the last column."""
-    value, by_pose, by_nuisance = linearize_channels(
-        problem.at(state), problem.blocks, problem.time, state.rotation, state.position
-    )
+    value, by_pose, by_nuisance = linearized(problem, state)
     error = (value - problem.measured)[..., None]
     return whitened(
         problem.sqrt_information, np.concatenate([by_pose, by_nuisance, error], axis=-1)

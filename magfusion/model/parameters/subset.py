@@ -66,6 +66,7 @@ def samples_of(samples: FieldSamples, channels: IntArray) -> FieldSamples:
         phasor_sensor=samples.phasor_sensor[:, channels],
         phasor_cov=samples.phasor_cov[:, channels],
         ahead=None if samples.ahead is None else samples.ahead[:, channels],
+        turned=None if samples.turned is None else samples.turned[:, channels],
     )
 
 
