@@ -105,3 +105,13 @@ def test_where_everything_is_known_there_is_no_stop() -> None:
         platform=replace(site.platform, magnetometer=sensor),
     )
     assert next_motion(known, PLACES, 3, STOP, known=True).stops == ()
+
+
+def test_no_stop_is_where_the_fields_err_as_at_another_while_there_is_room() -> None:
+    site = replace(loose(), model_error=0.005, model_error_length=0.5)
+    found = next_motion(site, PLACES, 6, STOP, known=False)
+    places = np.array([stop.position_world for stop in found.stops])
+    apart = np.linalg.norm(places[:, None] - places, axis=2) + 10.0 * np.eye(len(places))
+    assert np.min(apart) > site.model_error_length
+    few = next_motion(site, PLACES[:2], 5, STOP, known=False)
+    assert len(few.stops) == 5

@@ -166,7 +166,7 @@ def static_motion(position_world: Array, world_from_body: Rotation) -> Motion:
     return Motion(still, attitude, BPoly(np.zeros((1, 1)), np.array([0.0, 1.0])))
 
 
-def _rate(duration: float, rests: Rests) -> BPoly:
+def progress_rate(duration: float, rests: Rests) -> BPoly:
     """Return the rate of progress: quintic ramps between 0 (rest) and 1 (full speed)."""
     if not duration > 0.0:
         raise InputError(f"duration: found {duration} s; give a positive number of seconds")
@@ -191,7 +191,7 @@ def _rate(duration: float, rests: Rests) -> BPoly:
 
 def _progress(duration: float, rests: Rests) -> tuple[BPoly, float, Array]:
     """Return the rate of progress, the seconds of moving, and the knots of attitude over them."""
-    rate = _rate(duration, rests)
+    rate = progress_rate(duration, rests)
     moving = float(rate.integrate(rate.x[0], rate.x[-1]))
     return rate, moving, np.arange(np.ceil(moving / ATTITUDE_KNOT) + 2) * ATTITUDE_KNOT
 

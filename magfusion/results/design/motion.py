@@ -3,6 +3,7 @@
 A stop is a pose held for some time.  What it tells of the calibration is what its fields leave when
 the pose itself is marginalised, of which only gravity is known; or all of it, where poses are
 measured.  What an IMU tells of the way between stops is left out: a log determines more, not less.
+Where fields err, they err alike at places close by: of these only one is chosen.
 
 A parameter counts by how far one sigma of it moves the fields where it is to be navigated, in
 units of their noise: so metres, radians and shares can be compared.
@@ -171,11 +172,13 @@ def next_motion(site: Site, places: Array, count: int, stop: float, *, known: bo
         ~is_free(blocks) & (limit < OUT_OF_REACH),
     )
     stops: list[Stop] = []
-    ratio = _ratio(information)
+    ratio, fresh = _ratio(information), np.ones(len(poses.root), dtype=bool)
     for _ in range(count if np.any(parameters.asked) else 0):
         worst = parameters.worst(ratio)
-        chosen, reached = _best(information, poses, worst)
+        chosen, reached = _best(information, poses, worst, np.flatnonzero(fresh))
         information = information + poses.root[chosen].T @ poses.root[chosen]
+        fresh = fresh & ~_errs_alike(site, poses, chosen)
+        fresh = fresh if np.any(fresh) else np.ones_like(fresh)
         stops.append(
             Stop(
                 poses.position_world[chosen],
@@ -246,13 +249,21 @@ def _ratio(information: Array) -> Array:
     return np.sqrt(np.diagonal(np.linalg.inv(information), axis1=-2, axis2=-1))
 
 
-def _best(information: Array, poses: Poses, worst: int) -> tuple[int, float]:
-    """Return the candidate that leaves the least sigma of a parameter, and that sigma."""
+def _errs_alike(site: Site, poses: Poses, chosen: int) -> BoolArray:
+    """Return where the model error is that of a stop: a second one there would not be as good."""
+    if site.model_error == 0.0:
+        return np.zeros(len(poses.root), dtype=bool)
+    apart = np.linalg.norm(poses.position_world - poses.position_world[chosen], axis=1)
+    return np.asarray(apart <= site.model_error_length)
+
+
+def _best(information: Array, poses: Poses, worst: int, among: IntArray) -> tuple[int, float]:
+    """Return which of some candidates leaves the least sigma of a parameter, and that sigma."""
     found = []
-    for start in range(0, len(poses.root), AT_ONCE):
-        root = poses.root[start : start + AT_ONCE]
+    for start in range(0, len(among), AT_ONCE):
+        root = poses.root[among[start : start + AT_ONCE]]
         ratio = _ratio(information + np.swapaxes(root, 1, 2) @ root)
         found.append(ratio[:, worst])
     each = np.concatenate(found)
     chosen = int(np.argmin(each))
-    return chosen, float(each[chosen])
+    return int(among[chosen]), float(each[chosen])
