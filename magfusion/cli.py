@@ -253,7 +253,7 @@ def _parameters(command: Command, writes: bool) -> list[inspect.Parameter]:
         output = _keyword("output", Annotated[hint, info], default)
         found.insert(0, output)
     if command.reports:
-        flag = typer.Option("--json", help="Print the report as the last line.")
+        flag = typer.Option("--json", help="Print the report as a line of JSON, and nothing else.")
         found.append(_keyword("as_json", Annotated[bool, flag], False))
     return found
 
@@ -354,12 +354,13 @@ def _refuse_failed(figures: Figures) -> None:
 
 
 def _show_result(figures: Figures, output: Path | None, as_json: bool) -> None:
-    """Show the figures of a job as a table, and as the last line in JSON where that is asked."""
-    from magfusion.results.screen import show
-
+    """Show the figures of a job as a table, or as one line of JSON where that is asked."""
     if sys.stdout is None:
         return
     with until_closed():
-        show(figures, output)
         if as_json:
             sys.stdout.write(json.dumps(dict(figures), default=float) + "\n")
+            return
+        from magfusion.results.screen import show
+
+        show(figures, output)

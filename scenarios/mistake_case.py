@@ -18,7 +18,7 @@ from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_lo
 from magfusion.simulation.waveform import simulate_waveform
 from magfusion.units import DEGREE, Array
 
-Group = Literal["none", "site", "data", "world"]
+Group = Literal["none", "site", "data", "world", "midway", "instrument"]
 LOGS = ("moving", "rough", "rest")
 DURATION = 40.0  # s
 TIME_OFFSET = 0.004  # s, of the IMU, within its prior
@@ -72,7 +72,8 @@ class Mistake:
     ----------
     name : str
     group : str
-        Where it is made: in the site's file, in the data, or in the world.
+        Where it is made: in the site's file, in the data, in the world, by an instrument; or when:
+        midway.
     change : callable
     codes : tuple of str
         Of `magfusion.model.trust.CODES`: the right diagnoses; none where nothing is to be said.
@@ -82,6 +83,8 @@ class Mistake:
         Part of that parameter's name.
     harmless : bool
         Whether a trustworthy verdict is right, as the error stays covered.
+    unknowable : bool
+        Whether nothing in any log could tell it: what all poses share.
     """
 
     name: str
@@ -91,6 +94,7 @@ class Mistake:
     unseen: tuple[str, ...] = ()
     parameter: str = ""
     harmless: bool = False
+    unknowable: bool = False
 
 
 @lru_cache(maxsize=3)

@@ -1,6 +1,8 @@
 """All mistakes of `mistakes` by name, and the case without one."""
 
+import mistakes_midway
 import mistakes_of_data
+import mistakes_of_instruments
 import mistakes_of_site
 import mistakes_of_world
 from mistake_case import Mistake
@@ -8,6 +10,12 @@ from mistake_case import Mistake
 GOOD = Mistake("good", "none", lambda case: case, harmless=True)
 MISTAKES = {
     mistake.name: mistake
-    for part in (mistakes_of_site, mistakes_of_data, mistakes_of_world)
+    for part in (
+        mistakes_of_site,
+        mistakes_of_data,
+        mistakes_of_world,
+        mistakes_midway,
+        mistakes_of_instruments,
+    )
     for mistake in part.MISTAKES
 }

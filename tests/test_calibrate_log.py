@@ -127,12 +127,13 @@ def test_a_calibration_of_one_part_serves_the_other(report: dict[str, Any]) -> N
 def test_the_screen_tells_what_is_open(
     recorded: tuple[Path, SimulatedLog], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    run_command("calibrate", "log", recorded[0], "-o", tmp_path / "out", "--end", 12, "--json")
+    run_command("calibrate", "log", recorded[0], "-o", tmp_path / "out", "--end", 12)
     shown = capfd.readouterr().out
     assert "directions of the calibration are determined" in shown
     assert "open: all beacons shifted together along x" in shown
     assert "missing motion: The platform never stood still" in shown
-    assert json.loads(shown.splitlines()[-1])["job"] == "calibrate log"
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["job"] == "calibrate log"
 
 
 def test_what_cannot_be_cross_validated_is_refused(

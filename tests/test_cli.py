@@ -50,9 +50,8 @@ def test_fixes_of_one_beacon_are_told_to_be_ambiguous(
     """A dipole's field is the same on its other side: no epoch can tell which."""
     site = _site_of_one_beacon(worked.log, tmp_path / "site.yaml", 2, True)
     run_command("simulate", "--site", site, "-o", tmp_path / "log", "--duration", 8)
-    run_command("fix", tmp_path / "log", "-o", tmp_path / "run", "--json")
-    out = capfd.readouterr().out
-    figures = json.loads(out.splitlines()[-1])
+    run_command("fix", tmp_path / "log", "-o", tmp_path / "run")
+    out, figures = capfd.readouterr().out, _report(tmp_path / "run")
     assert figures["ambiguous_epochs"] == figures["epochs"]
     assert "epochs are ambiguous: fixes.parquet holds every pose" in out
 
@@ -63,9 +62,8 @@ def test_what_one_coil_leaves_open_is_told_and_not_smoothed_over(
     site = _site_of_one_beacon(worked.log, tmp_path / "site.yaml", 1, True)
     log = tmp_path / "log"
     run_command("simulate", "--site", site, "-o", log, "--duration", 8, "--motion", "static")
-    run_command("fix", log, "-o", tmp_path / "fixes", "--json")
-    out = capfd.readouterr().out
-    figures = json.loads(out.splitlines()[-1])
+    run_command("fix", log, "-o", tmp_path / "fixes")
+    out, figures = capfd.readouterr().out, _report(tmp_path / "fixes")
     assert figures["undetermined_epochs"] == figures["epochs"]
     assert "leave a direction of the pose open" in out
     with pytest.raises(SystemExit) as ended:
@@ -99,21 +97,29 @@ def test_smoothing_is_better_than_fixing(worked: Worked) -> None:
     assert smoothed["attitude_rmse_deg"] < 0.5  # deg
 
 
-def test_the_last_line_of_json_is_the_report(
+def test_with_json_the_report_is_all_that_is_printed(
     worked: Worked, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
+    site = tmp_path / "site.yaml"
+    beacon = "A position_m=0,0,1 rpy_deg=0,0,90 frequency_hz=25 moment_a_m2=220 axes=xy"
+    parts = ["--imu", "BMI088", "--magnetometer", "RM3100", "--beacon", beacon]
+    run_command("init", *parts, "-o", site, "--json")
+    assert json.loads(capfd.readouterr().out)["job"] == "init"
     lines = {
         "simulate": ["simulate", "--duration", 2],
         "demodulate": ["demodulate", worked.log],
         "fix": ["fix", worked.log],
         "smooth": ["smooth", worked.log],
         "demo": ["demo", "--duration", 5, "--no-show"],
+        "check": ["check", worked.log],
+        "navigate": ["navigate", worked.log, "--estimator", "ekf"],
     }
     for name, line in lines.items():
         run_command(*line, "-o", tmp_path / name, "--json")
         out, err = capfd.readouterr()
-        assert json.loads(out.splitlines()[-1]) == _report(tmp_path / name)
+        assert json.loads(out) == _report(tmp_path / name)
         assert err == ""
+        assert out.count("\n") == 1
 
 
 def test_the_screen_tells_the_errors_first_and_the_calibration_as_a_table(
@@ -273,7 +279,7 @@ def _script(*arguments: object) -> subprocess.CompletedProcess[str]:
 def test_the_console_script_keeps_the_contract(worked: Worked, tmp_path: Path) -> None:
     good = _script("evaluate", worked.smoothed, worked.log, "--json")
     assert (good.returncode, good.stderr) == (0, "")
-    assert json.loads(good.stdout.splitlines()[-1])["job"] == "evaluate"
+    assert json.loads(good.stdout)["job"] == "evaluate"
     bad = _script("fix", tmp_path / "none", "-o", tmp_path / "run")
     assert (bad.returncode, bad.stdout, bad.stderr.count("\n")) == (2, "", 1)
     usage = _script("fix", "--frobnicate")

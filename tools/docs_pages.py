@@ -72,7 +72,7 @@ def option_table(path: str) -> str:
     if "output" in inspect.signature(command.run).parameters:
         rows.append(("`-o`, `--output`", f"{command.output_help}.", _output(command)))
     if command.reports:
-        rows.append(("`--json`", "Print the report as the last line.", ""))
+        rows.append(("`--json`", "Print the report as a line of JSON, and nothing else.", ""))
     return f"{title}\n\n{_table(('option', 'what', 'default'), rows)}"
 
 
