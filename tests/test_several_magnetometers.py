@@ -278,6 +278,31 @@ def test_one_that_hears_nothing_is_named_and_left_out() -> None:
     assert without_silent(both, site) == (both, site)
 
 
+def test_the_first_that_hears_nothing_stays_in_the_file_and_keeps_the_clock(tmp_path: Path) -> None:
+    """The clock of the second is told against it; a file without it would be refused."""
+    first, second = two_magnetometers().platform.magnetometers
+    third = replace(second, name="third", clock_offset=-0.002)
+    site = two_magnetometers()
+    site = replace(site, platform=site.platform.carrying((first, second, third)))
+    found = simulate_fields(site, poses(12), 1e-10, np.random.default_rng(0))
+    noise = np.random.default_rng(1).normal(0.0, 1e-10, (2, 12, 6, 3))
+    for dead in ((0,), (0, 1), (1, 2), (0, 2)):
+        quiet = found.phasor_sensor.copy()
+        for which in dead:
+            quiet[:, site.of_sensor(which)] = noise[0] + 1j * noise[1]
+        fields = replace(found, phasor_sensor=quiet)
+        log, alone = without_silent(Log("three", 0, "simulation", NO_SAMPLES, fields=fields), site)
+        assert log.fields is not None
+        assert len(alone.platform.magnetometers) == 3 - len(dead)
+        save_site(alone, tmp_path / "site.yaml")
+        again = load_site(tmp_path / "site.yaml", several=True).platform.magnetometers
+        assert [(one.name, one.clock_offset) for one in again] == [
+            ("left", 0.0),
+            ("right", 0.004),
+            ("third", -0.002),
+        ]
+
+
 def walked(seed: int) -> tuple[Log, Site, SimulatedLog]:
     """Return a walk with both, ten and seven times a second."""
     site = two_magnetometers(demo_site(coil_radius=None))

@@ -11,7 +11,7 @@ from magfusion.errors import InputError
 from magfusion.files.field_map import read_field_maps, write_field_maps
 from magfusion.files.site_correlation import load_correlation, save_correlation
 from magfusion.files.site_ground import ground_entry, log_sigma
-from magfusion.files.site_magnetometer import magnetometer_entries, magnetometer_of
+from magfusion.files.site_magnetometer import magnetometer_entries, magnetometer_of, with_left_out
 from magfusion.files.site_motion import MotionEntry, imu_entry, prior_entry
 from magfusion.files.site_plain import (
     degree_sigma_entry,
@@ -165,7 +165,7 @@ def save_site(site: Site, path: Path | str) -> None:
         "beacons": [_beacon_entry(b) for b in site.every_beacon],
         "platform": {
             **imu_entry(site.platform.imu),
-            **magnetometer_entries(site.platform.magnetometers),
+            **magnetometer_entries(with_left_out(site.platform)),
             **_model_entry("motion", site.platform.motion, MotionEntry),
             **prior_entry(site.platform.motion_prior),
         },

@@ -43,7 +43,7 @@ from magfusion.files.site_values import (
 )
 from magfusion.files.site_warming import SensorWarmingEntry, warming_entry
 from magfusion.files.yaml_files import StrictModel
-from magfusion.model.site import Magnetometer, MagnetometerSigma
+from magfusion.model.site import Magnetometer, MagnetometerSigma, Platform
 from magfusion.units import Array
 
 LARGEST_PHASE = 0.2  # rad; of a tone by a clock's sigma: three of them are still nearly linear
@@ -172,6 +172,17 @@ def magnetometer_of(entry: MagnetometerEntry) -> Magnetometer:
         name=entry.name or Magnetometer.name,
         clock_offset=entry.clock_offset_s,
     )
+
+
+def with_left_out(platform: Platform) -> tuple[Magnetometer, ...]:
+    """Return all that a platform carries, in their order.
+
+    Those that were left out of a log are as declared: the first of all keeps the clock.
+    """
+    sensors = list(platform.magnetometers)
+    for place, sensor in reversed(platform.left_out):
+        sensors.insert(place, sensor)
+    return tuple(sensors)
 
 
 def magnetometer_entries(sensors: tuple[Magnetometer, ...]) -> dict[str, Any]:

@@ -270,6 +270,8 @@ class Platform:
         The only one, or the first.
     further : tuple of Magnetometer
         Those beside it.
+    left_out : tuple of (int, Magnetometer)
+        Those that a log gave reason to leave out, each with its place among those then there.
     motion_prior : MotionPrior, optional
         What is assumed of the motion where a log has no inertial samples.
     replaced : Replaced, optional
@@ -283,6 +285,7 @@ class Platform:
     motion_prior: MotionPrior | None = None
     replaced: Replaced | None = None
     further: tuple[Magnetometer, ...] = ()
+    left_out: tuple[tuple[int, Magnetometer], ...] = ()
 
     @property
     def inertial(self) -> bool:

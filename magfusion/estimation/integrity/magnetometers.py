@@ -27,8 +27,11 @@ def first_magnetometer(log: Log, site: Site) -> tuple[Log, Site]:
 
 
 def _only(log: Log, site: Site, kept: list[int]) -> tuple[Log, Site]:
-    sensors = tuple(site.platform.magnetometers[k] for k in kept)
-    left = replace(site, platform=site.platform.carrying(sensors))
+    every = tuple(enumerate(site.platform.magnetometers))
+    sensors = tuple(sensor for k, sensor in every if k in kept)
+    gone = tuple((k, sensor) for k, sensor in reversed(every) if k not in kept)
+    platform = site.platform.carrying(sensors)
+    left = replace(site, platform=replace(platform, left_out=(*platform.left_out, *gone)))
     fields = None if log.fields is None else of_sensors(log.fields, site, kept)
     waves = {s.name: log.waveforms[s.name] for s in sensors if s.name in log.waveforms}
     if waves and len(kept) == 1:  # as a log of one has it, by the log's clock
