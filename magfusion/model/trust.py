@@ -27,6 +27,7 @@ CODES = {
     "beacons_swapped": "beacons are taken for each other",
     "beacons_unheard": "of many beacons a log hears some; the others stay as declared",
     "body_iron": "iron or a magnet on the body changes the field",
+    "changed": "a gain, a clock, a mount or a beacon is another from some time of the log on",
     "coil_reversed": "a coil of a beacon is wired in reverse, or exchanged for another",
     "coils_swapped": "the coils of every beacon are exchanged",
     "demodulated_apart": "several magnetometers were demodulated each by itself",

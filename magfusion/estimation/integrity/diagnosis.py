@@ -52,7 +52,14 @@ OF_SAMPLES = {
 # What the streams show themselves, which comes before what follows of it.
 # What gravity, field and gyroscope are sure of where they fail a log, whatever follows of it.
 OF_COMPASSES = {"accel_units", "gravity_missing", "gravity_sign", "gyro_sign", "gyro_units"}
-SEEN = OF_SAMPLES | {"low_signal", "mains", "samples_lost", "silent_beacon", "undeclared_line"}
+SEEN = OF_SAMPLES | {
+    "changed",
+    "low_signal",
+    "mains",
+    "samples_lost",
+    "silent_beacon",
+    "undeclared_line",
+}
 FIRST = 1e6  # weight: a cause comes before what it causes
 OF_SEEN = FIRST / 2.0  # and before what the streams show, which may be beside it
 OF_CATCH_ALL = FIRST / 4.0  # but what only says where something is wrong may be of what they show

@@ -13,6 +13,7 @@ from magfusion.estimation.batch import Smoothed
 from magfusion.estimation.graph import Estimate
 from magfusion.estimation.integrity.close_residuals import together
 from magfusion.estimation.integrity.held import held
+from magfusion.estimation.integrity.midway import changed
 from magfusion.estimation.integrity.outcome import convergence, geometry, rivals
 from magfusion.estimation.integrity.place_witness import of_place
 from magfusion.estimation.integrity.priors_of_log import bias_change, calibration_change
@@ -79,6 +80,7 @@ def _heard(case: Case) -> Iterator[Testimony]:
         of_held = _traces(of_held, prior)
     yield of_held
     yield from residuals
+    yield _traces(changed(case), cause)
     yield _traces(priors, cause)
     yield _traces(biases, cause)
     for witness in (fixes, together, convergence, geometry, rivals):

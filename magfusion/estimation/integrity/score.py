@@ -107,7 +107,7 @@ def score_of(result: Smoothed, imu: ImuSamples) -> Score | None:
     imu : ImuSamples
         As it was recorded.
     """
-    graph, estimate = result.graph, result.estimate
+    graph = result.graph
     if not graph.measurements or result.fix_response is not None:
         return None
     known = result.declared.site
@@ -115,9 +115,12 @@ def score_of(result: Smoothed, imu: ImuSamples) -> Score | None:
         return None  # nothing contradicts a lone beacon but that a path ought to be short
     steady = any(isinstance(m, EarthField) for m in graph.measurements)
     held = held_blocks(known, result.blocks, steady=steady)
-    size = dimension(held)
-    if size == 0:
-        return None
+    return score_beside(result, held, imu) if held else None
+
+
+def score_beside(result: Smoothed, held: tuple[Block, ...], imu: ImuSamples) -> Score:
+    """Return the score of parameters that a result does not estimate, at least one."""
+    graph, estimate, size = result.graph, result.estimate, dimension(held)
     unit = np.diag(prior_sigma(held))
     by_others = _by_stream(result, held, imu) @ unit
     # One system after the other: of a long log each of them is most of what there is.

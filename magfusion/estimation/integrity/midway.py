@@ -1,0 +1,220 @@
+"""What changed while a log ran: a gain, a clock, a mount or a beacon that is another from then on.
+
+An estimator takes all of them for constant.  A step of any of them at a quarter, at half and at
+three quarters of the log is asked as `magfusion.estimation.integrity.held` asks what is held: by
+how much the cost would fall, and how far the poses would move, whatever constant errors there are
+beside it.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.estimation.integrity.held import (
+    COVERED,
+    HOPELESS,
+    Freed,
+    freed_by,
+)
+from magfusion.estimation.integrity.score import score_beside
+from magfusion.estimation.integrity.statistics import holm, sigmas
+from magfusion.estimation.integrity.suspects import Suspect, spoken_name
+from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
+from magfusion.model.parameters import (
+    BEACON_POSITION,
+    BEACON_ROTATION,
+    GAIN,
+    SENSOR_ROTATION,
+    Block,
+    Parameter,
+    dimension,
+    placed,
+    prior_sigma,
+)
+from magfusion.model.parameters.parameter import PhasorView
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import DEGREE, Array, ComplexArray
+
+PARTS = (0.25, 0.5, 0.75)  # of the log, after which something may be another
+MOST_BEACONS = 12  # of more, each has too many others to be asked so
+FEWEST = 40  # epochs, of which a part tells anything
+SHORTEST = 10.0  # s
+BUDGET = 1e-5  # of false alarms, beside half a per cent of all other witnesses together
+
+
+class Since(Parameter):
+    """What a parameter is more by from some time on (s)."""
+
+    group = kind = "change"
+
+    def __init__(self, of: Parameter, begin: float) -> None:
+        self.of, self.begin = of, begin
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Since) and (self.of, self.begin) == (other.of, other.begin)
+
+    def __hash__(self) -> int:
+        return hash((self.of, self.begin))
+
+    def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray | None:
+        """Return the columns of the parameter itself, zero before."""
+        columns = self.of.phasor_jacobian(view, owner)
+        if columns is None:
+            return None
+        time = view.calibration.reference_time + view.elapsed
+        return columns * (time >= self.begin)[:, None, None, None]
+
+
+class Stamps(Parameter):
+    """How late the magnetometer's stamps are (s), as its phases show it."""
+
+    group, owner, kind = "change", "stamps", "delay"
+    factor_of_phasor = True
+
+    def phasor_jacobian(self, view: PhasorView, owner: str) -> ComplexArray:  # noqa: ARG002
+        """Return what a delay does to the phases of every beacon."""
+        turns = 2.0 * np.pi * view.beacon.tone_frequencies_hz
+        return (-1j * view.phasor * turns[:, None])[..., None]
+
+
+STAMPS = Stamps()
+# What may change, its size in a unit of the tangent vector, and in words.
+TYPICAL: dict[Parameter, float] = {
+    GAIN: 0.01,
+    STAMPS: 1e-4,
+    SENSOR_ROTATION: DEGREE,
+    BEACON_POSITION: 0.01,
+    BEACON_ROTATION: DEGREE,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """A suspect, and since when it would be another."""
+
+    suspect: Suspect
+    begin: float
+
+
+def changed(case: Case) -> Testimony:
+    """Ask what may have changed while the log ran."""
+    result, score = case.result, case.score
+    site, time = result.declared.site, result.fields.time
+    if score is None or not 1 < len(site.beacons) <= MOST_BEACONS or len(time) < FEWEST:
+        return NOTHING
+    begin, length = float(time[0]), float(time[-1] - time[0])
+    if length < SHORTEST or len(result.graph.segments) > 1:
+        return NOTHING
+    times = [begin + part * length for part in PARTS]
+    new = [_blocks(site, at) for at in times]
+    every = placed((*score.held, *(block for part in new for block in part)))
+    wide = score_beside(result, every, case.log.imu)
+    information, gradient = wide.with_declared()
+    asked = [
+        Change(suspect, at)
+        for at, part in zip(times, _again(every, new), strict=True)
+        for suspect in _suspects(part, dimension(every))
+    ]
+    freed = [
+        (one, found)
+        for one in asked
+        if (found := freed_by(case.pose_cov, wide, one.suspect, information, gradient)) is not None
+    ]
+    speaks = holm([found.log_p for _, found in freed], BUDGET)
+    likely = [
+        pair
+        for pair, significant in zip(freed, speaks, strict=True)
+        if significant and np.mean(pair[1].distance) > COVERED
+    ]
+    if not likely:
+        return NOTHING
+    change, cause = max(likely, key=lambda pair: pair[1].gain)
+    moved = cause.moved[:, :, None] * cause.moved[:, None, :]
+    known = wide.by_pose @ cause.known_cov @ np.swapaxes(wide.by_pose, 1, 2)
+    return Testimony((_finding(change, cause, prior_sigma(every)),), spread=moved + known)
+
+
+def _blocks(site: Site, at: float) -> list[Block]:
+    owners = [beacon.name for beacon in site.beacons]
+    every: list[tuple[Parameter, str]] = [(GAIN, owner) for owner in owners]
+    every += [(STAMPS, STAMPS.owner)]
+    every += [(SENSOR_ROTATION, owner) for owner in SENSOR_ROTATION.owners(site)[:1]]
+    every += [(BEACON_POSITION, owner) for owner in owners]
+    every += [(BEACON_ROTATION, owner) for owner in owners]
+    return [
+        Block(Since(kind, at), owner, slice(0), np.full(_width(kind), TYPICAL[kind]))
+        for kind, owner in every
+    ]
+
+
+def _width(kind: Parameter) -> int:
+    return 1 if kind in (GAIN, STAMPS) else 3
+
+
+def _again(every: tuple[Block, ...], parts: list[list[Block]]) -> Iterator[list[Block]]:
+    """Yield the blocks of each part where they were placed."""
+    at = {block.key: block for block in every}
+    for part in parts:
+        yield [at[block.key] for block in part]
+
+
+def _suspects(blocks: list[Block], size: int) -> Iterator[Suspect]:
+    """Yield what one event changes: a beacon, or what hears them all."""
+    gains = [block for block in blocks if _of(block) == GAIN]
+    if len(gains) > 1:
+        common = np.zeros((size, 1))
+        for block in gains:
+            common[block.columns] = 1.0
+        yield Suspect("the strength of all fields", tuple(gains), common)
+    for block in blocks:
+        name = _spoken(block)
+        yield Suspect(name, (block,), np.eye(size)[:, np.arange(size)[block.columns]])
+
+
+def _of(block: Block) -> Parameter:
+    assert isinstance(block.parameter, Since)
+    return block.parameter.of
+
+
+def _spoken(block: Block) -> str:
+    kind = _of(block)
+    if kind == GAIN:
+        return f"the strength of beacon {block.owner}"
+    if kind == STAMPS:
+        return "the stamps of the magnetometer"
+    return spoken_name(block._replace(parameter=kind))
+
+
+def _finding(change: Change, cause: Freed, sigma: Array) -> Finding:
+    block = change.suspect.blocks[0]
+    kind, step = _of(block), (sigma * cause.step)[block.columns]
+    size = float(np.linalg.norm(step))
+    amounts = {
+        GAIN: f"by {100.0 * np.expm1(step[0]):+.2g} %",
+        STAMPS: f"by {1e3 * step[0]:+.2g} ms",
+        SENSOR_ROTATION: f"by {size / DEGREE:.2g} deg",
+        BEACON_ROTATION: f"by {size / DEGREE:.2g} deg",
+        BEACON_POSITION: f"by {100.0 * size:.2g} cm",
+    }
+    if kind == GAIN and len(change.suspect.blocks) > 1:
+        remedy = "the range or the temperature of the magnetometer, and the supply of the beacons"
+    elif kind == GAIN:
+        remedy = "its supply and its driver"
+    elif kind == STAMPS:
+        remedy = "what makes the stamps, and samples that were lost there"
+    elif kind == SENSOR_ROTATION:
+        remedy = "how it is fastened"
+    else:
+        remedy = "whether it was moved"
+    mean = float(np.mean(cause.distance))
+    return Finding(
+        "changed",
+        f"Something changed while the log ran: {change.suspect.name} {amounts[kind]}, from about"
+        f" {change.begin:.0f} s on ({float(sigmas(cause.log_p)):.0f} sigma), which moves the poses"
+        f" by {np.sqrt(mean):.1f} times what they claim. Check {remedy}; smooth the parts before"
+        " and after apart, by --start and --end.",
+        Verdict.FAILED if mean > HOPELESS else Verdict.DOUBTFUL,
+        float(sigmas(cause.log_p)),
+    )
