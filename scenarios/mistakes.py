@@ -76,7 +76,8 @@ class Row:
     def silent(self) -> bool:
         """Whether a wrong result passes as a right one, and nothing is said."""
         wrong = self.nees is not None and self.nees > SILENT_NEES
-        return self.verdict == "trustworthy" and wrong and not self.listed
+        told = self.listed or self.known.unknowable
+        return self.verdict == "trustworthy" and wrong and not told
 
     @property
     def diagnosable(self) -> bool:

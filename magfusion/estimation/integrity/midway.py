@@ -1,4 +1,4 @@
-"""What changed while a log ran: a gain, a clock, a mount or a beacon that is another from then on.
+"""What changed while a log ran: a gain, a clock, a bias, a mount or a beacon, from some time on.
 
 An estimator takes all of them for constant.  A step of any of them at a quarter, at half and at
 three quarters of the log is asked as `magfusion.estimation.integrity.held` asks what is held: by
@@ -7,7 +7,7 @@ beside it.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,15 +17,16 @@ from magfusion.estimation.integrity.held import (
     Freed,
     freed_by,
 )
-from magfusion.estimation.integrity.score import score_beside
+from magfusion.estimation.integrity.score import Score, score_beside
 from magfusion.estimation.integrity.statistics import holm, sigmas
-from magfusion.estimation.integrity.suspects import Suspect, spoken_name
+from magfusion.estimation.integrity.suspects import Inertial, Stream, Suspect, spoken_name, suspects
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
 from magfusion.model.parameters import (
     BEACON_POSITION,
     BEACON_ROTATION,
     GAIN,
     SENSOR_ROTATION,
+    TIME_OFFSET,
     Block,
     Parameter,
     dimension,
@@ -79,7 +80,46 @@ class Stamps(Parameter):
         return (-1j * view.phasor * turns[:, None])[..., None]
 
 
+class Bias(Inertial):
+    """A bias of the accelerometer or of the gyro, beside the one that walks."""
+
+    def __init__(self, first: int) -> None:
+        self.first = first
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Bias) and self.first == other.first
+
+    def __hash__(self) -> int:
+        return hash((Bias, self.first))
+
+    def as_bias(self, stream: Stream) -> Array:
+        """Return ones in its own rows."""
+        rows = np.zeros((6, 3))
+        rows[self.first : self.first + 3] = np.eye(3)
+        return np.broadcast_to(rows, (len(stream.imu), 6, 3))
+
+
+class SinceBias(Inertial):
+    """What a bias is more by from some time on (s)."""
+
+    kind = "change"
+
+    def __init__(self, of: Bias, begin: float) -> None:
+        self.of, self.begin = of, begin
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, SinceBias) and (self.of, self.begin) == (other.of, other.begin)
+
+    def __hash__(self) -> int:
+        return hash((SinceBias, self.of, self.begin))
+
+    def as_bias(self, stream: Stream) -> Array:
+        """Return the bias itself, zero before."""
+        return self.of.as_bias(stream) * (stream.imu.time >= self.begin)[:, None, None]
+
+
 STAMPS = Stamps()
+ACCEL_BIAS, GYRO_BIAS = Bias(0), Bias(3)
 # What may change, its size in a unit of the tangent vector, and in words.
 TYPICAL: dict[Parameter, float] = {
     GAIN: 0.01,
@@ -87,6 +127,9 @@ TYPICAL: dict[Parameter, float] = {
     SENSOR_ROTATION: DEGREE,
     BEACON_POSITION: 0.01,
     BEACON_ROTATION: DEGREE,
+    TIME_OFFSET: 1e-3,
+    ACCEL_BIAS: 0.1,
+    GYRO_BIAS: 0.01,
 }
 
 
@@ -131,9 +174,32 @@ def changed(case: Case) -> Testimony:
     if not likely:
         return NOTHING
     change, cause = max(likely, key=lambda pair: pair[1].gain)
+    if cause.gain < _throughout(case, wide, information, gradient):
+        return NOTHING  # it was so from the beginning
     moved = cause.moved[:, :, None] * cause.moved[:, None, :]
     known = wide.by_pose @ cause.known_cov @ np.swapaxes(wide.by_pose, 1, 2)
     return Testimony((_finding(change, cause, prior_sigma(every)),), spread=moved + known)
+
+
+def _throughout(case: Case, wide: Score, information: Array, gradient: Array) -> float:
+    """Return the most that anything held explains which is wrong all along."""
+    assert case.score is not None
+    own = slice(0, dimension(case.score.held))
+    gains = [
+        found.gain
+        for suspect in suspects(case.result.declared.site, case.score.held)
+        if (
+            found := freed_by(
+                case.pose_cov,
+                replace(wide, by_state=wide.by_state[:, :, own]),
+                suspect,
+                information[own, own],
+                gradient[own],
+            )
+        )
+        is not None
+    ]
+    return max(gains, default=0.0)
 
 
 def _blocks(site: Site, at: float) -> list[Block]:
@@ -143,14 +209,21 @@ def _blocks(site: Site, at: float) -> list[Block]:
     every += [(SENSOR_ROTATION, owner) for owner in SENSOR_ROTATION.owners(site)[:1]]
     every += [(BEACON_POSITION, owner) for owner in owners]
     every += [(BEACON_ROTATION, owner) for owner in owners]
+    if site.platform.inertial:
+        every += [(kind, "imu") for kind in (TIME_OFFSET, ACCEL_BIAS, GYRO_BIAS)]
     return [
-        Block(Since(kind, at), owner, slice(0), np.full(_width(kind), TYPICAL[kind]))
+        Block(
+            SinceBias(kind, at) if isinstance(kind, Bias) else Since(kind, at),
+            owner,
+            slice(0),
+            np.full(_width(kind), TYPICAL[kind]),
+        )
         for kind, owner in every
     ]
 
 
 def _width(kind: Parameter) -> int:
-    return 1 if kind in (GAIN, STAMPS) else 3
+    return 1 if kind in (GAIN, STAMPS, TIME_OFFSET) else 3
 
 
 def _again(every: tuple[Block, ...], parts: list[list[Block]]) -> Iterator[list[Block]]:
@@ -174,7 +247,7 @@ def _suspects(blocks: list[Block], size: int) -> Iterator[Suspect]:
 
 
 def _of(block: Block) -> Parameter:
-    assert isinstance(block.parameter, Since)
+    assert isinstance(block.parameter, Since | SinceBias)
     return block.parameter.of
 
 
@@ -182,8 +255,14 @@ def _spoken(block: Block) -> str:
     kind = _of(block)
     if kind == GAIN:
         return f"the strength of beacon {block.owner}"
-    if kind == STAMPS:
-        return "the stamps of the magnetometer"
+    words = {
+        STAMPS: "the stamps of the magnetometer",
+        TIME_OFFSET: "the stamps of the inertial sensor",
+        ACCEL_BIAS: "the bias of the accelerometer",
+        GYRO_BIAS: "the bias of the gyroscope",
+    }
+    if kind in words:
+        return words[kind]
     return spoken_name(block._replace(parameter=kind))
 
 
@@ -197,13 +276,18 @@ def _finding(change: Change, cause: Freed, sigma: Array) -> Finding:
         SENSOR_ROTATION: f"by {size / DEGREE:.2g} deg",
         BEACON_ROTATION: f"by {size / DEGREE:.2g} deg",
         BEACON_POSITION: f"by {100.0 * size:.2g} cm",
+        TIME_OFFSET: f"by {-1e3 * step[0]:+.2g} ms",
+        ACCEL_BIAS: f"by {size:.2g} m/s^2",
+        GYRO_BIAS: f"by {size / DEGREE:.2g} deg/s",
     }
     if kind == GAIN and len(change.suspect.blocks) > 1:
         remedy = "the range or the temperature of the magnetometer, and the supply of the beacons"
     elif kind == GAIN:
         remedy = "its supply and its driver"
-    elif kind == STAMPS:
+    elif kind in (STAMPS, TIME_OFFSET):
         remedy = "what makes the stamps, and samples that were lost there"
+    elif isinstance(kind, Bias):
+        remedy = "how warm it became, and whether it was struck"
     elif kind == SENSOR_ROTATION:
         remedy = "how it is fastened"
     else:
