@@ -177,8 +177,9 @@ def _noise_10s(case: Case, time: Array, measured: Array) -> tuple[Array, Array]:
 
 
 _GAP = ("gap", "samples_lost")
-_JUMP = ("clock_jump", "time_offset", "epoch_shift", "gap", "restarts", "imu_clock")
+_JUMP = ("changed", "time_offset", "epoch_shift", "gap", "restarts", "imu_clock")
 _STEP = (
+    "changed",
     "gain_step",
     "magnetometer_matrix",
     "field_scale",
@@ -186,9 +187,9 @@ _STEP = (
     "beacon_fault",
     "moments",
 )
-_FAULT = ("beacon_fault", "beacon_excluded", "field_residuals", "moments")
+_FAULT = ("changed", "beacon_fault", "beacon_excluded", "field_residuals", "moments")
 _PLACE = ("beacon_pose", *_FAULT)
-_BIAS = ("imu_bias", "inertial_residuals")
+_BIAS = ("changed", "imu_bias", "inertial_residuals")
 
 MISTAKES = (
     Mistake("magnetometer_jumps_200ms", "midway", _wave_jump(0.2), _JUMP),
@@ -226,9 +227,25 @@ MISTAKES = (
     Mistake("magnetometer_gap_1s", "midway", _wave_gap(_gap(18.0, 19.0)), _GAP, harmless=True),
     Mistake("imu_gap_1s", "midway", _imu_gap(_gap(18.0, 19.0)), _GAP, harmless=True),
     Mistake("imu_gap_5s", "midway", _imu_gap(_gap(18.0, 23.0)), _GAP, harmless=True),
-    Mistake("magnetometer_sent_again_1s", "midway", _wave_again(1.0), ("repeated_block",)),
-    Mistake("magnetometer_sent_again_200ms", "midway", _wave_again(0.2), ("repeated_block",)),
-    Mistake("imu_sent_again_1s", "midway", _imu_again(1.0), ("repeated_block",), REST),
+    Mistake(
+        "magnetometer_sent_again_1s",
+        "midway",
+        _wave_again(1.0),
+        ("changed", "field_residuals", "field_innovations"),
+    ),
+    Mistake(
+        "magnetometer_sent_again_200ms",
+        "midway",
+        _wave_again(0.2),
+        ("changed", "field_residuals", "field_innovations"),
+    ),
+    Mistake(
+        "imu_sent_again_1s",
+        "midway",
+        _imu_again(1.0),
+        ("changed", "field_residuals", "field_innovations"),
+        REST,
+    ),
     Mistake("gyro_bias_steps", "midway", _gyro_bias_step((0.01, 0.0, -0.01)), _BIAS),
     Mistake("accel_bias_steps", "midway", _accel_bias_step((0.2, 0.0, 0.1)), _BIAS),
     Mistake("gyro_bias_drifts", "midway", _gyro_bias_drifts((2e-4, 0.0, -2e-4)), _BIAS),
