@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.preintegration import low_pass_reach
 from magfusion.model.quaternion import (
@@ -19,6 +18,7 @@ from magfusion.model.quaternion import (
     product,
     turned,
     unit,
+    vectors,
 )
 from magfusion.model.samples import ImuSamples
 from magfusion.model.strapdown import turn_at, turn_from_gyro
@@ -295,7 +295,7 @@ def _between(turn: Array) -> Array:
     between = product(inverse(turn[:, :-1]), turn[:, 1:])
     if not between.shape[1]:
         return np.zeros((3, 0))
-    return np.asarray(Rotation.from_quat(between.T, scalar_first=True).as_rotvec().T)
+    return vectors(between)
 
 
 def _turn_at(known: Array, turn: Array, between: Array, wanted: Array) -> Array:

@@ -431,7 +431,8 @@ class Navigator:
         if other <= inertial and other < arrived.next_field:
             self._absorb(other, None)
             return True
-        centre = arrived.next_window(state, lost=self._update.asks_for_each(state))
+        apart = arrived.short is not None and self._update.asks_for_each(state)
+        centre = arrived.next_window(state, lost=apart)
         if centre is not None:
             self._step_window(centre)
             return True

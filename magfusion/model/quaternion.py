@@ -9,9 +9,19 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.units import Array
 
+FEW = 8000  # numbers
+# Which component of the second factor each of the first meets, for each of the product, and how.
+_PLACES = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
+_SIGNS = np.array([[1, 1, 1, 1], [-1, 1, -1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1]], dtype=np.float64)
+_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
+
 
 def product(a: Array, b: Array) -> Array:
     """Return the products ``a b`` of quaternions, shape (4, ...), scalar first."""
+    if a.size + b.size < FEW:  # of few it is the calls that take the time
+        parts = b[_PLACES]
+        parts *= _SIGNS.reshape(4, 4, *(1,) * (b.ndim - 1))
+        return np.asarray(np.add.reduce(a[:, None] * parts, axis=0))
     (p, q, r, s), (w, x, y, z) = a, b
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
     out[0] = p * w - q * x - r * y - s * z
@@ -29,8 +39,7 @@ def turned(quaternion: Array, vector: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Return the cross products of vectors, shape (3, ...)."""
-    (p, q, r), (x, y, z) = a, b
-    return np.stack([q * z - r * y, r * x - p * z, p * y - q * x])
+    return a[_NEXT] * b[_LAST] - a[_LAST] * b[_NEXT]
 
 
 def components(rotation: Rotation) -> Array:
@@ -47,6 +56,14 @@ def of_vectors(rotation: Array) -> Array:
     """Return the quaternions, shape (4, ...), of rotation vectors, shape (3, ...) (rad)."""
     half = 0.5 * np.sqrt(np.sum(rotation**2, axis=0))
     return np.concatenate([np.cos(half)[None], 0.5 * np.sinc(half / np.pi) * rotation])
+
+
+def vectors(quaternion: Array) -> Array:
+    """Return the rotation vectors, shape (3, ...) (rad), of unit quaternions, shape (4, ...)."""
+    size = np.sqrt(np.sum(quaternion[1:] ** 2, axis=0))
+    # Of the two ways to write it that of the shorter turn.
+    half = np.arctan2(np.where(quaternion[0] < 0.0, -size, size), np.abs(quaternion[0]))
+    return 2.0 * np.where(size > 0.0, half / np.where(size > 0.0, size, 1.0), 1.0) * quaternion[1:]
 
 
 def matrices(quaternion: Array) -> Array:

@@ -11,6 +11,7 @@ that of a single number with all of the variance (G. J. Székely and N. K. Bakir
 Theory and Related Fields 126, 2003), and that of three equal ones with the largest.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -22,8 +23,9 @@ from magfusion.estimation.solve.batched import open_inverse
 from magfusion.model.trust import Risk
 from magfusion.units import DEGREE, Array, BoolArray, IntArray
 
+ROOT_2, ROOT_2_PI = float(np.sqrt(2.0)), float(np.sqrt(2.0 / np.pi))
 POSE = 6  # axes: rotation, then position
-BISECTIONS = 24
+PRECISE, MOST_STEPS = 1e-7, 60  # of a level
 MOST_DEG = 180.0  # an attitude level beyond it says nothing
 SINGLE_HOLDS = 0.215  # probability of a tail below which a single number bounds it
 LEAST = 1e-30  # rad, m; a deviation below it is none
@@ -46,10 +48,9 @@ class Radius(NamedTuple):
 
     def tail(self, radius: Array) -> Array:
         """Return a probability that is not less than that of a norm beyond a radius."""
-        single = erfc(radius / (np.sqrt(2.0) * np.maximum(self.whole, LEAST)))
-        share = radius / np.maximum(self.largest, LEAST)
-        share = np.clip(share, 0.0, 1e3)
-        three = erfc(share / np.sqrt(2.0)) + np.sqrt(2.0 / np.pi) * share * np.exp(-0.5 * share**2)
+        single = erfc(radius / (ROOT_2 * np.maximum(self.whole, LEAST)))
+        share = np.minimum(np.maximum(radius / np.maximum(self.largest, LEAST), 0.0), 1e3)
+        three = erfc(share / ROOT_2) + ROOT_2_PI * share * np.exp(-0.5 * share**2)
         return np.minimum(three, np.where(single < SINGLE_HOLDS, single, 1.0))
 
     def beyond(self, probability: Array | float) -> Array:
@@ -277,21 +278,50 @@ def _levels(sigma: Radius, without: Radius, threshold: Array, prior: Array, risk
     It solves ``P(error > L) + sum_j p_j P(error_j > L - T_j) = risk``, shapes (n, beacons, 2) of
     the faults j.
     """
-    terms = prior.shape[1] + 1
-    tail = np.minimum(risk[:, None] / (terms * np.where(prior > 0.0, prior, 1.0)), 1.0)
-    faulted = np.where(prior > 0.0, threshold + without.beyond(tail), 0.0)
-    high = np.maximum(sigma.beyond(risk / terms), np.max(faulted, axis=1))
-    low = np.zeros_like(high)
     # The estimate with all is one more, of threshold zero, whose share is one.
     each = Radius(
         *(np.concatenate([a[:, None], b], axis=1) for a, b in zip(sigma, without, strict=True))
     )
-    threshold = np.concatenate([np.zeros_like(high)[:, None], threshold], axis=1)
+    threshold = np.concatenate([np.zeros_like(threshold[:, :1]), threshold], axis=1)
     prior = np.concatenate([np.ones_like(prior[:, :1]), prior], axis=1)
-    for _ in range(BISECTIONS):
-        middle = 0.5 * (low + high)
-        more = np.sum(prior * each.tail(middle[:, None] - threshold), axis=1) > risk
-        low, high = np.where(more, middle, low), np.where(more, high, middle)
+    goal, own = np.log(risk), risk[:, None] / np.where(prior > 0.0, prior, 1.0)
+
+    def more(level: Array) -> Array:
+        total = (prior * each.tail(level[:, None] - threshold)).sum(axis=1)
+        return np.asarray(np.log(np.maximum(total, LEAST)) - goal)
+
+    # One alone has all of the risk at the lower end, and none more than its part at the upper.
+    reach, part = threshold + each.beyond(np.minimum(own, 1.0)), own / prior.shape[1]
+    low = np.max(np.where((prior > 0.0) & (own < SINGLE_HOLDS), reach, 0.0), axis=1)
+    reach = threshold + each.beyond(np.minimum(part, 1.0))
+    high = np.max(np.where(prior > 0.0, reach, 0.0), axis=1)
+    return _crossing(more, np.maximum(low - PRECISE * high, 0.0), high)
+
+
+def _crossing(falling: Callable[[Array], Array], low: Array, high: Array) -> Array:
+    """Return where functions fall below zero between two ends, from above.
+
+    By chords between the ends; of an end that stays the value counts half from step to step, so
+    that the other moves, too (the Illinois algorithm).
+    """
+    at_low, at_high, width = falling(low), np.minimum(falling(high), 0.0), PRECISE * high
+    rose = np.full(high.shape, 2)
+    with np.errstate(invalid="ignore"):  # of what has no end
+        for _ in range(MOST_STEPS):
+            if not np.any(high - low > width):
+                break
+            middle = low + (high - low) * (at_low / np.maximum(at_low - at_high, LEAST))
+            # Not nearer to an end than is asked for: a step beyond the crossing closes in on it.
+            middle = np.maximum(low + 0.4 * width, np.minimum(middle, high - 0.4 * width))
+            found = falling(middle)
+            rises = found > 0.0
+            half = np.where(rises == rose, 0.5, 1.0)
+            low, high = np.where(rises, middle, low), np.where(rises, high, middle)
+            at_low, at_high = (
+                np.where(rises, found, half * at_low),
+                np.where(rises, half * at_high, found),
+            )
+            rose = rises
     return high
 
 

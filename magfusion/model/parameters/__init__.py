@@ -223,6 +223,8 @@ def prior_sigma(blocks: tuple[Block, ...]) -> Array:
 
 def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) -> Calibration:
     """Return the calibration moved by a tangent vector, shape (dimension,)."""
+    if not np.any(step):
+        return calibration
     for block in blocks:
         part = np.array(step[block.columns])  # GTSAM's vectors are read-only
         if np.any(part):
@@ -233,6 +235,8 @@ def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) ->
 def difference(reference: Calibration, moved: Calibration, blocks: tuple[Block, ...]) -> Array:
     """Return the tangent vector that takes ``reference`` to ``moved``: the inverse of `retract`."""
     step = np.zeros(dimension(blocks))
+    if moved is reference:  # as of a filter that estimates none
+        return step
     for block in blocks:
         step[block.columns] = block.parameter.difference(reference, moved, block.owner)
     return step

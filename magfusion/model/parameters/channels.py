@@ -127,6 +127,7 @@ def linearize_channels(
     by_calibration = np.zeros((n, channels, 6, dimension(blocks)))
     whole = any(not block.parameter.factor_of_phasor for block in blocks)
     elapsed = time - calibration.reference_time
+    acting = {beacon.name: _acting(blocks, beacon) for beacon in site.beacons}
     groups, factors = _groups(site), axis_factors(site)
     sensors = enumerate(site.platform.magnetometers)
     for (sensor, magnetometer), group in product(sensors, groups):
@@ -145,10 +146,11 @@ def linearize_channels(
             rows = slice(mine.start + tones.start, mine.start + tones.stop)
             value[:, rows], by_pose[:, rows] = values[k], poses[k]
             view = PhasorView(calibration, beacon, elapsed, phasor[k], observations[k], sensor)
-            for block in blocks:
+            for block in acting[beacon.name]:
                 part = block.parameter.phasor_jacobian(view, block.owner)
                 if part is not None:
-                    by_calibration[:, rows, :, block.columns] = _stacked(part)
+                    by_calibration[:, rows, :3, block.columns] = part.real
+                    by_calibration[:, rows, 3:, block.columns] = part.imag
     if factors is not None:
         parts = value[..., None], by_pose, by_calibration
         value, by_pose, by_calibration = (_answered(part, factors) for part in parts)
@@ -157,6 +159,12 @@ def linearize_channels(
     if np.all(gain == 1.0):
         return value, by_pose, by_calibration
     return gain * value, gain[..., None] * by_pose, gain[..., None] * by_calibration
+
+
+def _acting(blocks: tuple[Block, ...], beacon: Beacon) -> list[Block]:
+    """Return the blocks that have a bearing on a beacon's phasors."""
+    own = (b.owner == beacon.name or not isinstance(b.parameter, BeaconParameter) for b in blocks)
+    return [block for block, acts in zip(blocks, own, strict=True) if acts]
 
 
 def _answered(stacked: Array, factors: ComplexArray) -> Array:
