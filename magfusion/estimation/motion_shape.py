@@ -9,6 +9,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from magfusion.estimation.preintegration import low_pass_reach
+from magfusion.model.hermite import hermite
 from magfusion.model.quaternion import (
     cross,
     inverse,
@@ -147,10 +148,10 @@ class MotionShape:
         near = self._near(wanted)
         own = self.time[near]
         path = own, self.position_world[near], self.velocity_world[near]
-        position, velocity = _hermite(*path, wanted)
+        position, velocity = hermite(*path, wanted)
         known = self.states.time
         inside = np.clip(wanted, known[0], known[-1])
-        lack, slope = _hermite(known, *self._lack, inside)
+        lack, slope = hermite(known, *self._lack, inside)
         attitude = product(
             _turn_at(known, self.world_from_start, self._spread, wanted),
             turn_at(self.chain[:, near], own, self.gyro_body[near], wanted),
@@ -174,7 +175,7 @@ class MotionShape:
         states = self.states
         assert states.velocity_world is not None
         path = self.time, self.position_world, self.velocity_world
-        position, velocity = _hermite(*path, states.time)
+        position, velocity = hermite(*path, states.time)
         return states.position_world - position, states.velocity_world - velocity
 
     @cached_property
@@ -197,9 +198,9 @@ class MotionShape:
         near, known, late = self._near(wanted), self.states.time, self._by_offset
         own = self.time[near]
         inside = np.clip(wanted, known[0], known[-1])
-        held_back, slope = _hermite(known, *late.at_states, inside)
+        held_back, slope = hermite(known, *late.at_states, inside)
         change = own, late.position[near], late.velocity[near]
-        by_position = _hermite(*change, wanted)[0] - held_back
+        by_position = hermite(*change, wanted)[0] - held_back
         by_position -= slope * (wanted - inside)[:, None]
         by_rotation = interpolated(wanted, known, late.rate_at_states)
         return by_rotation - interpolated(wanted, own, late.rate[near]), by_position
@@ -224,7 +225,7 @@ class MotionShape:
         speed -= self.accel_world
         velocity = self._averaged(speed)
         del speed
-        held_back = _hermite(self.time, position, velocity, known)
+        held_back = hermite(self.time, position, velocity, known)
         return _ByOffset(rate, at_states, position, velocity, held_back)
 
     def _averaged(self, values: Array) -> Array:
@@ -275,19 +276,6 @@ def _pieces(count: int) -> Iterator[slice]:
     """Yield rows, as many at once as stay in the cache."""
     for begin in range(0, count, AT_ONCE):
         yield slice(begin, min(begin + AT_ONCE, count))
-
-
-def _hermite(known: Array, value: Array, slope: Array, wanted: Array) -> tuple[Array, Array]:
-    """Return values and slopes at some times of the cubics through those at the known ones."""
-    index = np.clip(np.searchsorted(known, wanted, side="right") - 1, 0, len(known) - 2)
-    step = (known[index + 1] - known[index])[:, None]
-    share = (wanted - known[index])[:, None] / step
-    rise, begin, end = value[index + 1] - value[index], slope[index] * step, slope[index + 1] * step
-    square, cube = 3.0 * rise - 2.0 * begin - end, begin + end - 2.0 * rise
-    return (
-        value[index] + share * (begin + share * (square + share * cube)),
-        (begin + share * (2.0 * square + 3.0 * share * cube)) / step,
-    )
 
 
 def _between(turn: Array) -> Array:

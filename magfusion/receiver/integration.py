@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.special import gammaln
-from scipy.stats import chi2, f
+from scipy.special import chdtrc, chdtri, fdtrc, gammaln  # scipy.stats takes long to import
 
 from magfusion.receiver.pieces import Pieces
 from magfusion.units import Array, ComplexArray
@@ -74,7 +73,7 @@ def trace_chance(trace: float, freedom: int) -> float:
     b = (p + 2 * half) * (q + 2 * half) / (2 * (2 * half + 1) * (half - 1))
     second = 4.0 + (p * q + 2) / (b - 1)
     c = (2.0 + (p * q + 2) / (b - 1)) / (2 * half)
-    return float(f.sf(trace / freedom / c * second / (p * q), p * q, second))
+    return float(fdtrc(p * q, second, trace / freedom / c * second / (p * q)))
 
 
 def integrated(found: Pieces, tone: int, time: float) -> Integrated:
@@ -197,8 +196,8 @@ def chance_of_any(chances: list[float], trials: float) -> float:
     trials : float
         As of `Search`.
     """
-    square = float(sum(chi2.isf(max(c, 1e-300), 6) for c in chances))
+    square = float(sum(chdtri(6, max(c, 1e-300)) for c in chances))
     degrees = 6 * len(chances)
     size = 0.5 * (degrees - 1) * np.log(0.5 * square) - 0.5 * square - gammaln(0.5 * degrees)
     crossings = trials / np.sqrt(np.pi) * np.exp(size)
-    return float(min(1.0, chi2.sf(square, degrees) + crossings))
+    return float(min(1.0, chdtrc(degrees, square) + crossings))

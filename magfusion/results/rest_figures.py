@@ -1,11 +1,16 @@
 """What is said of whole rests that were integrated."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magfusion.estimation.at_rest import AtRest
 from magfusion.results.figures import Figure, Figures
+
+if TYPE_CHECKING:
+    from magfusion.estimation.at_rest import AtRest
 
 
 def rest_figures(rested: AtRest) -> Figures:

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 
 from magfusion.estimation.preintegration import GAP_SAMPLES
+from magfusion.model.hermite import hermite
 from magfusion.model.samples import ImuSamples
 from magfusion.model.strapdown import attitude_at, attitude_from_gyro
 from magfusion.units import Array, BoolArray
@@ -57,13 +57,13 @@ def strides_between(imu: ImuSamples, time_offset: float, epochs: Array) -> Strid
     velocity = _summed(0.5 * (force[:-1] + force[1:]) * step)
     # Exact for a force that is linear between samples.
     inner = (2.0 * force[:-1] + force[1:]) * step**2 / 6.0
-    path = CubicHermiteSpline(stamps, _summed(velocity[:-1] * step + inner), velocity)
+    path = _summed(velocity[:-1] * step + inner)
     axes = chain.as_matrix().reshape(-1, 9)
     turned = _summed(0.5 * (axes[:-1] + axes[1:]) * step)
     lever = np.stack([np.interp(epochs, stamps, axis) for axis in turned.T], axis=1)
     here = attitude_at(chain, stamps, rate_body, epochs).as_matrix()
     dt, back = np.diff(epochs), np.swapaxes(here[:-1], 1, 2)
-    place, speed = path(epochs), path.derivative()(epochs)
+    place, speed = hermite(stamps, path, velocity, epochs)
     moved = np.diff(place, axis=0) - speed[:-1] * dt[:, None]
     gap = np.flatnonzero(np.diff(stamps) > GAP_SAMPLES * usual)
     silent = (stamps[gap] < epochs[1:, None]) & (stamps[gap + 1] > epochs[:-1, None])
