@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 
 from magfusion.estimation.residual_shares import ChannelErrors
-from magfusion.estimation.solve.bounded import minimise_bounded
+from magfusion.estimation.solve.bounded import minimise_sloped
 from magfusion.units import Array
 
 PRIOR = float(np.log(2.0))  # of the logarithm of a declared sigma
@@ -213,24 +213,23 @@ def likeliest(
         least[kind.start] = LEAST
     gain, width = NORMAL[components], STUDENT + components
 
-    def cost(log: Array) -> float:
-        variance = np.exp(2.0 * log) @ parts + fixed
-        bounded = width * np.log1p(gain * square / (STUDENT * variance))
-        likelihood = 0.5 * np.sum(weight * (components * np.log(variance) + bounded))
-        prior = [0.5 * np.log(np.sum(np.exp(2.0 * log[kind]))) / PRIOR for kind in kinds]
-        return float(likelihood + 0.5 * np.sum(np.square(prior)))
+    scaled = gain * square
+    reach, constant = scaled / STUDENT, width * scaled
 
-    def gradient(log: Array) -> Array:
-        by = 2.0 * np.exp(2.0 * log)[:, None] * parts
-        variance = 0.5 * np.sum(by, axis=0) + fixed
-        bounded = width * gain * square / (STUDENT * variance + gain * square)
-        by_variance = 0.5 * weight * (components - bounded) / variance
-        slope = np.asarray(by @ by_variance)
+    def cost(log: Array) -> tuple[float, Array]:
+        squares = np.exp(2.0 * log)
+        by = squares[:, None] * parts
+        variance = np.sum(by, axis=0) + fixed
+        bounded = width * np.log1p(reach / variance)
+        likelihood = 0.5 * float(weight @ (components * np.log(variance) + bounded))
+        left = components - constant / (STUDENT * variance + scaled)
+        slope = by @ (weight * left / variance)
         for kind in kinds:
-            square_of = np.exp(2.0 * log[kind])
-            total = np.sum(square_of)
-            slope[kind] += 0.5 * np.log(total) / PRIOR**2 * square_of / total
-        return slope
+            total = float(np.sum(squares[kind]))
+            prior = 0.5 * np.log(total) / PRIOR
+            likelihood += 0.5 * prior**2
+            slope[kind] += prior / PRIOR * squares[kind] / total
+        return likelihood, slope
 
     limits = np.log(np.stack([least, np.full(len(parts), MOST)], axis=1))
-    return minimise_bounded(cost, start, limits, steps=200, decrease=1e-14, gradient=gradient)
+    return minimise_sloped(cost, start, limits, steps=200, decrease=1e-14)

@@ -16,9 +16,10 @@ def minimise_bounded(
     limits: Array,
     steps: int = 20,
     decrease: float = DECREASE,
-    gradient: Callable[[Array], Array] | None = None,
 ) -> Array:
     """Return where a cost is least, by a quasi-Newton method (SciPy's L-BFGS-B).
+
+    Its slopes are taken of differences.
 
     Parameters
     ----------
@@ -31,11 +32,25 @@ def minimise_bounded(
         At most.
     decrease : float
         Of the cost, relative; the step that lowers it by less is the last.
-    gradient : callable, optional
-        Of the cost, shape (n,); by differences where it is not given.
     """
     options = {"maxiter": steps, "ftol": decrease}
-    found = minimize(cost, start, jac=gradient, method="L-BFGS-B", bounds=limits, options=options)
+    found = minimize(cost, start, method="L-BFGS-B", bounds=limits, options=options)
+    return np.asarray(found.x)
+
+
+def minimise_sloped(
+    cost: Callable[[Array], tuple[float, Array]],
+    start: Array,
+    limits: Array,
+    steps: int,
+    decrease: float,
+) -> Array:
+    """Return where a cost is least that tells its gradient, shape (n,), with it.
+
+    Otherwise as `minimise_bounded`.
+    """
+    options = {"maxiter": steps, "ftol": decrease}
+    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=limits, options=options)
     return np.asarray(found.x)
 
 
