@@ -17,7 +17,7 @@ from magfusion.model.ground import in_ground
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import Site
 from magfusion.model.without_imu import logged
-from magfusion.receiver.receiver import received
+from magfusion.receiver.receivers import received
 from magfusion.units import Array, ComplexArray
 
 RATE_HZ = 250.0

@@ -41,7 +41,7 @@ from magfusion.model.site import (
 from magfusion.papers.p000_tracker.pose import TrackerFix, locate_by_svd, unit_coupling
 from magfusion.receiver.ambient import Removal, subtraction_gain
 from magfusion.receiver.cycles import whole_cycles
-from magfusion.receiver.receiver import received
+from magfusion.receiver.receivers import received
 from magfusion.receiver.slots import SlotSettings
 from magfusion.receiver.windows import default_settings
 from magfusion.simulation.field import phasors_world, synchronised_drives

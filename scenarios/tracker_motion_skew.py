@@ -28,7 +28,7 @@ from magfusion.model.samples import FieldSamples, ImuSamples, Log
 from magfusion.model.site import Site, Slots
 from magfusion.model.trajectory import Trajectory
 from magfusion.papers.p000_tracker.pose import world_poses
-from magfusion.receiver.receiver import received
+from magfusion.receiver.receivers import received
 from magfusion.simulation.field import phasors_world, synchronised_drives
 from magfusion.simulation.inertial import simulate_imu
 from magfusion.simulation.motion import ATTITUDE_KNOT, Motion, Rests, turning_motion

@@ -22,7 +22,7 @@ from magfusion.model.platform_motion import MotionPrior
 from magfusion.model.samples import FieldSamples, ImuSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.receiver.receiver import Receiver
+from magfusion.receiver.receivers import receiver_of
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import (
     SimulatedLog,
@@ -148,8 +148,8 @@ def test_raw_samples_of_fewer_axes_become_phasors_of_these(
     log = read_log(tmp_path / "log")
     assert log.waveform is not None
     assert log.waveform.axes == axes
-    _, whole = Receiver.of(site).whole(log.waveform, log.imu)
-    _, found = Receiver.of(with_axes(site, axes)).whole(log.waveform, log.imu)
+    _, whole = receiver_of(site).whole(log.waveform, log.imu)
+    _, found = receiver_of(with_axes(site, axes)).whole(log.waveform, log.imu)
     assert found.axes == axes
     assert np.isnan(found.phasor_sensor[..., 1]).all()
     sensor, truth = site.platform.magnetometer, simulated.motion.trajectory(found.time)

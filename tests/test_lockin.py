@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from magfusion.errors import InputError
 from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.receiver.lockin import window_operator
-from magfusion.receiver.receiver import LockinReceiver
+from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.receiver.turn import on_clock
 from magfusion.receiver.windows import LockinSettings, default_settings
 from magfusion.simulation.demo_site import demo_site

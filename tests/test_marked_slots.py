@@ -24,7 +24,7 @@ from magfusion.model.site import MarkedSlots, Site, Slots
 from magfusion.receiver.ambient import uneven_weights
 from magfusion.receiver.cycles import cycles, joins, whole_cycles
 from magfusion.receiver.marked import OUTSIDE, TOO_SHORT, MarkedReceiver
-from magfusion.receiver.receiver import Receiver, received
+from magfusion.receiver.receivers import received, receiver_of
 from magfusion.receiver.turn import turn_of
 
 RATE_HZ, CARRIER_HZ = 20e3, 6e3
@@ -130,7 +130,7 @@ def test_a_stream_in_odd_pieces_gives_what_the_log_gives(carrier_hz: float) -> N
     marks = waveform.marks
     assert marks is not None
     for beside in (False, True):
-        receiver = Receiver.of(site)
+        receiver = receiver_of(site)
         slot, parts, end, rng = _slots_beside(waveform), [], 0, np.random.default_rng(1)
         while end < len(waveform):
             first, end = end, min(end + int(rng.integers(50, 900)), len(waveform))
@@ -212,13 +212,13 @@ def test_a_checkpoint_in_the_middle_of_a_burst_goes_on() -> None:
     slot, half = _slots_beside(waveform), 7000
     runs = []
     for cut in (False, True):
-        receiver = Receiver.of(site)
+        receiver = receiver_of(site)
         receiver.hear_slots(waveform.time[:half], slot[:half])
         early = waveform.rows(slice(half))
         receiver.begin(early, imu)
         receiver.push(early, imu, float(early.time[-1]))
         if cut:
-            data, receiver = to_plain(receiver), Receiver.of(site)
+            data, receiver = to_plain(receiver), receiver_of(site)
             resume(receiver, data, "receiver")
         receiver.hear_slots(waveform.time[half:], slot[half:])
         runs.append(receiver.push(waveform, imu, float(waveform.time[-1])))

@@ -13,7 +13,7 @@ from magfusion.estimation.state import State, as_trajectory
 from magfusion.jobs.replay import Replay, feed
 from magfusion.model.samples import ImuSamples
 from magfusion.model.trust import Verdict
-from magfusion.receiver.receiver import LockinReceiver
+from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulatedLog, SimulationConfig, simulate_log

@@ -16,7 +16,10 @@ from magfusion.jobs.inputs import Job
 from magfusion.jobs.smooth import run_smooth
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site, Slots
-from magfusion.receiver.receiver import LockinReceiver, Receiver, SlotReceiver, received
+from magfusion.receiver.lockin_receiver import LockinReceiver
+from magfusion.receiver.receiver import Receiver
+from magfusion.receiver.receivers import received
+from magfusion.receiver.slot_receiver import SlotReceiver
 from magfusion.receiver.windows import LockinSettings
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.field import synchronised_drives

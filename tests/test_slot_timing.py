@@ -10,7 +10,8 @@ from magfusion.errors import InputError
 from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.model.site import Site, Slots
 from magfusion.receiver.cycles import whole_cycles
-from magfusion.receiver.receiver import SlotReceiver, received
+from magfusion.receiver.receivers import received
+from magfusion.receiver.slot_receiver import SlotReceiver
 from magfusion.receiver.slot_timing import is_searched, slot_start
 
 SLOTS = Slots(1.0 / 480.0, 4)

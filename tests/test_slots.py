@@ -17,7 +17,7 @@ from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site, Slots
 from magfusion.receiver.ambient import Removal, ambient_weights, subtraction_gain
 from magfusion.receiver.cycles import whole_cycles
-from magfusion.receiver.receiver import Receiver, received
+from magfusion.receiver.receivers import received, receiver_of
 from magfusion.receiver.slots import (
     SlotSettings,
     default_slot_settings,
@@ -174,7 +174,7 @@ def test_a_gyro_bias_costs_the_paper_dearly_and_its_neighbours_nothing() -> None
         settings = SlotSettings(removal, "rectangular")
         found, _ = received(waveform, imu, site, settings)
         wrong[removal] = _wrong(site, _without_ends(found), motion)
-    receiver = Receiver.of(site, SlotSettings("subtract", "rectangular"))
+    receiver = receiver_of(site, SlotSettings("subtract", "rectangular"))
     windows, _ = receiver.whole(waveform, imu)
     known = on_clock(imu, site.platform.imu.time_offset, np.full(3, 0.02))
     mended, _ = receiver.phasors(waveform, known, windows, site)

@@ -21,7 +21,7 @@ from magfusion.model.parameters import Calibration
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.trajectory import Trajectory
 from magfusion.receiver.admission import INERTIAL_GAP, Windows, longest_step, silences, usual_step
-from magfusion.receiver.receiver import LockinReceiver
+from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.receiver.turn import on_clock
 from magfusion.units import Array
 

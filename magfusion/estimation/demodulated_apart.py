@@ -13,7 +13,7 @@ from magfusion.files.fields import side_by_side
 from magfusion.model.samples import FieldSamples, Log, Waveform
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
-from magfusion.receiver.receiver import usual_lockin
+from magfusion.receiver.receivers import usual_lockin
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 

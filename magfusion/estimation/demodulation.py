@@ -21,7 +21,9 @@ from magfusion.model.strapdown import resting
 from magfusion.model.trajectory import Trajectory, interpolated
 from magfusion.receiver.admission import Windows
 from magfusion.receiver.cycles import whole_cycles
-from magfusion.receiver.receiver import LockinReceiver, Receiver
+from magfusion.receiver.lockin_receiver import LockinReceiver
+from magfusion.receiver.receiver import Receiver
+from magfusion.receiver.receivers import receiver_of, windowed
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.turn import on_clock
 from magfusion.receiver.windows import LockinSettings
@@ -87,7 +89,7 @@ class Demodulation:
                 )
             return self.log.steady
         assert self.windows is not None
-        site, receiver = calibration.site, self.receiver.lockin()
+        site, receiver = calibration.site, windowed(self.receiver)
         imu = on_clock(calibration.on_log_rate(self.log.imu), calibration.time_offset)
         operator = receiver.operator(waveform, imu, self.windows, site)
         offset = site.platform.magnetometer.offset
@@ -161,7 +163,7 @@ def demodulated(log: Log, site: Site, settings: LockinSettings | None = None) ->
         return Demodulation(log, without_silence(log.fields), {})
     if site.platform.further:
         raise InputError("samples of several magnetometers are not demodulated; give their phasors")
-    receiver = Receiver.of(site, beside_lines(log, site, settings))
+    receiver = receiver_of(site, beside_lines(log, site, settings))
     windows, fields = receiver.whole(log.waveform, log.imu)
     refuse_too_deep(fields, site)
     heard, hidden = without_silence(fields), drowned(fields)

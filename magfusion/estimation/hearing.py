@@ -12,7 +12,8 @@ from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.cells import way_of
-from magfusion.receiver.receiver import LockinReceiver, Receiver
+from magfusion.receiver.lockin_receiver import LockinReceiver
+from magfusion.receiver.receivers import receiver_of
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import IntArray
@@ -63,7 +64,7 @@ def _heard(log: Log, site: Site, settings: LockinSettings | None) -> IntArray:
         assert log.fields is not None
         loud = above_noise(log.fields, DETECTION_CHI_SQUARE_ONLINE)
         return beacons_of(site, np.any(loud, axis=0))
-    receiver = Receiver.of(site, settings)
+    receiver = receiver_of(site, settings)
     assert isinstance(receiver, LockinReceiver)
     samples = receiver.sent(log.waveform, log.imu)
     if not tones_of(site).reused:

@@ -35,7 +35,8 @@ from magfusion.model.marks import Marks
 from magfusion.model.parameters import CLOCK_RATE, TIME_OFFSET, Block
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
 from magfusion.model.trust import Finding
-from magfusion.receiver.receiver import LockinReceiver, Receiver
+from magfusion.receiver.lockin_receiver import LockinReceiver
+from magfusion.receiver.receiver import Receiver
 from magfusion.units import Array, IntArray
 
 LONGEST_WAIT = 5.0  # s; the fields go on without an IMU that is silent for longer

@@ -22,7 +22,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.model.waveform import Motion, carriers, predicted_waveform
 from magfusion.receiver.cells import owned_by
 from magfusion.receiver.lockin import WindowOperator, window_operator
-from magfusion.receiver.receiver import LockinReceiver
+from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.receiver.turn import on_clock
 from magfusion.units import Array, BoolArray, ComplexArray
 

@@ -10,7 +10,9 @@ from magfusion.estimation.state import State
 from magfusion.estimation.stream_buffer import Buffer
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
-from magfusion.receiver.receiver import LockinReceiver, Receiver
+from magfusion.receiver.lockin_receiver import LockinReceiver
+from magfusion.receiver.receiver import Receiver
+from magfusion.receiver.receivers import receiver_of
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array
 
@@ -49,7 +51,7 @@ class SensorStream:
 
     def __init__(self, site: Site, lockin: LockinSettings | None) -> None:
         self.name = site.platform.magnetometer.name
-        self.receiver = Receiver.of(site, lockin)
+        self.receiver = receiver_of(site, lockin)
         self.samples = Buffer(f"magnetometer {self.name}", 3)
         self.windows, self.now, self.late = deque(), None, 0
         self._noise, self._noise_unseen = [], False

@@ -27,8 +27,9 @@ from magfusion.model.parameters import seen_by
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
+from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.receiver.marked_bursts import LATE
-from magfusion.receiver.receiver import LockinReceiver, Receiver
+from magfusion.receiver.receivers import receiver_of
 from magfusion.receiver.slots import is_marked
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, IntArray
@@ -59,7 +60,7 @@ class SeveralArrivals(Arrivals):
 
     def __init__(self, site: Site, lockin: LockinSettings | None, applied_offset: float) -> None:
         refuse_warm(site)
-        super().__init__(Receiver.of(site, lockin), applied_offset)
+        super().__init__(receiver_of(site, lockin), applied_offset)
         self.site, sensors = site, site.platform.magnetometers
         self._lockin = same_windows(site, lockin) if site.beacons else lockin
         self.streams = []
@@ -388,4 +389,4 @@ def arrivals_of(site: Site, lockin: LockinSettings | None) -> Arrivals:
     offset = site.platform.imu.time_offset
     if site.platform.further:
         return SeveralArrivals(site, lockin, offset)
-    return Arrivals(Receiver.of(site, lockin), offset)
+    return Arrivals(receiver_of(site, lockin), offset)

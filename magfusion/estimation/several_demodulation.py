@@ -14,7 +14,7 @@ from magfusion.model.parameters import Calibration, seen_by
 from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
-from magfusion.receiver.receiver import usual_lockin
+from magfusion.receiver.receivers import usual_lockin
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import BoolArray, IntArray

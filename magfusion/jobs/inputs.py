@@ -37,7 +37,7 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.model.without_imu import logged
-from magfusion.receiver.receiver import Receiver
+from magfusion.receiver.receivers import receiver_of
 from magfusion.receiver.windows import LockinSettings
 from magfusion.results.page import PAGE
 from magfusion.results.report import FAILED
@@ -321,7 +321,7 @@ def read_job(
     if log.waveform is not None:
         if site.beacons:
             with named(job.declared_path):
-                Receiver.of(site).check()
+                receiver_of(site).check()
         log = mended(log, site)
     if log.waveforms and not raw:
         with named(job.log_path):

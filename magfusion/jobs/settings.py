@@ -277,7 +277,7 @@ class WindowSettings(Settings):
         if self.window is None and self.step is None and self.mains_hz == WindowSettings.mains_hz:
             return None
         from magfusion.jobs.inputs import read_site
-        from magfusion.receiver.receiver import usual_lockin
+        from magfusion.receiver.receivers import usual_lockin
         from magfusion.receiver.windows import LockinSettings
 
         site = read_site(job, unknown=True, several=True)

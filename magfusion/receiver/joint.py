@@ -16,7 +16,7 @@ from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.admission import Grid, Windows, sample_rate_hz
 from magfusion.receiver.design import nuisances_hz
-from magfusion.receiver.receiver import LEAST_SHARE, LockinReceiver
+from magfusion.receiver.lockin_receiver import LEAST_SHARE, LockinReceiver
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings, default_settings
 from magfusion.units import Array, BoolArray

@@ -11,8 +11,8 @@ from magfusion.model.site import Site
 from magfusion.receiver.admission import Grid, Windows, sample_rate_hz
 from magfusion.receiver.cycles import cycles
 from magfusion.receiver.marked_bursts import LATE, LONGEST_BURST, Bursts
-from magfusion.receiver.receiver import LEAST_SHARE_OF_SLOT, SlotReceiver
 from magfusion.receiver.slot_phasors import SlotValues
+from magfusion.receiver.slot_receiver import LEAST_SHARE_OF_SLOT, SlotReceiver
 from magfusion.receiver.slots import (
     LEAST_CYCLES,
     LEAST_SAMPLES,

@@ -1,13 +1,12 @@
 """The receiver: a magnetometer's samples, pushed as they come or all at once, to phasors.
 
-Of tones that are sent at once, `LockinReceiver`; of time slots, `SlotReceiver`.  Which windows are
-used `magfusion.receiver.admission` says, for both and whatever the size of the pieces.
+Of tones that are sent at once, `LockinReceiver`; of time slots, `SlotReceiver`: this is what they
+share.  Which windows are used `magfusion.receiver.admission` says, for both and whatever the size
+of the pieces.
 """
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from dataclasses import replace
-from functools import cached_property, reduce
 
 import numpy as np
 
@@ -19,39 +18,18 @@ from magfusion.model.site import Site
 from magfusion.receiver.admission import (
     INERTIAL_GAP,
     REASONS,
-    ROUNDING,
     Admission,
     Grid,
     Windows,
-    sample_rate_hz,
     usual_step,
 )
-from magfusion.receiver.cells import owned_by
-from magfusion.receiver.cycles import cycles, joins
-from magfusion.receiver.design import Designs, separable, variance_growth
-from magfusion.receiver.lockin import WindowOperator, designs_of, window_operator
-from magfusion.receiver.slot_phasors import SlotValues, demodulate_slots, slot_values
-from magfusion.receiver.slot_timing import check_told, heard_for, is_searched, slot_start
 from magfusion.receiver.slots import (
-    SlotSettings,
-    check_carriers,
-    driven_slots,
     has_schedule,
-    history_of,
-    is_marked,
-    is_pulsed,
-    schedule,
-    slot_lockin,
-    slot_settings_of,
 )
-from magfusion.receiver.turn import Turn, on_clock, slot_turn_of
-from magfusion.receiver.windows import LockinSettings, default_settings, sent_frequencies_hz
+from magfusion.receiver.turn import on_clock
 from magfusion.units import Array, BoolArray, IntArray
 
 NO_SILENT_SLOT = "no silent slot beside it"
-# Of the samples of a window: its design tells whether they suffice; of a slot: it has few columns.
-LEAST_SHARE, LEAST_SHARE_OF_SLOT = 0.5, 0.9
-FOLLOWED_EVERY = 0.2  # s; clocks that are 100 ppm apart drift by 20 us
 INERTIAL_MARGIN = 0.1  # s; by which their clocks may be apart, and before a window
 BEFORE = 256  # samples before a window, among which an axis that keeps one value is seen to
 
@@ -95,23 +73,6 @@ class Receiver(ABC):
         self.recent = np.zeros(0, dtype=np.int64)
         self.dropped = Counter()
 
-    @staticmethod
-    def of(site: Site, settings: LockinSettings | SlotSettings | None = None) -> "Receiver":
-        """Return the receiver for the drives of a site.
-
-        Parameters
-        ----------
-        settings : LockinSettings or SlotSettings, optional
-            None chooses them by the tones or the time slots.
-        """
-        if is_marked(site):
-            from magfusion.receiver.marked import MarkedReceiver
-
-            return MarkedReceiver(site, settings)
-        if isinstance(settings, SlotSettings) or has_schedule(site):
-            return SlotReceiver(site, settings)
-        return LockinReceiver(site, settings)
-
     @property
     @abstractmethod
     def remembered(self) -> int:
@@ -132,21 +93,6 @@ class Receiver(ABC):
         ------
         InputError
         """
-
-    def lockin(self) -> "LockinReceiver":
-        """Return this receiver where its windows leave a steady field, the Earth's.
-
-        Raises
-        ------
-        InputError
-            Where it is of time slots.
-        """
-        if isinstance(self, LockinReceiver):
-            return self
-        raise InputError(
-            "of coils in time slots the Earth field is taken off with the silent slots; leave"
-            " --earth out"
-        )
 
     @abstractmethod
     def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
@@ -383,268 +329,3 @@ class Receiver(ABC):
             f"magnetometer: no {one} is usable"
             f" ({reasons or 'the log is too short'}); record longer{remedy}"
         )
-
-
-class LockinReceiver(Receiver):
-    """Of tones that are sent at once: windows that overlap, long against the motion."""
-
-    remembered = 0
-    # With the lines that were found beside the tones; of a checkpoint, as the others are.
-    beside: LockinSettings | None
-
-    def __init__(self, site: Site, settings: LockinSettings | None = None) -> None:
-        super().__init__(site)
-        self._given, self.beside = settings, None
-        self._designs: Designs | None = None
-
-    @property
-    def settings(self) -> LockinSettings:
-        """Window and step, chosen by the tones where they were not given."""
-        return self._chosen if self.beside is None else self.beside
-
-    @cached_property
-    def _chosen(self) -> LockinSettings:
-        return default_settings(self.site) if self._given is None else self._given
-
-    @cached_property
-    def _sent(self) -> Array:
-        return sent_frequencies_hz(self.site)
-
-    def check(self) -> None:
-        """Refuse tones that cannot be separated, as `Receiver.check`."""
-        sent_frequencies_hz(self.site)
-
-    def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
-        """Lay windows from the first sample on, as `Receiver.begin`."""
-        rate_hz = sample_rate_hz(waveform)
-        frequencies = self._sent
-        highest = float(np.max(frequencies))
-        if highest > 0.45 * rate_hz:
-            raise InputError(
-                f"magnetometer: sampled at {rate_hz:.4g} Hz, too slow for the tone at {highest:g}"
-                f" Hz; at least {highest / 0.45:.4g} Hz are needed"
-            )
-        window = self.settings.window
-        if not separable(1.0 / rate_hz, self.settings, frequencies):
-            raise InputError(
-                f"magnetometer: {window * rate_hz:.3g} samples in a window of {window:.3g} s are"
-                " too few to tell tones, drift and steady field apart; choose a longer"
-                f" window (--window), or sample faster than at {rate_hz:.4g} Hz"
-            )
-        grid = Grid(
-            centre=self.settings.first_centre(float(waveform.time[0]) - 0.5 / rate_hz),
-            step=self.settings.step,
-            length=window,
-            wait=-0.6 / rate_hz,  # the last sample is half a step earlier
-        )
-        self._begin(waveform, imu, grid, LEAST_SHARE, clips=True)
-
-    def whole(self, waveform: Waveform, imu: ImuSamples) -> tuple[Windows, FieldSamples]:
-        """Return windows and phasors as `Receiver.whole`, each phasor of one beacon."""
-        windows, found = super().whole(waveform, imu)
-        return windows, owned_by(found, self.site)
-
-    def sent(self, waveform: Waveform, imu: ImuSamples) -> FieldSamples:
-        """Return what is received of each channel, of whichever beacon on its frequency."""
-        return super().whole(waveform, imu)[1]
-
-    def phasors(
-        self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
-    ) -> tuple[FieldSamples, IntArray]:
-        """Return the phasors of windows without what is known of the motion but the turns."""
-        operator = self.operator(waveform, imu, windows, site)
-        return operator.demodulate(waveform.measured_sensor)[0], windows.number
-
-    def operator(
-        self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
-    ) -> WindowOperator:
-        """Return the map from a waveform to phasors, as of `window_operator`.
-
-        What is made of the sample times alone is kept until others come.
-        """
-        known = self._designs
-        if known is None or known.windows is not windows or known.time is not waveform.time:
-            known = self._designs = designs_of(waveform, site, self.settings, windows)
-        return window_operator(waveform, imu, site, self.settings, windows, designs=known)
-
-    def _driven(self, windows: Windows) -> BoolArray:
-        return np.ones(len(windows), dtype=bool)
-
-    def _growth(self, windows: Windows, time: Array) -> Array:
-        assert self.admission is not None
-        frequencies = self._sent
-        step = self.admission.magnetometer_step
-        return variance_growth(windows, time, step, self.settings, frequencies)
-
-
-class SlotReceiver(Receiver):
-    """Of coils driven in turn: each slot a row at its own time, judged by whole cycles."""
-
-    _values: SlotValues  # of those that the phasors of later ones need
-    _followed: float  # when the grid was last compared with the stream (s)
-
-    def __init__(self, site: Site, settings: LockinSettings | SlotSettings | None = None) -> None:
-        super().__init__(site)
-        self._given, self._values = settings, SlotValues.none()
-        self._followed = -np.inf
-
-    @cached_property
-    def settings(self) -> SlotSettings:
-        """Removal and taper, chosen by the drives where they were not given."""
-        given = self._given
-        return given if isinstance(given, SlotSettings) else slot_settings_of(self.site, given)
-
-    @property
-    def remembered(self) -> int:
-        """For how many slots one that was admitted tells the ambient field and the noise."""
-        return history_of(self.site, self.settings) * schedule(self.site).count
-
-    def check(self) -> None:
-        """Refuse a schedule that not all coils keep, as `Receiver.check`."""
-        schedule(self.site)
-        check_told(self.site)
-        slot_settings_of(self.site, None if isinstance(self._given, SlotSettings) else self._given)
-
-    def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
-        """Lay slots by the schedule, from the first that is whole, as `Receiver.begin`."""
-        slots = schedule(self.site)
-        rate_hz = sample_rate_hz(waveform)
-        check_told(self.site)
-        check_carriers(self.site, rate_hz, self.settings)
-        if is_searched(self.site):
-            start = slot_start(waveform, self.site, rate_hz)
-            if start is None:
-                raise InputError(
-                    "magnetometer: the time slots are not found in the stream; bring the sensor"
-                    " nearer, or give the log's clock (synchronised: true, with start_s)"
-                )
-            slots, self._followed = replace(slots, start=start), float(waveform.time[-1])
-        grid = Grid(
-            centre=slots.start + 0.5 * slots.duration,
-            step=slots.duration,
-            length=slots.duration,
-            early=0.5 / rate_hz,
-            rounding=ROUNDING * slots.duration,
-            together=slots.count,
-        )
-        elapsed = float(waveform.time[0]) - 1.0 / rate_hz - slots.start
-        self.next_number = int(np.ceil(elapsed / slots.duration + ROUNDING))
-        # The plateau of a pulse is no saturation.
-        clips = not is_pulsed(self.site)
-        self._begin(waveform, imu, grid, LEAST_SHARE_OF_SLOT, clips=clips)
-
-    def _admitted(self, waveform: Waveform, imu: ImuSamples) -> Windows:
-        """Follow slots that are searched through a whole log, as through a stream."""
-        if not is_searched(self.site):
-            return super()._admitted(waveform, imu)
-        time, refusal, parts = waveform.time, None, [Windows.none()]
-        span = heard_for(schedule(self.site))
-        ends = np.searchsorted(time, np.arange(time[0] + span, time[-1], span))
-        for end in np.append(ends, len(time)).tolist():
-            newest = float(time[end - 1])
-            rows = slice(int(np.searchsorted(time, newest - 1.01 * span)), end)
-            look = waveform.rows(rows)
-            if self.grid is None:
-                # Where nothing is heard yet, there is nothing to count on from.
-                try:
-                    self.begin(look, imu)
-                except InputError as error:
-                    refusal = error
-                    continue
-            self._follow(look)
-            come = waveform.rows(slice(end))
-            own, inertial = self._since(come, imu, None, self.next_number)
-            found = self.admit(own, inertial, None if end == len(time) else newest)
-            parts.append(replace(found, first=found.first + end - len(own)))
-        if self.grid is None and refusal is not None:
-            raise refusal
-        return reduce(Windows.joined, parts)
-
-    def phasors(
-        self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
-    ) -> tuple[FieldSamples, IntArray]:
-        """Return the phasors of driven slots, freed of what the silent ones tell."""
-        turn = slot_turn_of(imu, site)
-        values = self._held(waveform, turn, windows, site)
-        return demodulate_slots(values, turn, site, self.settings)
-
-    def pushed(
-        self, waveform: Waveform, imu: ImuSamples, windows: Windows, since: int
-    ) -> tuple[FieldSamples, int]:
-        """Return the phasors of slots from a number on, as `Receiver.pushed`."""
-        turn = slot_turn_of(imu, self.site)
-        same = self._values.number[:, None] == windows.number
-        known = self._values.rows(np.any(same, axis=1))
-        fresh = windows.rows(~np.any(same, axis=0))
-        self._values = known.joined(self._held(waveform, turn, fresh, self.site))
-        found, number = demodulate_slots(self._values, turn, self.site, self.settings)
-        number, found = number[number >= since], found.rows(number >= since)
-        seen = len(found)
-        if seen and self.joined and not self.site.platform.magnetometer.lacking:
-            found = self._joined(found, number, turn)
-        return found, seen
-
-    def _joined(self, found: FieldSamples, number: IntArray, turn: Turn) -> FieldSamples:  # noqa: ARG002
-        """Return the slots of each cycle as one epoch, where it is short."""
-        return cycles(found, turn, self.site) if joins(self.site) else found
-
-    def _follow(self, waveform: Waveform) -> None:
-        """Bring the slots to where the stream shows them, half the way: a look is noisy."""
-        newest = float(waveform.time[-1])
-        if newest < self._followed + FOLLOWED_EVERY or not is_searched(self.site):
-            return
-        assert self.grid is not None
-        assert self.admission is not None
-        self._followed = newest
-        start = slot_start(waveform, self.site, 1.0 / self.admission.magnetometer_step)
-        if start is not None:
-            cycle, centre = self.grid.step * self.grid.together, self.grid.centre
-            late = (start + 0.5 * self.grid.step - centre + 0.5 * cycle) % cycle - 0.5 * cycle
-            if abs(late) < 0.5 * self.grid.step:
-                self.grid = replace(self.grid, centre=centre + 0.5 * late)
-
-    def _held(self, waveform: Waveform, turn: Turn, windows: Windows, site: Site) -> SlotValues:
-        assert self.admission is not None
-        rate_hz = 1.0 / self.admission.magnetometer_step
-        return slot_values(waveform, turn, site, self.settings, windows, rate_hz)
-
-    def _driven(self, windows: Windows) -> BoolArray:
-        return driven_slots(self.site, windows.number)
-
-    def _growth(self, windows: Windows, time: Array) -> Array:  # noqa: ARG002
-        """Return one: the few columns of a slot stay apart without a few samples."""
-        return np.ones(len(windows))
-
-
-def usual_lockin(site: Site, mains_hz: float = 50.0) -> LockinSettings:
-    """Return the window and step of a site where nothing else is asked: of slots, theirs.
-
-    Raises
-    ------
-    InputError
-        Where its drives cannot be separated.
-    """
-    return (slot_lockin if has_schedule(site) else default_settings)(site, mains_hz)
-
-
-def received(
-    waveform: Waveform,
-    imu: ImuSamples,
-    site: Site,
-    settings: LockinSettings | SlotSettings | None = None,
-) -> tuple[FieldSamples, Counter[str]]:
-    """Return the phasors of a whole waveform, and how many windows were dropped for which reason.
-
-    Parameters
-    ----------
-    settings : LockinSettings or SlotSettings, optional
-        As of `Receiver.of`.
-
-    Raises
-    ------
-    InputError
-        Where no window is usable.
-    """
-    receiver = Receiver.of(site, settings)
-    _, found = receiver.whole(waveform, imu)
-    return found, receiver.dropped

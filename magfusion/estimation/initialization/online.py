@@ -26,7 +26,7 @@ from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields,
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.receiver.cycles import cycle_of, cycles, joins
-from magfusion.receiver.receiver import Receiver
+from magfusion.receiver.receivers import receiver_of, windowed
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.turn import on_clock, turn_of
 from magfusion.receiver.windows import LockinSettings
@@ -128,10 +128,10 @@ def find_online_start(
     several = {} if waveforms is None else waveforms
     wave = Waveform(*waveform.rows(), marks, site.platform.magnetometer.axes)
     if not fields:
-        receiver = Receiver.of(site, settings.lockin)
+        receiver = receiver_of(site, settings.lockin)
         receiver.check()
         if settings.earth:
-            receiver.lockin()
+            windowed(receiver)
     whole = [s for s in fields if s.time[0] <= until]
     log = Log(
         name="the beginning",
@@ -213,7 +213,7 @@ def _lines_of_each(log: Log, site: Site, given: LockinSettings | None) -> dict[s
 
 def _of_cycles(log: Log, waveform: Waveform, site: Site, settings: EstimatorSettings) -> Log:
     """Return the phasors of a slotted tracker, a cycle an epoch, and no more than a start needs."""
-    receiver = Receiver.of(site, settings.lockin)
+    receiver = receiver_of(site, settings.lockin)
     _, found = receiver.whole(waveform, log.imu)
     if site.platform.magnetometer.lacking:  # whose slots stay epochs of their own
         cycle = cycle_of(found, site)

@@ -32,7 +32,7 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import SYMPTOMS, Finding, Trust, Verdict
 from magfusion.receiver.cycles import whole_cycles
-from magfusion.receiver.receiver import usual_lockin
+from magfusion.receiver.receivers import usual_lockin
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array

@@ -14,7 +14,7 @@ from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Verdict
-from magfusion.receiver.receiver import received, usual_lockin
+from magfusion.receiver.receivers import received, usual_lockin
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray

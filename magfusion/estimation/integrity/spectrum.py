@@ -18,7 +18,7 @@ from magfusion.model.site import Site
 from magfusion.model.strapdown import attitude_at, attitude_from_gyro
 from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.design import separable
-from magfusion.receiver.receiver import usual_lockin
+from magfusion.receiver.receivers import usual_lockin
 from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array

@@ -1,0 +1,114 @@
+"""The receiver of tones that are sent at once: windows that overlap, each a lock-in."""
+
+from functools import cached_property
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
+from magfusion.model.site import Site
+from magfusion.receiver.admission import (
+    Grid,
+    Windows,
+    sample_rate_hz,
+)
+from magfusion.receiver.cells import owned_by
+from magfusion.receiver.design import Designs, separable, variance_growth
+from magfusion.receiver.lockin import WindowOperator, designs_of, window_operator
+from magfusion.receiver.receiver import Receiver
+from magfusion.receiver.windows import LockinSettings, default_settings, sent_frequencies_hz
+from magfusion.units import Array, BoolArray, IntArray
+
+LEAST_SHARE = 0.5  # of the samples of a window: its design tells whether they suffice
+
+
+class LockinReceiver(Receiver):
+    """Of tones that are sent at once: windows that overlap, long against the motion."""
+
+    remembered = 0
+    # With the lines that were found beside the tones; of a checkpoint, as the others are.
+    beside: LockinSettings | None
+
+    def __init__(self, site: Site, settings: LockinSettings | None = None) -> None:
+        super().__init__(site)
+        self._given, self.beside = settings, None
+        self._designs: Designs | None = None
+
+    @property
+    def settings(self) -> LockinSettings:
+        """Window and step, chosen by the tones where they were not given."""
+        return self._chosen if self.beside is None else self.beside
+
+    @cached_property
+    def _chosen(self) -> LockinSettings:
+        return default_settings(self.site) if self._given is None else self._given
+
+    @cached_property
+    def _sent(self) -> Array:
+        return sent_frequencies_hz(self.site)
+
+    def check(self) -> None:
+        """Refuse tones that cannot be separated, as `Receiver.check`."""
+        sent_frequencies_hz(self.site)
+
+    def begin(self, waveform: Waveform, imu: ImuSamples) -> None:
+        """Lay windows from the first sample on, as `Receiver.begin`."""
+        rate_hz = sample_rate_hz(waveform)
+        frequencies = self._sent
+        highest = float(np.max(frequencies))
+        if highest > 0.45 * rate_hz:
+            raise InputError(
+                f"magnetometer: sampled at {rate_hz:.4g} Hz, too slow for the tone at {highest:g}"
+                f" Hz; at least {highest / 0.45:.4g} Hz are needed"
+            )
+        window = self.settings.window
+        if not separable(1.0 / rate_hz, self.settings, frequencies):
+            raise InputError(
+                f"magnetometer: {window * rate_hz:.3g} samples in a window of {window:.3g} s are"
+                " too few to tell tones, drift and steady field apart; choose a longer"
+                f" window (--window), or sample faster than at {rate_hz:.4g} Hz"
+            )
+        grid = Grid(
+            centre=self.settings.first_centre(float(waveform.time[0]) - 0.5 / rate_hz),
+            step=self.settings.step,
+            length=window,
+            wait=-0.6 / rate_hz,  # the last sample is half a step earlier
+        )
+        self._begin(waveform, imu, grid, LEAST_SHARE, clips=True)
+
+    def whole(self, waveform: Waveform, imu: ImuSamples) -> tuple[Windows, FieldSamples]:
+        """Return windows and phasors as `Receiver.whole`, each phasor of one beacon."""
+        windows, found = super().whole(waveform, imu)
+        return windows, owned_by(found, self.site)
+
+    def sent(self, waveform: Waveform, imu: ImuSamples) -> FieldSamples:
+        """Return what is received of each channel, of whichever beacon on its frequency."""
+        return super().whole(waveform, imu)[1]
+
+    def phasors(
+        self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
+    ) -> tuple[FieldSamples, IntArray]:
+        """Return the phasors of windows without what is known of the motion but the turns."""
+        operator = self.operator(waveform, imu, windows, site)
+        return operator.demodulate(waveform.measured_sensor)[0], windows.number
+
+    def operator(
+        self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
+    ) -> WindowOperator:
+        """Return the map from a waveform to phasors, as of `window_operator`.
+
+        What is made of the sample times alone is kept until others come.
+        """
+        known = self._designs
+        if known is None or known.windows is not windows or known.time is not waveform.time:
+            known = self._designs = designs_of(waveform, site, self.settings, windows)
+        return window_operator(waveform, imu, site, self.settings, windows, designs=known)
+
+    def _driven(self, windows: Windows) -> BoolArray:
+        return np.ones(len(windows), dtype=bool)
+
+    def _growth(self, windows: Windows, time: Array) -> Array:
+        assert self.admission is not None
+        frequencies = self._sent
+        step = self.admission.magnetometer_step
+        return variance_growth(windows, time, step, self.settings, frequencies)
