@@ -8,7 +8,7 @@ from numpy.linalg import norm
 
 from magfusion.errors import InputError
 from magfusion.estimation.integrity.detection import only
-from magfusion.estimation.motion_shape import MotionShape
+from magfusion.estimation.motion_stretches import joined, stretches
 from magfusion.estimation.sending import Sending
 from magfusion.estimation.state import State, as_trajectory
 from magfusion.model.audibility import Owned, only_owned, owned_at
@@ -105,25 +105,25 @@ def taken_off(
     """
     site, measured_sensor = calibration.site, samples.measured_sensor
     earth = np.zeros(3) if site.earth_field_world is None else site.earth_field_world
-    shape = MotionShape.of(path, imu, time_offset, site.gravity)
     unexplained, change = np.empty_like(measured_sensor), np.empty_like(measured_sensor)
-    sending = Sending.of(calibration, window)
-    for begin in range(0, len(samples.time), sending.at_once):
-        rows = slice(begin, begin + sending.at_once)
-        time = samples.time[rows]
-        motion = shape.at(time)
-        heard = sending.along(motion)
-        predicted, change[rows] = predicted_waveform(
-            motion,
-            heard,
-            earth,
-            carriers(tone_frequencies(heard.site), time),
-            Motion(*shape.by_time_offset(time)),
-        )
-        unexplained[rows] = measured_sensor[rows] - predicted
-    return TakenOff(
-        unexplained, change, sending, earth, None if wanted is None else shape.at(wanted)
-    )
+    sending, others = Sending.of(calibration, window), []
+    for stretch in stretches(samples.time, path, imu, time_offset, site.gravity):
+        shape = stretch.shape
+        for rows in stretch.pieces(sending.at_once):
+            time = samples.time[rows]
+            motion = shape.at(time)
+            heard = sending.along(motion)
+            predicted, change[rows] = predicted_waveform(
+                motion,
+                heard,
+                earth,
+                carriers(tone_frequencies(heard.site), time),
+                Motion(*shape.by_time_offset(time)),
+            )
+            unexplained[rows] = measured_sensor[rows] - predicted
+        if wanted is not None:
+            others.append(stretch.at_others(wanted))
+    return TakenOff(unexplained, change, sending, earth, joined(others) if others else None)
 
 
 def demodulate_about(

@@ -88,7 +88,11 @@ class MotionShape:
 
     @staticmethod
     def of(
-        states: Trajectory, imu: ImuSamples, time_offset: float, gravity: float
+        states: Trajectory,
+        imu: ImuSamples,
+        time_offset: float,
+        gravity: float,
+        reach: int | None = None,
     ) -> "MotionShape":
         """Integrate an inertial stream through states.
 
@@ -98,6 +102,8 @@ class MotionShape:
             (s)
         gravity : float
             (m/s^2)
+        reach : int, optional
+            Where the samples are a part of a stream that has its own.
         """
         if states.velocity_world is None or states.gyro_bias_body is None:
             raise ValueError("states must have velocity and biases")
@@ -129,7 +135,7 @@ class MotionShape:
             velocity_world=velocity,
             position_world=position,
             gravity=gravity,
-            reach=low_pass_reach(imu),
+            reach=low_pass_reach(imu) if reach is None else reach,
         )
 
     def at(self, wanted: Array) -> Trajectory:
@@ -220,9 +226,15 @@ class MotionShape:
         speed, moved = _integrated(self.time, tilted)
         del tilted
         moved -= self.velocity_world
+        speed -= self.accel_world
         position = self._averaged(moved)
         del moved
-        speed -= self.accel_world
+        # Beside a gap, and at the ends, a mean is of another time: what has been gathered of speed
+        # since the beginning must not matter there.
+        since = self.time - self.time[0]
+        late = self._averaged(since) - since
+        uneven = np.flatnonzero(np.abs(late) > 0.5 * float(np.median(np.diff(self.time))))
+        position[uneven] -= late[uneven, None] * speed[uneven]
         velocity = self._averaged(speed)
         del speed
         held_back = hermite(self.time, position, velocity, known)

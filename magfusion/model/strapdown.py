@@ -8,6 +8,7 @@ from magfusion.model.site import MotionModel
 from magfusion.units import Array, BoolArray, IntArray
 
 CHUNK = 65_536  # samples at a time: what is computed of them stays in the cache
+LONG = 1 << 18  # samples whose turns are multiplied at once
 
 
 def rotation_increments(time: Array, gyro_body: Array) -> Rotation:
@@ -70,10 +71,15 @@ def attitude_from_gyro(time: Array, gyro_body: Array) -> Rotation:
 
 def turn_from_gyro(time: Array, gyro_body: Array) -> Array:
     """Return `attitude_from_gyro` as quaternions, shape (4, n), scalar first."""
-    steps = np.empty((4, len(time)))
-    steps[:, 0] = [1.0, 0.0, 0.0, 0.0]
-    steps[:, 1:] = of_vectors(_increments(time, gyro_body).T)
-    return unit(_prefix_products(steps))
+    out = np.empty((4, len(time)))
+    out[:, :1] = [[1.0], [0.0], [0.0], [0.0]]
+    for lo in range(0, len(time), LONG):
+        piece = slice(lo, lo + LONG + 1)  # from the last turn of the piece before
+        steps = np.concatenate(
+            [out[:, lo : lo + 1], of_vectors(_increments(time[piece], gyro_body[piece]).T)], axis=1
+        )
+        out[:, piece] = unit(_prefix_products(steps))
+    return out
 
 
 def attitude_at(attitude: Rotation, time: Array, gyro_body: Array, wanted: Array) -> Rotation:
@@ -100,8 +106,13 @@ def attitude_at(attitude: Rotation, time: Array, gyro_body: Array, wanted: Array
 
 def turn_at(turn: Array, time: Array, gyro_body: Array, wanted: Array) -> Array:
     """Return `attitude_at` of and as quaternions, shape (4, n) and (4, m), scalar first."""
-    index = _sample_before(time, wanted)
-    return product(turn[:, index], _turn_since(index, time, gyro_body, wanted))
+    out = np.empty((4, len(wanted)))
+    for lo in range(0, len(wanted), CHUNK):
+        rows = slice(lo, lo + CHUNK)
+        index = _sample_before(time, wanted[rows])
+        since = _turn_since(index, time, gyro_body, wanted[rows])
+        out[:, rows] = product(turn[:, index], since)
+    return out
 
 
 def attitude_from_gyro_at(time: Array, gyro_body: Array, wanted: Array) -> Rotation:

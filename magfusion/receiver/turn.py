@@ -61,7 +61,7 @@ def on_clock(
 
 
 def standing_in(imu: ImuSamples, silence: tuple[Array, Array]) -> ImuSamples:
-    """Return an inertial stream that says of its gaps that nothing turns there.
+    """Return a stream of rates that says of its gaps that nothing turns there.
 
     Parameters
     ----------
@@ -79,8 +79,8 @@ def standing_in(imu: ImuSamples, silence: tuple[Array, Array]) -> ImuSamples:
     rates = np.zeros((len(time), 3))
     rates[-2] = imu.gyro_body[-1]
     gyro = np.insert(imu.gyro_body, at, rates, axis=0)
-    accel = np.insert(imu.accel_body, at, imu.accel_body[at - 1], axis=0)
-    return ImuSamples(np.insert(imu.time, at, time), gyro, accel)
+    force = np.broadcast_to(np.zeros(3), gyro.shape)  # of which no turn is made
+    return ImuSamples(np.insert(imu.time, at, time), gyro, force)
 
 
 def turn_of(imu: ImuSamples, site: Site) -> Turn:
