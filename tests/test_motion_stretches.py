@@ -22,7 +22,7 @@ Case = tuple[Waveform, Trajectory, ImuSamples, Calibration]
 
 @pytest.fixture(scope="module")
 def case() -> Case:
-    """A log of a minute, its states uneven, with a gap of the IMU in it."""
+    """Return a log of a minute, its states uneven, with a gap of the IMU in it."""
     rng, site = np.random.default_rng(5), demo_site()
     moving = turning_motion(rng, 60.0, BOX_WORLD)
     imu = simulate_imu(moving, NOISY, site.gravity, 200.0, 60.0, rng, 0.0, None).samples

@@ -167,6 +167,21 @@ def test_piece_by_piece_a_log_is_separated_as_at_once(monkeypatch: pytest.Monkey
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=0.0)
 
 
+def test_what_is_considered_is_taken_in_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = _smoothed(_walk(1))
+    known = separate_smoothed(result), _marginals(result)
+    monkeypatch.setattr(chain_system, "SIDES", 1.0)  # one block at once
+    assert len(chain_system.column_groups(result.uncertain, result.graph.epochs)) > 3
+    monkeypatch.setattr(chain_system, "KEPT", 1.0)
+    found = separate_smoothed(result), _marginals(result)
+    assert known[0] is not None
+    assert found[0] is not None
+    pairs = [(getattr(found[0], name), value) for name, value in vars(known[0]).items()]
+    for one, other in (*pairs, *zip(found[1], known[1], strict=True)):
+        scale = max(float(np.max(np.abs(other))), 1e-300)
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12 * scale)
+
+
 @pytest.mark.parametrize("seed", [2, 3])
 def test_good_logs_stay_as_they_are_within_a_useful_level(seed: int) -> None:
     small = _walk(seed)

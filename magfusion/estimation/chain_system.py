@@ -18,12 +18,13 @@ from magfusion.estimation.graph import Estimate, Graph
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.solve.chain import Chain
 from magfusion.estimation.state import MOTION, states_in
-from magfusion.model.parameters import Block, difference, dimension
+from magfusion.model.parameters import Block, difference, dimension, placed
 from magfusion.model.prior import prior_sqrt_covariance, prior_sqrt_information
 from magfusion.units import Array, BoolArray, IntArray
 
 AT_ONCE = 2e8  # bytes; variants are solved in groups of so much
 KEPT = 1e8  # bytes of rows; what is more is made anew for every group
+SIDES = 6e7  # bytes of right sides at once; what is considered is taken in groups
 _FIRST, _WIDTH = {"x": 0, "v": 6, "b": 9}, {"x": 6, "v": 3, "b": 6}  # in a state's tangent vector
 
 
@@ -120,8 +121,10 @@ class FieldRows:
 
     Parameters
     ----------
-    spread : ndarray, shape (dimension, considered)
-        What makes a step of what is considered out of unit noise.
+    considered : tuple of Block
+        Those that the columns are of.
+    spread : ndarray, shape (dimension, columns)
+        What makes a step of them out of unit noise.
     """
 
     factors: Factors
@@ -138,9 +141,9 @@ class FieldRows:
         for factors in islice(self.factors.pieces(), len(self.known), None):
             found = factors.rows(states, calibration, factors.blocks)
             jacobian = found.jacobian(dimension(factors.blocks))
-            right = np.zeros((*found.error.shape, 1 + len(self.spread)))
+            right = np.zeros((*found.error.shape, 1 + self.spread.shape[1]))
             right[..., 0] = -found.error
-            if len(self.spread):
+            if self.considered:
                 by_other = factors.rows(states, calibration, self.considered).by_calibration
                 if by_other is not None:
                     right[..., 1:] = -by_other @ self.spread
@@ -156,30 +159,55 @@ def _size(piece: Piece) -> int:
     return piece.by_state.nbytes + piece.by_calibration.nbytes + piece.right.nbytes
 
 
+def column_groups(considered: tuple[Block, ...], epochs: int) -> list[slice]:
+    """Return columns of what is considered, so many at once that their right sides fit memory."""
+    most, out = int(SIDES / (8.0 * MOTION * epochs)), [slice(0, 0)]
+    for block in considered:
+        first, end = out[-1].start, block.columns.stop
+        if end - first > most and out[-1].stop > first:
+            out.append(slice(out[-1].stop, end))
+        else:
+            out[-1] = slice(first, end)
+    return out
+
+
 def chain_system(
-    graph: Graph, estimate: Estimate, considered: tuple[Block, ...]
+    graph: Graph,
+    estimate: Estimate,
+    considered: tuple[Block, ...],
+    columns: slice = slice(None),
 ) -> tuple[Normal, FieldRows | None]:
     """Return the normal equations of all but the fields, and the rows of the fields.
 
     Of a log that has one calibration all along, whose prior is in the graph.
+
+    Parameters
+    ----------
+    columns : slice
+        Of what is considered, of which the right sides are.
     """
     assert graph.declared is not None
-    size, others = dimension(graph.blocks), dimension(considered)
-    spread = prior_sqrt_covariance(graph.declared.site, considered) if others else np.zeros((0, 0))
-    normal = Normal(graph.epochs, size, others)
+    size = dimension(graph.blocks)
+    spread = np.zeros((0, 0))
+    if considered:
+        spread = prior_sqrt_covariance(graph.declared.site, considered)[:, columns]
+    normal = Normal(graph.epochs, size, spread.shape[1])
     if size:
         whitening = prior_sqrt_information(graph.declared.site, graph.blocks)
         step = difference(graph.declared, estimate.calibration, graph.blocks)
         normal.corner += whitening.T @ whitening
         normal.right_border[:, 0] -= whitening.T @ (whitening @ step)
         if graph.shift is not None:
-            by = graph.shift.by_considered
+            by = graph.shift.by_considered[:, columns]
             normal.right_border[:, 1 : 1 + by.shape[1]] += whitening.T @ (whitening @ by)
     for own in _native_rows(graph, estimate, spread, size):
         normal.add(*own)
     fields: FieldRows | None = None
+    felt = [block for block in considered if np.any(spread[block.columns])]
+    of_felt = [spread[block.columns] for block in felt]
     for factors in graph.factors:
-        rows = FieldRows(factors, estimate, considered, spread)
+        own_spread = np.concatenate(of_felt) if felt else spread[:0]
+        rows = FieldRows(factors, estimate, placed(felt), own_spread)
         if isinstance(factors.measurement, FieldPhasors):
             fields = rows
             continue
@@ -201,7 +229,10 @@ def _native_rows(
     graph: Graph, estimate: Estimate, spread: Array, size: int
 ) -> Iterator[tuple[IntArray, Array, Array | None, Array, Array]]:
     """Yield the rows of inertial factors and priors of the motion, those alike together."""
-    linear = graph.inertial(estimate, graph.by_considered(spread) if len(spread) else None)
+    by_others = graph.by_considered(spread) if len(spread) else None
+    if by_others is not None and not np.any(by_others):
+        by_others = None  # what the fields alone tell of
+    linear = graph.inertial(estimate, by_others)
     kinds: dict[tuple[tuple[str, int], ...], list[tuple[int, Array, Array]]] = defaultdict(list)
     for i in range(linear.size()):
         factor = linear.at(i)
@@ -212,7 +243,7 @@ def _native_rows(
         kind = tuple((name, index - first if name in _FIRST else 0) for name, index in names)
         kinds[kind].append((first, factor.getA(), factor.getb()))
     apart = {chr(gtsam.Symbol(CALIBRATION_KEY).chr()): size}
-    apart[chr(gtsam.Symbol(CONSIDERED_KEY).chr())] = len(spread)
+    apart[chr(gtsam.Symbol(CONSIDERED_KEY).chr())] = spread.shape[1]
     for kind, found in (
         (kind, every[begin : begin + PIECE])
         for kind, every in kinds.items()
@@ -221,7 +252,7 @@ def _native_rows(
         jacobian = np.array([by for _, by, _ in found])
         rows = jacobian.shape[:2]
         own, after = np.zeros((*rows, MOTION)), np.zeros((*rows, MOTION))
-        border, right = np.zeros((*rows, size)), np.zeros((*rows, 1 + len(spread)))
+        border, right = np.zeros((*rows, size)), np.zeros((*rows, 1 + spread.shape[1]))
         right[..., 0] = np.array([b for _, _, b in found])
         column = 0
         for name, later in kind:

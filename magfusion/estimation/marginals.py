@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam.symbol_shorthand import X
 
-from magfusion.estimation.chain_system import AT_ONCE, chain_system
+from magfusion.estimation.chain_system import AT_ONCE, chain_system, column_groups
 from magfusion.estimation.factors import CALIBRATION_KEY
 from magfusion.estimation.graph import Estimate, Graph
 from magfusion.estimation.measurements.phasors import leaves_out
 from magfusion.estimation.solve.bordered import eliminate, last_marginal
 from magfusion.estimation.solve.chain import solve_chain
+from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.estimation.state import MOTION
 from magfusion.model.parameters import Block, dimension
 from magfusion.units import Array
@@ -32,9 +33,10 @@ class _Marginals:
     ----------
     pose_cov : ndarray, shape (n, 6, 6)
         Of what is estimated alone.
-    by_considered : ndarray, shape (n, 6, considered)
+    by_considered : ndarray, shape (n, 6, 6)
+        What considered parameters add to it.
     calibration_cov : ndarray, shape (dimension, dimension)
-        Likewise.
+        Of what is estimated alone.
     response : ndarray, shape (dimension, considered)
     """
 
@@ -46,7 +48,7 @@ class _Marginals:
     @property
     def whole(self) -> tuple[Array, Array, Array]:
         """As `marginals` returns it."""
-        poses = self.pose_cov + self.by_considered @ np.swapaxes(self.by_considered, 1, 2)
+        poses = self.pose_cov + self.by_considered
         return poses, self.calibration_cov + self.response @ self.response.T, self.response
 
 
@@ -76,6 +78,7 @@ def marginals(
         vouched = {i: np.array(tree.marginalCovariance(X(i))) for i in rows}
         calibration = last_marginal(tree, linear, ordering) if graph.blocks else None
         del tree, linear  # of a long log they are as much again as what follows
+        give_back_memory()
         found = _of_chain(graph, estimate, considered)
         if _agrees(found, vouched, calibration):
             return found.whole
@@ -100,9 +103,10 @@ def marginals(
 
 
 def _is_chain(graph: Graph, considered: tuple[Block, ...]) -> bool:
-    """Tell whether one sweep gives all covariances: of one calibration, no log of hours."""
-    columns = 1 + dimension(considered) + dimension(graph.blocks)
-    too_long = 8.0 * graph.epochs * MOTION * columns > AT_ONCE
+    """Tell whether one sweep gives all covariances: of one calibration, no log of many hours."""
+    columns = [group.stop - group.start for group in column_groups(considered, graph.epochs)]
+    most = 1 + max(columns) + dimension(graph.blocks)
+    too_long = 8.0 * graph.epochs * MOTION * most > AT_ONCE
     if graph.declared is None or len(graph.segments) > 1 or graph.shift is not None:
         return False
     return not too_long and not leaves_out(graph.measurements)
@@ -110,14 +114,22 @@ def _is_chain(graph: Graph, considered: tuple[Block, ...]) -> bool:
 
 def _of_chain(graph: Graph, estimate: Estimate, considered: tuple[Block, ...]) -> _Marginals:
     """Return all covariances in one sweep."""
-    normal, fields = chain_system(graph, estimate, considered if graph.measurements else ())
-    if fields is not None:
-        for piece in fields.pieces():
-            piece.added_to(normal)
-    found = solve_chain(normal.chain(), POSE)
-    return _Marginals(
-        found.cov[0], found.states[0, ..., 1:], found.border_cov[0], found.border[0, :, 1:]
-    )
+    considered = considered if graph.measurements else ()
+    added, responses, solved = np.zeros((graph.epochs, POSE, POSE)), [], None
+    for columns in column_groups(considered, graph.epochs):
+        normal, fields = chain_system(graph, estimate, considered, columns)
+        if fields is not None:
+            for piece in fields.pieces():
+                piece.added_to(normal)
+        found = solve_chain(normal.chain(), POSE, None if solved is None else solved.inverse)
+        del normal, fields  # before the next group: of a long log they are much
+        response = found.states[0, ..., 1:]
+        added += response @ np.swapaxes(response, 1, 2)
+        responses.append(found.border[0, :, 1:])
+        solved = found._replace(states=added[None]) if solved is None else solved
+        del response, found
+    assert solved is not None
+    return _Marginals(solved.cov[0], added, solved.border_cov[0], np.concatenate(responses, axis=1))
 
 
 def _agrees(found: _Marginals, vouched: dict[int, Array], calibration: Array | None) -> bool:

@@ -18,6 +18,7 @@ from magfusion.estimation.integrity.smoothed_exclusion import (
     states_judged,
 )
 from magfusion.estimation.self_survey import Placement
+from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.files.site import save_site
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
@@ -84,6 +85,7 @@ def finished(
         By other logs.
     """
     separated = separated_smooth(result, risk)
+    give_back_memory()
     result, trust = judged(separated.result, log)
     trust |= Trust((*open_signs(result), *roll_findings(site)))
     result = replace(result, states=with_open_roll(result.states, site))

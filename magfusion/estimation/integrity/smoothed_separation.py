@@ -1,10 +1,12 @@
 """The smoothed trajectory without each beacon: alarms and protection levels by state."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from magfusion.estimation import chain_system as chains
 from magfusion.estimation.batch import Smoothed
-from magfusion.estimation.chain_system import FieldRows, Normal, chain_system
+from magfusion.estimation.chain_system import FieldRows, Normal, chain_system, column_groups
 from magfusion.estimation.convergence import OPEN_ROTATION
 from magfusion.estimation.integrity.separation import Separation
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
@@ -35,19 +37,26 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
     site = result.declared.site
     owner = site.sensor if by_magnetometer else site.owner
     every = range(len(site.platform.magnetometers if by_magnetometer else site.beacons))
-    rest, rows = chain_system(graph, result.estimate, result.uncertain)
-    assert rows is not None
-    rest.diagonal += np.diag(1.0 / OPEN**2)
     kept = np.array([owner >= 0, *(owner != j for j in every)])
     heard, square, count = np.zeros(len(owner), dtype=bool), np.zeros(len(owner)), 0
-    for piece in rows.pieces():
-        heard |= np.any(piece.by_state != 0.0, axis=(0, 2, 3))
-        square += np.sum(piece.right[..., 0] ** 2, axis=(0, 2))
-        count += len(piece.epoch)
-    solved, cost = _without_each(rest, rows, kept, square)
+    solved: list[_Variant] = []
+    for columns in column_groups(result.uncertain, graph.epochs):
+        rest, rows = chain_system(graph, result.estimate, result.uncertain, columns)
+        assert rows is not None
+        rest.diagonal += np.diag(1.0 / OPEN**2)
+        if not solved:
+            for piece in rows.pieces():
+                heard |= np.any(piece.by_state != 0.0, axis=(0, 2, 3))
+                square += np.sum(piece.right[..., 0] ** 2, axis=(0, 2))
+                count += len(piece.epoch)
+        solved = _without_each(rest, rows, kept, solved)
+        del rest, rows  # before the next group: of a long log they are much
+    cost = kept @ square - np.array([one.explained for one in solved])
     numbers = np.array([6 * np.sum(heard & (owner == j)) * count for j in every])
     others = np.array([np.any(heard & (owner != j)) for j in every])
-    step, cov, apart = solved
+    step, cov = np.array([v.step for v in solved]), np.array([v.cov for v in solved])
+    apart = np.array([v.apart for v in solved[1:]])
+    del solved
     variance = np.einsum("hnii->hni", cov[1:])
     shift = step[1:] - step[:1]
     determined = np.isfinite(shift).all(axis=2) & (variance > 0.0).all(axis=2)
@@ -65,45 +74,69 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
     )
 
 
-def _without_each(
-    rest: Normal, rows: FieldRows, kept: BoolArray, square: Array
-) -> tuple[tuple[Array, Array, Array], Array]:
-    """Solve variants with some of the channels, shape (h, channels); and what they leave.
+@dataclass(eq=False)
+class _Variant:
+    """A solution with some of the channels.
 
-    Returns
-    -------
-    tuple of ndarray
-        Steps (h, n, 6), their covariances (h, n, 6, 6), and those of the difference from the first
-        variant, (h - 1, n, 6, 6).
-    ndarray, shape (h,)
-        Sum of squares.
+    Parameters
+    ----------
+    step : ndarray, shape (n, 6)
+    cov, apart : ndarray, shape (n, 6, 6)
+        Of it, and of its difference from the first; both grow by what is considered.
+    explained : float
+        Of the sum of squares.
+    inverse : ndarray, shape (n, 15, 15)
+        As of `ChainSolution`.
+    """
+
+    step: Array
+    cov: Array
+    apart: Array
+    explained: float
+    inverse: Array
+
+
+def _without_each(
+    rest: Normal, rows: FieldRows, kept: BoolArray, before: list[_Variant]
+) -> list[_Variant]:
+    """Solve variants with some of the channels, shape (h, channels).
+
+    Parameters
+    ----------
+    before : list of _Variant
+        Solved with other columns of what is considered.
     """
     per_variant = 8.0 * 4.0 * (rest.diagonal.size + rest.border.size + rest.right.size)
     group = max(1, int(chains.AT_ONCE / per_variant))
-    steps, covs, aparts, costs = [], [], [], []
-    whole: tuple[Array, Array] | None = None
+    out, whole, alone = list(before), np.zeros((0, 6, 0)), np.zeros((0, 6, 6))
     for first in range(0, len(kept), group):
-        some = kept[first : first + group]
-        found = _solved(rest, rows, some)
-        costs.append(some @ square - found.explained)
-        for states, cov in zip(found.states, found.cov, strict=True):
+        some = slice(first, first + group)
+        known = np.array([one.inverse for one in before[some]]) if before else None
+        found = _solved(rest, rows, kept[some], known)
+        for k, states in enumerate(found.states):
             response = states[..., 1:]
-            steps.append(states[..., 0].copy())
-            covs.append(cov + response @ np.swapaxes(response, -1, -2))
-            if whole is None:
-                whole = response.copy(), cov.copy()
-                continue
-            moved = response - whole[0]
-            aparts.append(cov - whole[1] + moved @ np.swapaxes(moved, -1, -2))
+            if first + k == 0:
+                whole = response.copy()
+                alone = found.cov[k].copy()
+            if not before:
+                own, explained = found.cov[k].copy(), float(found.explained[k])
+                inverse = found.inverse[k].copy()
+                step = states[..., 0].copy()
+                out.append(_Variant(step, own, own - alone, explained, inverse))
+            moved = response - whole
+            out[first + k].cov += response @ np.swapaxes(response, -1, -2)
+            out[first + k].apart += moved @ np.swapaxes(moved, -1, -2)
             del moved
-        del found, states, response, cov  # before the next group: of a long log they are much
-    return (np.array(steps), np.array(covs), np.array(aparts)), np.concatenate(costs)
+        del found, states, response  # before the next group, too
+    return out
 
 
-def _solved(rest: Normal, rows: FieldRows, some: BoolArray) -> ChainSolution:
-    """Solve some variants at once."""
+def _solved(
+    rest: Normal, rows: FieldRows, some: BoolArray, known: Array | None = None
+) -> ChainSolution:
+    """Solve some variants at once; ``known`` is as of `solve_chain`."""
     chain, variants = rest.variants(len(some))
     for piece in rows.pieces():
         for normal, channels in zip(variants, some, strict=True):
             piece.added_to(normal, channels)
-    return solve_chain(chain, 6)
+    return solve_chain(chain, 6, known)

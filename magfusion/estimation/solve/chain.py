@@ -56,16 +56,20 @@ class ChainSolution(NamedTuple):
     cov: Array  # (h, n, k, k) of the same
     border_cov: Array  # (h, c, c)
     explained: Array  # (h,) of the sum of squares, by the solution for the first right side
+    inverse: Array  # (h, n, s, s) of what is left of each state: other right sides need no more
 
 
 @np.errstate(all="ignore")
-def solve_chain(chain: Chain, kept: int) -> ChainSolution:
+def solve_chain(chain: Chain, kept: int, known: Array | None = None) -> ChainSolution:
     """Solve every variant.  What one leaves open comes out as not finite, or absurdly wide.
 
     Parameters
     ----------
     kept : int
         Of each state: how many of its first numbers' covariance is asked for.
+    known : ndarray, shape (h, n, s, s), optional
+        `ChainSolution.inverse` of the same chain with other right sides: no covariance of the
+        states is found again.
     """
     n, size = chain.diagonal.shape[1:3]
     # What is swept takes the place of the right sides, and what is found that of what is swept: of
@@ -74,27 +78,23 @@ def solve_chain(chain: Chain, kept: int) -> ChainSolution:
     solved = chain.sides
     if solved is None:
         solved = np.concatenate([chain.right, chain.border], axis=-1)
-    inverse, gain = [], []
-    pivot = chain.diagonal[:, 0]
-    for i in range(n):
-        inverse.append(_inverse(pivot))
-        if i + 1 < n:
-            gain.append(inverse[i] @ chain.following[:, i])
-            back = np.swapaxes(gain[i], 1, 2)
-            pivot = chain.diagonal[:, i + 1] - back @ chain.following[:, i]
-            solved[:, i + 1] -= back @ solved[:, i]
-    cov = inverse[-1]
-    own = np.empty((*solved.shape[:2], kept, kept))
-    solved[:, -1], own[:, -1] = cov @ solved[:, -1], cov[:, :kept, :kept]
+    inverse = _inverses(chain) if known is None else known
+    gain = inverse[:, :-1] @ chain.following
+    for i in range(n - 1):
+        solved[:, i + 1] -= np.swapaxes(gain[:, i], 1, 2) @ solved[:, i]
+    solved[:, -1] = inverse[:, -1] @ solved[:, -1]
     for i in range(n - 2, -1, -1):
-        solved[:, i] = inverse[i] @ solved[:, i] - gain[i] @ solved[:, i + 1]
-        cov = inverse[i] + gain[i] @ cov @ np.swapaxes(gain[i], 1, 2)
-        own[:, i] = cov[:, :kept, :kept]
+        solved[:, i] = inverse[:, i] @ solved[:, i] - gain[:, i] @ solved[:, i + 1]
+    own = np.empty((len(inverse), 0, kept, kept))
+    if known is None:
+        own = _covariances(inverse, gain, kept)
+    del gain
     count = chain.right.shape[-1]
     alone, by_border = solved[..., :count], solved[..., count:]
     explained = np.einsum("hns,hns->h", first, alone[..., 0])
     if not chain.corner.shape[1]:
-        return ChainSolution(alone[:, :, :kept], chain.right_border, own, chain.corner, explained)
+        states = alone[:, :, :kept]
+        return ChainSolution(states, chain.right_border, own, chain.corner, explained, inverse)
     # What the states leave of the border.
     left = np.swapaxes(outer.reshape(len(outer), n * size, -1), 1, 2)
     taken = left @ solved.reshape(len(outer), n * size, -1)
@@ -105,8 +105,31 @@ def solve_chain(chain: Chain, kept: int) -> ChainSolution:
     states = alone[:, :, :kept] - part @ border[:, None]
     # The border explains what the states leave of it.
     explained += np.einsum("hc,hc->h", rest[..., 0], border[..., 0])
-    cov = own + part @ corner[:, None] @ np.swapaxes(part, -1, -2)
-    return ChainSolution(states, border, cov, corner, explained)
+    if known is None:
+        own += part @ corner[:, None] @ np.swapaxes(part, -1, -2)
+    return ChainSolution(states, border, own, corner, explained, inverse)
+
+
+def _inverses(chain: Chain) -> Array:
+    """Return the inverse of what those before leave of each state, shape (h, n, s, s)."""
+    out, pivot = np.empty_like(chain.diagonal), chain.diagonal[:, 0]
+    for i in range(out.shape[1]):
+        out[:, i] = _inverse(pivot)
+        if i + 1 < out.shape[1]:
+            back = np.swapaxes(out[:, i] @ chain.following[:, i], 1, 2)
+            pivot = chain.diagonal[:, i + 1] - back @ chain.following[:, i]
+    return out
+
+
+def _covariances(inverse: Array, gain: Array, kept: int) -> Array:
+    """Return the covariance of the first numbers of each state, shape (h, n, kept, kept)."""
+    own = np.empty((*inverse.shape[:2], kept, kept))
+    cov = inverse[:, -1]
+    own[:, -1] = cov[:, :kept, :kept]
+    for i in range(inverse.shape[1] - 2, -1, -1):
+        cov = inverse[:, i] + gain[:, i] @ cov @ np.swapaxes(gain[:, i], 1, 2)
+        own[:, i] = cov[:, :kept, :kept]
+    return own
 
 
 def _inverse(matrix: Array) -> Array:
