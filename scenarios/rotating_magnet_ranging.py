@@ -40,7 +40,8 @@ from magfusion.model.site import Beacon, BeaconSigma, Site, rotor_coils
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.layers import Layers
 from magfusion.simulation.pipe import Pipe, Steel
-from magfusion.simulation.rotor import Pass, Shaft, Surroundings, simulate_passes
+from magfusion.simulation.rotor import Pass, Surroundings, simulate_passes
+from magfusion.simulation.shaft import Shaft
 from magfusion.simulation.wells import TwoWells, drawn_steel
 from magfusion.units import Array
 

@@ -27,7 +27,7 @@ from magfusion.receiver.rotor import demodulate_rotor
 from magfusion.receiver.rotor_phase import followed_angle
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.pipe import Pipe, Steel, wall_transmission
-from magfusion.simulation.rotor import Shaft, shaft_angle, turned_moment
+from magfusion.simulation.shaft import Shaft, shaft_angle, turned_moment
 from magfusion.units import Array
 
 ROTOR = Rotor(200.0, np.array([0.0, 0.6, 0.8]), np.array([1.0, 0.0, 0.0]))

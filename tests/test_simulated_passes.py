@@ -10,7 +10,7 @@ from conftest import Refuse, run_command
 from scipy.spatial.transform import Rotation
 
 from magfusion.model.rotor import Harmonic, Rotor
-from magfusion.simulation.rotor import Shaft, turned_moment
+from magfusion.simulation.shaft import Shaft, turned_moment
 from magfusion.simulation.wells import TwoWells, lean_of
 
 SITE = """magfusion_site: 1

@@ -139,6 +139,11 @@ def load_site(
 
 def _refuse_unknown(entry: SiteEntry, path: Path) -> None:
     for i, beacon in enumerate(entry.beacons):
+        if beacon.unknown == "pose" and beacon.rotor is not None and len(entry.beacons) == 1:
+            raise InputError(
+                f"{path}: beacons[0].unknown: this job needs the pose of beacon {beacon.name};"
+                " where a rotor is the only beacon, magfusion range finds the wells from each other"
+            )
         if beacon.unknown is not None:
             raise InputError(
                 f"{path}: beacons[{i}].unknown: this job needs the {beacon.unknown} of beacon"

@@ -52,6 +52,7 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     log, site = read_job(
         job,
         fewer=not used,
+        apart=not used,
         several=True,
         raw=True,
         reference=used,

@@ -146,6 +146,7 @@ def run_fix(
     log, site = read_job(
         job,
         fewer=True,
+        apart=True,
         amplitudes=True,
         several=True,
         lockin=lockin,

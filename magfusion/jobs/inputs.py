@@ -30,6 +30,14 @@ from magfusion.files.trajectory_table import read_trajectory
 from magfusion.files.tum import read_tum
 from magfusion.jobs.receiver_axes import check_axes
 from magfusion.jobs.region import ANYWHERE, Where
+from magfusion.jobs.rotor_inputs import check_rotors, is_for_ranging
+from magfusion.jobs.written import CHECKPOINT as CHECKPOINT
+from magfusion.jobs.written import KEPT as KEPT
+from magfusion.jobs.written import LOGS as LOGS
+from magfusion.jobs.written import LOGS_TABLE as LOGS_TABLE
+from magfusion.jobs.written import ROWS as ROWS
+from magfusion.jobs.written import UNFINISHED, WRITTEN
+from magfusion.jobs.written import UNFINISHED_DRIFT as UNFINISHED_DRIFT
 from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import Log
@@ -75,54 +83,12 @@ class Job:
         return self.log_path / "site.yaml" if self.site_path is None else self.site_path
 
 
-_SITE = {"site.yaml", "site_field_map.parquet", "site_correlation.parquet"}
-_RESULT = {"trajectory.tum", "trajectory.parquet", *_SITE, "run.rrd", "report.json", FAILED}
-_TABLES = {
-    *("imu.parquet", "magnetometer.parquet", "fields.parquet", "truth.parquet"),
-    "reference.parquet",
-}
-_TRUE_SITE = {f"true_{name}" for name in _SITE}
-_LOG = {"log.yaml", *_SITE, *_TRUE_SITE, "report.json", *_TABLES}
 NOT_USED = Finding(
     "reference_unused",
     "The reference sensor is not used: what it tells of noise is taken off at rest alone, by"
     " demodulate, fix, smooth or navigate with --at-rest.",
     Verdict.TRUSTWORTHY,
 )
-UNFINISHED_DRIFT = "unfinished"
-KEPT, LOGS, LOGS_TABLE = "kept", "logs", "logs.csv"  # of several logs
-CHECKPOINT, ROWS = "checkpoint.bin", "checkpoint.rows"
-# What is in the directory while these jobs run.
-_UNFINISHED = {
-    "navigate": {CHECKPOINT, ROWS},
-    "drift": {UNFINISHED_DRIFT},
-    "smooth": {KEPT},
-    "calibrate log": {KEPT},
-}
-_WRITTEN = {
-    "smooth": _RESULT | {"fixes.parquet", KEPT, LOGS, LOGS_TABLE},
-    "fix": _RESULT | {"fixes.parquet"},
-    "navigate": _RESULT | {"lagged.parquet"} | _UNFINISHED["navigate"],
-    "drift": {"drift.png", "stability.png", "run.rrd", "report.json"} | _UNFINISHED["drift"],
-    "import": {"log.yaml", *_TABLES, "report.json"},
-    "simulate": _LOG,
-    "demodulate": _LOG,
-    "survey": {"survey.parquet", "survey.png", "report.json"},
-    "calibrate log": _SITE | {"calibration.png", "report.json", KEPT, LOGS_TABLE},
-    "calibrate beacon": _SITE | {"beacon.png", "report.json"},
-    "calibrate antenna": _SITE | {"antenna.png", "report.json"},
-    "calibrate fieldmap": _SITE | {"field_map.png", "report.json"},
-    "calibrate magnetometer": _SITE | {"magnetometer.png", "report.json"},
-    "calibrate attitude-database": {"attitudes.parquet", "attitudes.png", "report.json"},
-    "allan": _SITE | {"allan.png", "report.json", FAILED},
-    "check": {"check.png", "report.json", FAILED},
-    "range": {"range.parquet", "report.json", FAILED},
-    "match": {"attitude.parquet", "attitude.png", "report.json"},
-    "coverage": {"coverage.parquet", "coverage.png", "run.rrd", "report.json"},
-    "design": _SITE
-    | {"coverage.parquet", "design.png", "run.rrd", "report.json"}
-    | {"motion.parquet", "motion.png"},
-}
 
 
 def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
@@ -131,14 +97,14 @@ def _may_be_replaced(path: Path, kinds: tuple[str, ...]) -> bool:
     # A checkpoint that was being written when its run was killed.
     abandoned = re.compile(abandoned_pattern(r"checkpoint\.(bin|rows)"))
     found = {name for name in found if not abandoned.fullmatch(name)}
-    if any(found <= _UNFINISHED.get(kind, set()) for kind in kinds):
+    if any(found <= UNFINISHED.get(kind, set()) for kind in kinds):
         return True
     try:
         report = json.loads((path / "report.json").read_text(encoding="utf-8"))
         job = report["job"]
     except (OSError, ValueError, KeyError, TypeError):
         return False
-    return job in kinds and found <= _WRITTEN[job] | {FAILED, PAGE}
+    return job in kinds and found <= WRITTEN[job] | {FAILED, PAGE}
 
 
 def claim(output: Path, *kinds: str) -> AbstractContextManager[Path]:
@@ -265,6 +231,7 @@ def read_job(
     amplitudes: bool = False,
     reference: bool = False,
     rotor: bool = False,
+    apart: bool = False,
     several: bool = False,
     raw: bool = False,
     anew: bool = False,
@@ -288,6 +255,8 @@ def read_job(
         Whether it uses a reference sensor; that it does not is said.
     rotor : bool
         Whether it takes the angle of a rotor and a casing itself.
+    apart : bool
+        Whether each epoch may have a phase of its own.
     several : bool
         Whether it can do with several magnetometers.
     raw : bool
@@ -307,11 +276,8 @@ def read_job(
     site = read_site(job, unknown=unknown, without=without, several=several)
     log = _as_known(job, _open(job, report), site)
     check_axes(job.declared_path, job.log_path, log, site, fewer=fewer, amplitudes=amplitudes)
-    if site.platform.magnetometer.casing is not None and not rotor:
-        raise InputError(
-            f"{job.declared_path}: platform.magnetometer.casing: through steel a sensor is ranged"
-            " by magfusion range alone; leave it out for other commands"
-        )
+    if not rotor:
+        check_rotors(job.declared_path, job.log_path, log, site, apart=apart)
     log, site = logged(log, site)
     if log.inertial and site.platform.imu == NO_IMU:
         raise InputError(
@@ -384,7 +350,15 @@ def read_recording(job: Job, report: Report = quiet) -> tuple[Log, Site | None]:
         site = load_site(job.declared_path, unknown=True, without=True, several=True)
         if site.beacons or site.platform.further:
             log, site = read_job(
-                job, unknown=True, without=True, fewer=True, several=True, raw=True, report=report
+                job,
+                unknown=True,
+                without=True,
+                fewer=True,
+                rotor=is_for_ranging(site),
+                apart=True,
+                several=True,
+                raw=True,
+                report=report,
             )
             if site.platform.further and not log.waveforms:
                 raise InputError(

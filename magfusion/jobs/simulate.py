@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from magfusion.errors import InputError
+from magfusion.jobs.rotor_inputs import is_for_ranging
 from magfusion.jobs.settings import Command, option
-from magfusion.jobs.simulate_passes import ShaftSettings, is_for_ranging, run_passes
+from magfusion.jobs.simulate_passes import ShaftSettings, run_passes
 from magfusion.results.figures import Figure, Figures, Section, heading
 
 if TYPE_CHECKING:
@@ -171,6 +172,7 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
         iron=settings.iron,
         random_field=settings.random_field,
         multiplexer=Multiplexer(settings.burst, settings.pause),
+        shafts=settings.shaft_errors(),
         ambient=Ambient(
             day_night=office_noise(EPOCH_NS) if settings.ambient == "day-night" else None,
             drift=FieldDrift(settings.drift, DRIFT_TIME) if settings.drift else None,

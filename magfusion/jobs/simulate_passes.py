@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from magfusion.model.site import Site
     from magfusion.simulation.layers import Layers
     from magfusion.simulation.pipe import Pipe
-    from magfusion.simulation.rotor import Pass, Shaft, Surroundings
+    from magfusion.simulation.rotor import Pass, Surroundings
+    from magfusion.simulation.shaft import ShaftErrors
     from magfusion.simulation.wells import TwoWells
 
 LEAST_RATE_HZ, SAMPLES_PER_TURN = 50.0, 10.0
 LEAST_SHARE, MOST_SEGMENT = 0.05, 0.5  # of a segment of steel: of the distance, and in m
-LEAST_DRIFT_TIME = 1.0  # s
 AHEAD = 2.0  # m, at most, of the magnet from where it is abreast, in the middle of its depths
 
 
@@ -51,37 +51,17 @@ class ShaftSettings(RandomSettings):
         0.1, "Of a recorded angle, 1 sigma", unit="deg", least=0.0, most=30.0
     )
 
+    def shaft_errors(self) -> ShaftErrors:
+        """Return what they say of shafts."""
+        from magfusion.simulation.shaft import ShaftErrors
+        from magfusion.units import DEGREE
 
-def is_for_ranging(site: Site) -> bool:
-    """Return whether a site is of a magnet on a shaft that is to be found from another well."""
-    return (
-        len(site.beacons) == 1
-        and site.beacons[0].rotor is not None
-        and site.beacons[0].unknown == "pose"
-    )
-
-
-def drawn_shaft(site: Site, settings: ShaftSettings, rng: np.random.Generator) -> Shaft:
-    """Draw how a rotor turns: an angle that errs twice a turn makes an ellipse of half its size."""
-    import numpy as np
-
-    from magfusion.simulation.rotor import Shaft
-    from magfusion.units import DEGREE
-
-    rotor = site.beacons[0].rotor
-    assert rotor is not None
-    rms = rotor.speed_sigma_hz if settings.shaft_drift is None else settings.shaft_drift
-    first, second = 2.0 * rotor.ellipse_sigma * rng.standard_normal(2)
-    return Shaft(
-        angle_start=float(rng.uniform(0.0, 2.0 * np.pi)),
-        drift_hz=rms,
-        drift_time=max(2.0 * (rms / rotor.speed_walk_hz_rts) ** 2, LEAST_DRIFT_TIME),
-        slip=float(np.hypot(first, second)),
-        slip_phase=float(np.arctan2(second, first)),
-        whirl=settings.shaft_whirl * DEGREE,
-        length=rotor.length,
-        encoder_sigma=settings.encoder_sigma * DEGREE,
-    )
+        return ShaftErrors(
+            self.shaft_drift,
+            self.shaft_whirl * DEGREE,
+            self.encoder,
+            self.encoder_sigma * DEGREE,
+        )
 
 
 def laid_wells(entry: WellsEntry, rng: np.random.Generator) -> TwoWells:
@@ -139,6 +119,7 @@ def run_passes(
     from magfusion.results.verdict import trust_figures
     from magfusion.simulation.perturbed import perturb_site, with_earth_field
     from magfusion.simulation.rotor import simulate_passes
+    from magfusion.simulation.shaft import draw_shaft
     from magfusion.simulation.waveform import LEAST_SAMPLES_PER_CYCLE
 
     entry, claimed = read_wells(settings.wells), claim(output, "simulate")
@@ -155,7 +136,7 @@ def run_passes(
             f"--rate {rate_hz:g}: the rotor's fastest tone has {fastest_hz:g} Hz; give at least"
             f" {LEAST_SAMPLES_PER_CYCLE * fastest_hz:g} Hz"
         )
-    shaft, wells = drawn_shaft(true_site, settings, rng), laid_wells(entry, rng)
+    shaft, wells = draw_shaft(rotor, settings.shaft_errors(), rng), laid_wells(entry, rng)
     sensor = true_site.platform.magnetometer
     rolls = rng.uniform(-np.pi, np.pi, 2)
     passes = wells.passes(rolls, sensor.position_body, rotor.axis_beacon)

@@ -29,6 +29,7 @@ from magfusion.files.stream import (
 from magfusion.jobs.checkpoint import begin, save
 from magfusion.jobs.live import LiveSettings, StateSink, state_sinks
 from magfusion.jobs.region import ANYWHERE, Where
+from magfusion.jobs.rotor_inputs import AwaitedAngles, check_streamed_rotors
 from magfusion.model.marks import Marks
 from magfusion.model.quaternion import of_matrices
 from magfusion.model.site import Site
@@ -95,6 +96,7 @@ def run_stream(
         Where the site cannot be read, or a record is none and ``keep_going`` is not set.
     """
     site = settings.where.bounded(load_site(site_path, several=True))
+    check_streamed_rotors(site_path, site)
     with state_sinks(settings.live, site, 0, messages) as sinks:
         return _navigate(site, settings, source, sink, messages, sinks)
 
@@ -111,7 +113,7 @@ def _navigate(
     navigator = begin(place, key, site, settings.navigator, None, resume=settings.resume).navigator
     refused, saved, reached = 0, -np.inf, -np.inf
     missing: Counter[str] = Counter()
-    told = _Told(navigator, sink, others)
+    told, angles = _Told(navigator, sink, others), AwaitedAngles(site)
     for numbered in read_records(source, settings.form):
         try:
             newest = _take_in(navigator, site, numbered, missing, told)
@@ -122,6 +124,7 @@ def _navigate(
             refused += 1
             messages.write(f"magfusion: {sentence} (passed over)\n")
             continue
+        angles.see(numbered.record)
         told.epochs()
         if not navigator.started and -np.inf < newest >= reached + WAITING:
             told.tell(None, _waiting(navigator, newest))

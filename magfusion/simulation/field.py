@@ -1,6 +1,7 @@
 """The simulator's own field of a beacon: coils of their true size, not dipoles."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from magfusion.model.site import Beacon, Coil, Site
 from magfusion.simulation.disturbance import Spheres
 from magfusion.simulation.ground import ground_effect
 from magfusion.simulation.layers import Layers, layered_effect
+from magfusion.simulation.rotor_beacons import Turning
 from magfusion.units import AnyArray, Array, ComplexArray
 
 
@@ -22,10 +24,13 @@ class Drives:
         Of all beacons' tones, one after the other, at the log's epoch (rad).
     drift : ndarray, shape (beacons,)
         Relative frequency error.
+    turning : mapping of str to Turning
+        Of beacons that are magnets on shafts, by name; phase and drift are not theirs.
     """
 
     phase: Array
     drift: Array
+    turning: Mapping[str, Turning] = field(default_factory=dict)
 
 
 def synchronised_drives(site: Site) -> Drives:

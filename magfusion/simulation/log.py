@@ -26,6 +26,8 @@ from magfusion.simulation.motion import (
 )
 from magfusion.simulation.perturbed import perturb_site as perturb_site
 from magfusion.simulation.perturbed import with_earth_field
+from magfusion.simulation.rotor_beacons import Turning, recorded_angles, turn_rotors
+from magfusion.simulation.shaft import ShaftErrors
 from magfusion.simulation.slots import Multiplexer, draw_marks, is_multiplexed
 from magfusion.simulation.waveform import Mains, beacons_world, simulate_waveform
 from magfusion.units import Array
@@ -93,6 +95,8 @@ class SimulationConfig:
         ``model_error_length``; where there is one it takes the place of the ambient's bending.
     multiplexer : Multiplexer
         By which coils are driven whose slots the site declares as marked.
+    shafts : ShaftErrors
+        How beacons turn that are magnets on shafts.
     """
 
     box_world: Array
@@ -114,6 +118,7 @@ class SimulationConfig:
     iron: int = 0
     random_field: float = 0.0
     multiplexer: Multiplexer = field(default_factory=Multiplexer)
+    shafts: ShaftErrors = field(default_factory=ShaftErrors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +166,12 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
     declared = with_earth_field(site)
     true_site = perturb_site(declared, calibration_rng) if config.perturb else declared
     true_site = _with_instruments(true_site, config)
-    drives = draw_drives(true_site, calibration_rng)
+    shaft_rng, among = calibration_rng, true_site
+    turning: dict[str, Turning] = {}
+    if any(beacon.rotor is not None for beacon in site.beacons):
+        shaft_rng = rng.spawn(1)[0]
+        among, turning = turn_rotors(true_site, config.shafts, config.duration, shaft_rng)
+    drives = replace(draw_drives(among, calibration_rng), turning=turning)
     motion = _motion(config, motion_rng)
     ambient = _with_bending(true_site, config, field_rng, _with_iron(true_site, config, iron_rng))
     imu = simulate_imu(
@@ -185,8 +195,18 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         return simulate_waveform(motion, site, drives, rate_hz, duration, rng, *parts)
 
     several = bool(true_site.platform.further)
-    waveform = None if several else recorded(true_site, magnetometer_rng, None)
-    waveforms = _of_each(true_site, recorded, magnetometer_rng) if several else {}
+    if several and turning and config.shafts.encoder:
+        raise InputError(
+            "encoder: beside the samples of several magnetometers no angle of a rotor is recorded;"
+            " simulate it without, or one magnetometer"
+        )
+    waveform = None if several else recorded(among, magnetometer_rng, None)
+    waveforms = _of_each(among, recorded, magnetometer_rng) if several else {}
+    rotation = None
+    if waveform is not None and turning and config.shafts.encoder:
+        taken_at = waveform.time + true_site.platform.magnetometer.clock_offset
+        angles = recorded_angles(turning, taken_at, shaft_rng)
+        rotation = replace(angles, time=waveform.time)
     stamp = imu.samples.time
     clock = true_site.platform.imu
     taken = (1.0 + clock.clock_rate) * stamp + clock.time_offset
@@ -199,7 +219,7 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
     if config.reference is not None:
         # Spawned later than those of old, whose draws stay as they were.
         reference = simulate_reference(
-            config.reference, true_site, drives, config, rng.spawn(1)[0], ambient, marks
+            config.reference, among, drives, config, rng.spawn(1)[0], ambient, marks
         )
     log = Log(
         name=f"simulated_{config.motion}",
@@ -210,6 +230,7 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         truth=truth,
         reference=reference,
         waveforms=waveforms,
+        rotation=rotation,
     )
     return SimulatedLog(log, true_site, drives, motion, ambient)
 

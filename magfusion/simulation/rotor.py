@@ -16,45 +16,10 @@ from magfusion.model.site import Rotor, Site
 from magfusion.simulation.ground import dipole_in_ground
 from magfusion.simulation.layers import Layers, layered_effect_at
 from magfusion.simulation.pipe import Steel
+from magfusion.simulation.shaft import Shaft, moment_orders, shaft_angle, turned_moment
 from magfusion.units import Array, ComplexArray
 
-POINTS, ORDERS = 64, 4  # of a turn, and of its angle, from steady on, beside the harmonics
-NEGLIGIBLE = 1e-6  # of the moment
 NODES_APART = 0.08  # of the distance, between places where steel and layers are calculated
-
-
-@dataclass(frozen=True, eq=False)
-class Shaft:
-    """How a magnet truly turns, beyond what its site declares.
-
-    Parameters
-    ----------
-    angle_start : float
-        (rad)
-    drift_hz : float
-        Root mean square of the speed about its mean.
-    drift_time : float
-        Of correlation (s).
-    slip : float
-        Amplitude of the angle's error twice a turn, as of a joint that is bent (rad).
-    slip_phase : float
-        (rad)
-    whirl : float
-        By which the shaft's axis circles against its turning (rad).
-    length : float
-        Of the stack of magnets along the shaft (m).
-    encoder_sigma : float
-        Of an angle as it is recorded (rad).
-    """
-
-    angle_start: float = 0.3
-    drift_hz: float = 0.05
-    drift_time: float = 20.0
-    slip: float = 0.0
-    slip_phase: float = 0.0
-    whirl: float = 0.0
-    length: float = 0.3
-    encoder_sigma: float = 2e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,39 +67,6 @@ class Surroundings:
     depth_scale: float = 0.0  # relative error of the magnet's depths
     depth_sigma: float = 0.0  # m, of each reading of them
     conductivity: float = 0.0  # S/m, without end, where there are no layers
-
-
-def turned_moment(rotor: Rotor, shaft: Shaft, angle: Array) -> Array:
-    """Return the moment at angles of the shaft, rotor axes, shape (n, 3) (A m^2)."""
-    axis, zero = rotor.axis_beacon, rotor.zero_beacon
-    across = np.cross(axis, zero)
-    true = (angle + shaft.slip * np.sin(2.0 * angle + shaft.slip_phase))[:, None]
-    moment = np.cos(rotor.tilt) * (zero * np.cos(true) + across * np.sin(true))
-    moment = rotor.moment * (moment + np.sin(rotor.tilt) * axis)
-    for one in rotor.harmonics:
-        moment = moment + np.cos(one.order * true + one.phase) * one.moment_beacon
-    # Backward whirl: the shaft leans by a small angle about a direction that circles against it.
-    lean = shaft.whirl * (zero * np.cos(angle)[:, None] - across * np.sin(angle)[:, None])
-    size = np.linalg.norm(lean, axis=1, keepdims=True)
-    if not shaft.whirl:
-        return moment
-    unit = lean / size
-    crossed = np.cross(unit, moment)
-    along = np.sum(unit * moment, axis=1, keepdims=True)
-    return np.cos(size) * moment + np.sin(size) * crossed + (1.0 - np.cos(size)) * along * unit
-
-
-def shaft_angle(shaft: Shaft, frequency_hz: float, time: Array, rng: np.random.Generator) -> Array:
-    """Return the angle of a shaft whose speed drifts, without jumps (rad)."""
-    knots = np.arange(time[0], time[-1] + 2.0, 0.25)
-    keep = np.exp(-0.25 / shaft.drift_time)
-    kick = shaft.drift_hz * np.sqrt(1.0 - keep**2) * rng.standard_normal(len(knots))
-    drift = np.empty(len(knots))
-    drift[0] = shaft.drift_hz * rng.standard_normal()
-    for k in range(1, len(knots)):
-        drift[k] = keep * drift[k - 1] + kick[k]
-    turned = CubicSpline(knots, frequency_hz + drift).antiderivative()
-    return shaft.angle_start + 2.0 * np.pi * (turned(time) - turned(time[0]))
 
 
 def simulate_passes(
@@ -213,7 +145,7 @@ def passing_phasor(
     """
     rotor = site.beacons[0].rotor
     assert rotor is not None
-    axis_world, share = own.world_from_rotor @ rotor.axis_beacon, _parts(rotor, shaft)[1]
+    axis_world, share = own.world_from_rotor @ rotor.axis_beacon, moment_orders(rotor, shaft)[1]
     magnet_world = own.start_world + (depth - own.depth[0])[:, None] * axis_world
     moment_world = own.world_from_rotor @ share
     out = np.zeros((len(depth), 3), dtype=np.complex128)
@@ -250,7 +182,7 @@ def _measured(
     for along in stack:
         offset = own.sensor_world - magnet_world - along * axis_world
         field_world += dipole_field(offset, moment_world / len(stack))
-    for order, share in _parts(rotor, shaft).items():
+    for order, share in moment_orders(rotor, shaft).items():
         tone_hz = site.beacons[0].frequency_hz * order
         added = _added(tone_hz, share, rotor, own, around, depth, stack)
         if added is not None:
@@ -262,21 +194,6 @@ def _measured(
     measured = in_body @ sensor.matrix.T + sensor.offset
     noise = sensor.noise_density * np.sqrt(rate_hz / 2.0)
     return np.asarray(measured + noise * rng.standard_normal(measured.shape))
-
-
-def _parts(rotor: Rotor, shaft: Shaft) -> dict[int, ComplexArray]:
-    """Return the moment's phasor in each order of the angle, rotor axes, (3,) (A m^2)."""
-    orders = max((ORDERS, *(one.order + 2 for one in rotor.harmonics)))
-    points = max(POINTS, 4 * orders)
-    angle = 2.0 * np.pi * np.arange(points) / points
-    moment = turned_moment(rotor, shaft, angle)
-    out = {}
-    for order in range(orders):
-        twice = 1.0 if order == 0 else 2.0
-        part = twice * np.mean(moment * np.exp(-1j * order * angle)[:, None], axis=0)
-        if np.linalg.norm(part) > NEGLIGIBLE * rotor.moment:
-            out[order] = part
-    return out
 
 
 def _added(

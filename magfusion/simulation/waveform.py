@@ -7,6 +7,7 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.model.marks import Marks
+from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.samples import Waveform
 from magfusion.model.site import Site, Slots
 from magfusion.simulation.disturbance import Ambient
@@ -101,7 +102,7 @@ def simulate_waveform(
         If the rate is too low for the tones or slots, coils are driven in time slots whose schedule
         the site does not declare, or the motion leads through iron.
     """
-    _check_tones(site, rate_hz, marks)
+    _check_tones(site, rate_hz, marks, drives)
     count = int(np.floor(duration * rate_hz * (1.0 + 1e-12)))
     if count < 1:
         raise InputError(
@@ -143,9 +144,13 @@ def simulate_waveform(
     return Waveform(stamps, measured, marks, magnetometer.axes)
 
 
-def _check_tones(site: Site, rate_hz: float, marks: Marks | None) -> None:
+def _check_tones(site: Site, rate_hz: float, marks: Marks | None, drives: Drives) -> None:
     for beacon in site.beacons:
         highest = float(beacon.tone_frequencies_hz.max())
+        if beacon.name in drives.turning and beacon.rotor is not None:
+            # What a shaft's slip and whirl add beyond half the rate aliases, as in an instrument.
+            orders = (1, *(one.order for one in beacon.rotor.harmonics))
+            highest = beacon.frequency_hz * max(orders)
         if rate_hz < LEAST_SAMPLES_PER_CYCLE * highest:
             raise InputError(
                 f"magnetometer_rate_hz: found {rate_hz} Hz and a tone of {highest} Hz in beacon "
@@ -183,6 +188,17 @@ def _tones_world(
         phasors = phasors_world(beacon, point_world, ambient.spheres, ambient.layers)
         if ambient.bending is not None:
             phasors = ambient.bending.bent_world(i, phasors, point_world)
+        own = drives.turning.get(beacon.name)
+        if own is not None:
+            steady_world = beacon.world_from_beacon @ own.steady_beacon
+            still = dipole_field(point_world - beacon.position_world, steady_world)
+            yield 0.0, still.astype(np.complex128)
+            angle = own.angle(time)
+            for k, frequency_hz in enumerate(beacon.tone_frequencies_hz):
+                order = np.rint(frequency_hz / beacon.frequency_hz)
+                yield float(frequency_hz), phasors[:, k] * np.exp(1j * order * angle)[:, None]
+            first += len(beacon.tones)
+            continue
         gates = slot_gates(beacon, time, marks)
         for k, frequency_hz in enumerate(beacon.tone_frequencies_hz):
             turns = 2.0 * np.pi * frequency_hz * (1.0 + drift) * time

@@ -1,0 +1,126 @@
+"""What a job needs to know of beacons that are magnets on shafts."""
+
+from pathlib import Path
+
+from magfusion.errors import InputError
+from magfusion.files.drive_columns import beacon_of
+from magfusion.files.stream import Record
+from magfusion.model.samples import Log
+from magfusion.model.site import Beacon, Site
+
+PATIENCE = 2.0  # s of samples in a stream, after which the angle of a rotor is missed
+ALL = ""  # as the name of a current that flows through the coils of all
+
+
+def is_for_ranging(site: Site) -> bool:
+    """Return whether a site is of a magnet on a shaft that is to be found from another well."""
+    return (
+        len(site.beacons) == 1
+        and site.beacons[0].rotor is not None
+        and site.beacons[0].unknown == "pose"
+    )
+
+
+def check_rotors(place: Path, log_path: Path, log: Log, site: Site, *, apart: bool) -> None:
+    """Refuse rotors whose angle a job needs and no one tells, and what is ranged alone.
+
+    Parameters
+    ----------
+    place : Path
+        File of the site.
+    apart : bool
+        Whether each epoch may have a phase of its own.
+
+    Raises
+    ------
+    InputError
+    """
+    if is_for_ranging(site):
+        raise InputError(
+            f"{place}: beacons[0]: the pose of rotor {site.beacons[0].name} is unknown, and it is"
+            " the only beacon; magfusion range finds the sensor's well from the magnet's"
+        )
+    if site.platform.magnetometer.casing is not None:
+        raise InputError(
+            f"{place}: platform.magnetometer.casing: through steel a sensor is ranged by magfusion"
+            " range alone; leave it out for other commands"
+        )
+    raw = log.waveform is not None or bool(log.waveforms)
+    recorded = set[str]() if log.rotation is None else set(log.rotation.angle)
+    recorded |= set[str]() if log.drive is None else set(log.drive.current)
+    for beacon in _wandering(site):
+        if beacon.name in recorded or ALL in recorded:
+            continue
+        remedy = (
+            f"add the angle of its shaft as rotor_{beacon.name} to magnetometer.parquet, declare"
+            " speed_sigma_hz of a shaft that a clock turns"
+        )
+        if beacon.synchronised and raw:
+            raise InputError(
+                f"{place}: rotor of beacon {beacon.name}: is synchronised, and {log_path} does not"
+                f" say how it turned; {remedy}, or write synchronised: false for magfusion fix"
+            )
+        if not beacon.synchronised and not apart:
+            raise InputError(
+                f"{place}: rotor of beacon {beacon.name}: nobody measures its angle, and its speed"
+                f" wanders farther than a clock's; {remedy}, or place each epoch by itself with"
+                " magfusion fix"
+            )
+
+
+def check_streamed_rotors(place: Path, site: Site) -> None:
+    """Refuse rotors whose angle a stream cannot tell.
+
+    Raises
+    ------
+    InputError
+    """
+    for beacon in _wandering(site):
+        if not beacon.synchronised:
+            raise InputError(
+                f"{place}: rotor of beacon {beacon.name}: online its angle has to be measured;"
+                " write synchronised: true, and send the cosine of its angle in records of drive"
+            )
+
+
+class AwaitedAngles:
+    """Misses the angles of rotors in a stream."""
+
+    def __init__(self, site: Site) -> None:
+        self._left = {beacon.name for beacon in _wandering(site)}
+        self._first: float | None = None
+
+    def see(self, record: Record | None) -> None:
+        """Take notice of a record.
+
+        Raises
+        ------
+        InputError
+            Where samples have come for some time, and no angle.
+        """
+        if record is None or not self._left:
+            return
+        if record.drive is not None:
+            names = {beacon_of(column) for column in record.drive.current}
+            self._left = set() if ALL in names else self._left - names
+        if record.magnetometer is None or not len(record.magnetometer.time):
+            return
+        if self._first is None:
+            self._first = float(record.magnetometer.time[0])
+        if self._left and float(record.magnetometer.time[-1]) > self._first + PATIENCE:
+            name = min(self._left)
+            raise InputError(
+                f"standard input: {PATIENCE:g} s of samples, and no record of drive with"
+                f" drive_{name}: beacon {name} is a rotor; send the cosine of its angle beside the"
+                " samples"
+            )
+
+
+def _wandering(site: Site) -> list[Beacon]:
+    """Return the rotors whose speed wanders farther than a clock's that is searched for."""
+    return [
+        beacon
+        for beacon in site.beacons
+        if beacon.rotor is not None
+        and beacon.rotor.speed_sigma_hz > site.clock.drift_largest * beacon.frequency_hz
+    ]

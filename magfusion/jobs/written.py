@@ -1,0 +1,48 @@
+"""What each job writes, by name: what of it is in the way of another."""
+
+from magfusion.results.report import FAILED
+
+_SITE = {"site.yaml", "site_field_map.parquet", "site_correlation.parquet"}
+_RESULT = {"trajectory.tum", "trajectory.parquet", *_SITE, "run.rrd", "report.json", FAILED}
+_TABLES = {
+    *("imu.parquet", "magnetometer.parquet", "fields.parquet", "truth.parquet"),
+    "reference.parquet",
+    "marks.parquet",
+    "depth.parquet",
+}
+_TRUE_SITE = {f"true_{name}" for name in _SITE}
+_LOG = {"log.yaml", *_SITE, *_TRUE_SITE, "report.json", *_TABLES}
+UNFINISHED_DRIFT = "unfinished"
+KEPT, LOGS, LOGS_TABLE = "kept", "logs", "logs.csv"  # of several logs
+CHECKPOINT, ROWS = "checkpoint.bin", "checkpoint.rows"
+# What is in the directory while these jobs run.
+UNFINISHED = {
+    "navigate": {CHECKPOINT, ROWS},
+    "drift": {UNFINISHED_DRIFT},
+    "smooth": {KEPT},
+    "calibrate log": {KEPT},
+}
+WRITTEN = {
+    "smooth": _RESULT | {"fixes.parquet", KEPT, LOGS, LOGS_TABLE},
+    "fix": _RESULT | {"fixes.parquet"},
+    "navigate": _RESULT | {"lagged.parquet"} | UNFINISHED["navigate"],
+    "drift": {"drift.png", "stability.png", "run.rrd", "report.json"} | UNFINISHED["drift"],
+    "import": {"log.yaml", *_TABLES, "report.json"},
+    "simulate": _LOG,
+    "demodulate": _LOG,
+    "survey": {"survey.parquet", "survey.png", "report.json"},
+    "calibrate log": _SITE | {"calibration.png", "report.json", KEPT, LOGS_TABLE},
+    "calibrate beacon": _SITE | {"beacon.png", "report.json"},
+    "calibrate antenna": _SITE | {"antenna.png", "report.json"},
+    "calibrate fieldmap": _SITE | {"field_map.png", "report.json"},
+    "calibrate magnetometer": _SITE | {"magnetometer.png", "report.json"},
+    "calibrate attitude-database": {"attitudes.parquet", "attitudes.png", "report.json"},
+    "allan": _SITE | {"allan.png", "report.json", FAILED},
+    "check": {"check.png", "report.json", FAILED},
+    "range": {"range.parquet", "run.rrd", "report.json", FAILED},
+    "match": {"attitude.parquet", "attitude.png", "report.json"},
+    "coverage": {"coverage.parquet", "coverage.png", "run.rrd", "report.json"},
+    "design": _SITE
+    | {"coverage.parquet", "design.png", "run.rrd", "report.json"}
+    | {"motion.parquet", "motion.png"},
+}
