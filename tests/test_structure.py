@@ -166,6 +166,7 @@ SIMULATOR_SEES = {
     "marks",
     "physics",
     "response",
+    "rotor",
     "samples",
     "site",
     "trajectory",

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from magfusion.errors import InputError
-from magfusion.jobs.rotor_inputs import is_for_ranging
 from magfusion.jobs.settings import Command, option
 from magfusion.jobs.simulate_passes import ShaftSettings, run_passes
 from magfusion.results.figures import Figure, Figures, Section, heading
@@ -141,6 +140,7 @@ def reference_option(text: str | None) -> Reference | None:
 def run(settings: SimulateSettings, output: Path) -> Figures:
     """Simulate a log as the settings ask; see `run_simulate`."""
     from magfusion.files.site import load_site
+    from magfusion.jobs.rotor_inputs import is_for_ranging
     from magfusion.simulation.atmosphere import Atmosphere
     from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
     from magfusion.simulation.disturbance import Ambient, FieldDrift, office_noise
