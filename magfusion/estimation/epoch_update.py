@@ -148,7 +148,8 @@ class EpochUpdate:
             if self.gate.lost and found.apart and self._found_again(estimator, found, predicted):
                 return self._judged(estimator.state, None)
         if found is not None:
-            measurements += self._of_fields(found, replace(point or state, cov=state.cov), step)
+            known = state if point is None else replace(point, cov=state.cov)
+            measurements += self._of_fields(found, known, step)
         self._ask(arrived, before, predicted, measurements, point)
         linear = predicted if point is None else None
         try:
@@ -347,7 +348,7 @@ def _wide(state: State) -> bool:
 def _no_wider(cov: Array, sigma: float) -> bool:
     """Tell whether no axis of a covariance (3, 3) has a larger sigma."""
     # The trace is not below the variance of any axis, and costs less.
-    return bool(np.trace(cov) <= sigma**2 or np.linalg.eigvalsh(cov)[-1] <= sigma**2)
+    return bool(cov.trace() <= sigma**2 or np.linalg.eigvalsh(cov)[-1] <= sigma**2)
 
 
 def _of_place(site: Site, state: State) -> tuple[Finding, ...]:

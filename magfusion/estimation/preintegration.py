@@ -63,7 +63,8 @@ def cut_at_epochs(
     # One long step would tie the position to the velocity: its noise would be singular.
     stamps = np.concatenate([time, _between_samples(time, epochs, known)])
     inside = (stamps > epochs[0]) & (stamps < epochs[-1])
-    grid = np.union1d(stamps[inside], epochs)
+    grid = np.sort(np.concatenate([stamps[inside], epochs]))
+    grid = grid[np.concatenate([[True], grid[1:] != grid[:-1]])]
     samples = [
         np.stack([np.interp(grid, time, axis) for axis in stream.T], axis=1)
         for stream in (imu.gyro_body, imu.accel_body)
@@ -73,14 +74,14 @@ def cut_at_epochs(
     silent = np.flatnonzero(in_gap(time, grid, known))
     bridged = np.zeros(len(epochs) - 1, dtype=bool)
     bridged[np.searchsorted(first, silent, side="right") - 1] = True
-    return Increments(gyro, accel, np.diff(grid), first, bridged)
+    return Increments(gyro, accel, grid[1:] - grid[:-1], first, bridged)
 
 
 def _between_samples(time: Array, epochs: Array, usual: float) -> Array:
     """Return stamps that fill the gaps of a stream, as far as the epochs reach."""
     edges = np.concatenate([[min(time[0], epochs[0])], time, [max(time[-1], epochs[-1])]])
     filled = [np.empty(0)]
-    for k in np.flatnonzero(np.diff(edges) > GAP_SAMPLES * usual):
+    for k in np.flatnonzero(edges[1:] - edges[:-1] > GAP_SAMPLES * usual):
         begin, end = max(edges[k], epochs[0]), min(edges[k + 1], epochs[-1])
         if end > begin:
             filled.append(np.linspace(begin, end, int((end - begin) / usual) + 2)[1:-1])
@@ -90,8 +91,8 @@ def _between_samples(time: Array, epochs: Array, usual: float) -> Array:
 def in_gap(time: Array, grid: Array, usual: float) -> BoolArray:
     """Tell which steps of the grid lie in a gap of the stream, however short the step itself is."""
     edges = np.concatenate([[min(time[0], grid[0])], time, [max(time[-1], grid[-1])]])
-    spacing = np.diff(edges)
-    holding = np.clip(np.searchsorted(edges, grid[:-1], side="right") - 1, 0, len(spacing) - 1)
+    spacing = edges[1:] - edges[:-1]
+    holding = np.searchsorted(edges[1:-1], grid[:-1], side="right")
     return np.asarray(spacing[holding] > GAP_SAMPLES * usual)
 
 

@@ -91,9 +91,11 @@ class StandIn:
 
     def covers(self, begin: float, end: float) -> bool:
         """Tell whether anything stands in between two stamps."""
-        return bool(np.any((self.time > begin) & (self.time < end)))
+        return len(self.time) > 0 and bool(np.any((self.time > begin) & (self.time < end)))
 
     def forget(self, before: float) -> None:
         """Drop what is older."""
+        if not len(self.time):
+            return
         kept = self.time >= before
         self.time, self.rows = self.time[kept], self.rows[kept]

@@ -84,13 +84,16 @@ class Buffer:
         InputError
             Where a number is not finite.
         """
-        if not (np.all(np.isfinite(time)) and np.all(np.isfinite(rows))):
+        if not (np.isfinite(time).all() and np.isfinite(rows).all()):
             raise InputError(f"{self.name}: a sample is not finite; leave it out of the stream")
         if len(time) == 0:
             return
         fresh = time > self.settled
-        self.late += int(np.sum(~fresh))
-        self._waiting.append((time[fresh], rows[fresh]))
+        if fresh.all():
+            self._waiting.append((time.copy(), rows.copy()))
+        else:
+            self.late += int(np.sum(~fresh))
+            self._waiting.append((time[fresh], rows[fresh]))
         self.newest = max(self.newest, float(np.max(time)))
 
     def leave_out(self, after: float, until: float) -> int:
@@ -103,10 +106,12 @@ class Buffer:
     def rows(self) -> tuple[Array, Array]:
         """Return all that is kept, in order of time; of equal stamps the first."""
         if self._waiting:
-            time = np.concatenate([t for t, _ in self._waiting])
-            rows = np.concatenate([r for _, r in self._waiting])
+            time, rows = self._waiting[0]
+            if len(self._waiting) > 1:
+                time = np.concatenate([t for t, _ in self._waiting])
+                rows = np.concatenate([r for _, r in self._waiting])
             self._waiting.clear()
-            if np.all(np.diff(time, prepend=self._time[-1:]) > 0.0):
+            if self._follows(time):
                 self._append(time, rows)
                 return self._time, self._rows
             time = np.concatenate([self._time, time])
@@ -115,6 +120,12 @@ class Buffer:
             self.late += len(rows) - len(first)
             self._time, self._rows = time, rows[first]
         return self._time, self._rows
+
+    def _follows(self, time: Array) -> bool:
+        """Tell whether stamps are in order, and later than all that is kept."""
+        if len(self._time) and len(time) and time[0] <= self._time[-1]:
+            return False
+        return bool((time[1:] > time[:-1]).all())
 
     def _append(self, time: Array, rows: Array) -> None:
         """Put later samples behind those that are kept, which are copied only now and then."""
@@ -131,14 +142,14 @@ class Buffer:
     def between(self, begin: float, end: float) -> tuple[Array, Array]:
         """Return the samples of a stretch, with the neighbours just outside it."""
         time, rows = self.rows()
-        lo = max(int(np.searchsorted(time, begin, side="right")) - 1, 0)
-        hi = min(int(np.searchsorted(time, end)) + 1, len(time))
+        lo = max(int(time.searchsorted(begin, side="right")) - 1, 0)
+        hi = min(int(time.searchsorted(end)) + 1, len(time))
         return time[lo:hi], rows[lo:hi]
 
     def forget(self, before: float, settled: float) -> None:
         """Drop what is older, but for the last sample of it; refuse what comes before settled."""
         time, rows = self.rows()
-        lo = max(int(np.searchsorted(time, before, side="right")) - 1, 0)
+        lo = max(int(time.searchsorted(before, side="right")) - 1, 0)
         self._time, self._rows = time[lo:], rows[lo:]
         self.settled = max(self.settled, settled)
 

@@ -201,7 +201,7 @@ def _take_in(
             navigator.hear_imu(time, gyro, accel)
             told.now()
             navigator.advance()
-        missing += Counter(imu=len(record.imu.time) - len(time))
+        _count_missing(missing, "imu", len(record.imu.time) - len(time))
         newest = max(newest, _last(time))
     if record.magnetometer is not None:
         own = record.magnetometer.field.copy()
@@ -209,12 +209,17 @@ def _take_in(
         time, field = whole_rows(record.magnetometer.time, own)
         if len(time):
             navigator.add_magnetometer(time, field, record.magnetometer.magnetometer)
-        missing += Counter(magnetometer=len(record.magnetometer.time) - len(time))
+        _count_missing(missing, "magnetometer", len(record.magnetometer.time) - len(time))
         newest = max(newest, _last(time))
     if record.fields is not None:
         navigator.add_fields(along_axis(site_fields(record.fields, site), site))
         newest = max(newest, record.fields.time)
     return newest
+
+
+def _count_missing(missing: Counter[str], stream: str, number: int) -> None:
+    if number:
+        missing[stream] += number
 
 
 def _take_in_beside(navigator: Navigator, record: Record) -> None:

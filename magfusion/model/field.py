@@ -29,6 +29,8 @@ from magfusion.model.receive_coils import (
 from magfusion.model.site import Beacon, Magnetometer
 from magfusion.units import AnyArray, Array, ComplexArray
 
+_ALIKE = np.eye(3)  # of components whose errors are alike and apart
+
 
 def _source(beacon: Beacon | Sources) -> Sources:
     return alone(beacon) if isinstance(beacon, Beacon) else beacon
@@ -387,4 +389,4 @@ def model_error_cov(phasor_sensor: ComplexArray, model_error: float | Array) -> 
 
 def power_error_cov(power: Array, model_error: float | Array) -> Array:
     """Return the same of the field's mean square in either quadrature, shape (...) (T^2)."""
-    return (model_error**2 * power)[..., None, None] / 3.0 * np.eye(3)
+    return (model_error**2 * power)[..., None, None] / 3.0 * _ALIKE

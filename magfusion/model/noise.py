@@ -183,19 +183,58 @@ def measurement_cov(
     ndarray, shape (n, channels, 3, 3)
         (T^2), measured axes.
     """
-    error = model_error(site, sensor_world) * np.sqrt(np.asarray(alike))[..., None]
-    if beside and site.platform.further:
-        error = error * np.sqrt(alike_beside(site, samples.valid))
-    owner = site.owner
-    factor = windows * np.array([b.noise_factor for b in site.beacons])[owner] ** 2
-    total = factor[:, None, None] * samples.phasor_cov
-    square = squares(site, samples, sensor_world)
-    power = 0.5 * np.sum(square, axis=-1)
-    total = total + power_error_cov(power, error)
+    ways = ((windows, alike),)
+    (total,), square, power = _covs(site, samples, sensor_world, ways, beside=beside)
     if survey_error:
         relative = _relative_error(site, square)
         total = total + (relative**2 * power / 3.0)[..., None, None] * np.eye(3)
     return total
+
+
+def weighed_and_alone(
+    site: Site,
+    samples: FieldSamples,
+    sensor_world: Array,
+    windows: float,
+    alike: Array | float,
+    *,
+    beside: bool = True,
+) -> tuple[Array, Array]:
+    """Return `measurement_cov` of epochs that share noise and model error, and were they alone.
+
+    Parameters
+    ----------
+    sensor_world, windows, alike, beside
+        As of `measurement_cov`.
+    """
+    ways = (windows, alike), (1.0, 1.0)
+    (weighed, alone), _, _ = _covs(site, samples, sensor_world, ways, beside=beside)
+    return weighed, alone
+
+
+def _covs(
+    site: Site,
+    samples: FieldSamples,
+    sensor_world: Array | None,
+    ways: tuple[tuple[float, Array | float], ...],
+    *,
+    beside: bool,
+) -> tuple[list[Array], Array, Array]:
+    """Return noise and model error as shared in some ways, with the squares and their power."""
+    own = model_error(site, sensor_world)
+    share = None
+    if beside and site.platform.further:
+        share = np.sqrt(alike_beside(site, samples.valid))
+    noise = np.array([b.noise_factor for b in site.beacons])[site.owner] ** 2
+    square = squares(site, samples, sensor_world)
+    power = 0.5 * np.sum(square, axis=-1)
+    found = []
+    for windows, alike in ways:
+        error = own * np.sqrt(np.asarray(alike))[..., None]
+        error = error if share is None else error * share
+        noisy = (windows * noise)[:, None, None] * samples.phasor_cov
+        found.append(noisy + power_error_cov(power, error))
+    return found, square, power
 
 
 def _relative_error(site: Site, square: Array) -> Array:
@@ -234,6 +273,8 @@ def whitening(cov: Array, there: BoolArray) -> Array:
         what is inverted: what is missing was not measured, however large its noise is.
     """
     each = there.ndim == cov.ndim - 1
+    if there.all():
+        return _whole_whitening(cov)
     valid = np.any(there, axis=-1) if each else there
     if each and np.any(valid & ~np.all(there, axis=-1)):
         known = np.where(there[..., :, None] & there[..., None, :], cov, 0.0)
@@ -242,11 +283,13 @@ def whitening(cov: Array, there: BoolArray) -> Array:
         other = np.where(there, 0.0, np.where(valid, size, 1.0)[..., None])
         whole = known + other[..., None] * np.eye(3)
         return np.where(there[..., None], whitening(whole, np.ones_like(there)), 0.0)
-    safe = np.where(valid[..., None, None], cov, np.eye(3))
-    scale = np.sqrt(np.trace(safe, axis1=-2, axis2=-1) / 3.0)[..., None, None]
-    root = cholesky(safe / scale**2)
-    sqrt_information = np.linalg.inv(root) / scale
-    return np.where(valid[..., None, None], sqrt_information, 0.0)
+    whole = _whole_whitening(np.where(valid[..., None, None], cov, np.eye(3)))
+    return np.where(valid[..., None, None], whole, 0.0)
+
+
+def _whole_whitening(cov: Array) -> Array:
+    scale = np.sqrt(np.trace(cov, axis1=-2, axis2=-1) / 3.0)[..., None, None]
+    return np.asarray(np.linalg.inv(cholesky(cov / scale**2)) / scale)
 
 
 def paired_whitening(cov: Array, there: BoolArray) -> Array:
@@ -262,4 +305,5 @@ def twice(there: BoolArray) -> BoolArray:
 
 def stacked(phasor: ComplexArray) -> Array:
     """Return complex vectors as real part, then imaginary part; zero where they are NaN."""
-    return np.nan_to_num(np.concatenate([phasor.real, phasor.imag], axis=-1))
+    parts = np.concatenate([phasor.real, phasor.imag], axis=-1)
+    return parts if np.isfinite(parts).all() else np.nan_to_num(parts)

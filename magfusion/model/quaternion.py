@@ -1,7 +1,8 @@
 """Products of many rotations at once, and vectors turned by them, on arrays.
 
 SciPy's `Rotation` converts fast but multiplies one by one; here the components are the first axis,
-so that each operation is one over all rotations.
+so that each operation is one over all rotations.  Of few rotations it is the number of operations
+that costs, and all products of components are made in one: the result is the same to the last bit.
 """
 
 import numpy as np
@@ -10,9 +11,18 @@ from scipy.spatial.transform import Rotation
 from magfusion.units import Array
 
 FEW = 8000  # numbers
+FEW_COMPONENTS = 1024  # of rotations whose matrices are made at once
 # Which component of the second factor each of the first meets, for each of the product, and how.
 _PLACES = np.array([[0, 1, 2, 3], [1, 0, 3, 2], [2, 3, 0, 1], [3, 2, 1, 0]])
 _SIGNS = np.array([[1, 1, 1, 1], [-1, 1, -1, 1], [-1, 1, 1, -1], [-1, -1, 1, 1]], dtype=np.float64)
+# Of a rotation's matrix, element by element, of products of components numbered 4 i + j: one term,
+# another with its sign, the factor of their sum, and what it is added to.
+_ONE = np.array([10, 6, 7, 6, 5, 11, 7, 11, 5])
+_OTHER = np.array([15, 3, 2, 3, 15, 1, 2, 1, 10])
+_TURN = np.array([1.0, -1, 1, 1, 1, -1, -1, 1, 1])[:, None]
+_FACTOR = np.array([-2.0, 2, 2, 2, -2, 2, 2, 2, -2])[:, None]
+_ADDED = np.eye(3).reshape(9, 1)
+_NO_TURN = np.finfo(np.float64).eps  # rad; its sine is as large
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
@@ -39,7 +49,8 @@ def turned(quaternion: Array, vector: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Return the cross products of vectors, shape (3, ...)."""
-    return a[_NEXT] * b[_LAST] - a[_LAST] * b[_NEXT]
+    found = a.take(_NEXT, axis=0) * b.take(_LAST, axis=0)
+    return np.asarray(found - a.take(_LAST, axis=0) * b.take(_NEXT, axis=0))
 
 
 def components(rotation: Rotation) -> Array:
@@ -54,8 +65,13 @@ def inverse(quaternion: Array) -> Array:
 
 def of_vectors(rotation: Array) -> Array:
     """Return the quaternions, shape (4, ...), of rotation vectors, shape (3, ...) (rad)."""
-    half = 0.5 * np.sqrt(np.sum(rotation**2, axis=0))
-    return np.concatenate([np.cos(half)[None], 0.5 * np.sinc(half / np.pi) * rotation])
+    half = 0.5 * np.sqrt(_square(rotation))
+    out = np.empty((4, *half.shape))
+    np.cos(half, out=out[0])
+    angle = np.pi * (half / np.pi)
+    angle[angle == 0.0] = _NO_TURN
+    np.multiply(0.5 * (np.sin(angle) / angle), rotation, out=out[1:])
+    return out
 
 
 def vectors(quaternion: Array) -> Array:
@@ -68,6 +84,14 @@ def vectors(quaternion: Array) -> Array:
 
 def matrices(quaternion: Array) -> Array:
     """Return the matrices, shape (n, 3, 3), of unit quaternions, shape (4, n), scalar first."""
+    if quaternion.size <= FEW_COMPONENTS:
+        every = (quaternion[:, None] * quaternion).reshape(16, -1)
+        sums = every.take(_OTHER, axis=0)
+        sums *= _TURN
+        sums += every.take(_ONE, axis=0)
+        sums *= _FACTOR
+        sums += _ADDED
+        return np.ascontiguousarray(sums.T).reshape(-1, 3, 3)
     w, x, y, z = quaternion
     out = np.empty((len(w), 3, 3))
     out[:, 0, 0], out[:, 1, 1], out[:, 2, 2] = (
@@ -101,4 +125,9 @@ def of_matrices(rotation: Array) -> Array:
 
 def unit(quaternion: Array) -> Array:
     """Return quaternions, shape (4, ...), without what rounding adds to their length."""
-    return quaternion / np.sqrt(np.sum(quaternion**2, axis=0))
+    return quaternion / np.sqrt(_square(quaternion))
+
+
+def _square(vectors: Array) -> Array:
+    """Return the squared lengths of vectors, shape (k, ...)."""
+    return np.asarray(np.add.reduce(vectors**2, axis=0))

@@ -31,7 +31,7 @@ def rotation_increments(time: Array, gyro_body: Array) -> Rotation:
 
 def _increments(time: Array, gyro_body: Array) -> Array:
     before, after = gyro_body[:-1], gyro_body[1:]
-    dt = np.diff(time)[:, None]
+    dt = (time[1:] - time[:-1])[:, None]
     coning = cross(before.T, after.T).T * dt**2 / 12.0
     return np.asarray(0.5 * (before + after) * dt + coning)
 
@@ -164,8 +164,7 @@ def _products_of_first(quaternion: Array, count: IntArray) -> Array:
 
 
 def _sample_before(time: Array, wanted: Array) -> IntArray:
-    before = np.searchsorted(time, wanted, side="right") - 1
-    return np.clip(before, 0, len(time) - 1)
+    return np.searchsorted(time[1:], wanted, side="right")
 
 
 def _turn_since(index: IntArray, time: Array, gyro_body: Array, wanted: Array) -> Array:
@@ -173,7 +172,7 @@ def _turn_since(index: IntArray, time: Array, gyro_body: Array, wanted: Array) -
     after = np.minimum(index + 1, len(time) - 1)
     span = np.where(after > index, time[after] - time[index], 1.0)
     ahead = wanted - time[index]
-    share = np.clip(0.5 * ahead / span, 0.0, 0.5)[:, None]
+    share = np.minimum(np.maximum(0.5 * ahead / span, 0.0), 0.5)[:, None]
     rate = (1.0 - share) * gyro_body[index] + share * gyro_body[after]
     return of_vectors((rate * ahead[:, None]).T)
 
@@ -231,6 +230,7 @@ def resting(
     span: float | None = None,
     *,
     motion: MotionModel,
+    at: IntArray | None = None,
 ) -> BoolArray:
     """Return at which samples the platform is at rest.
 
@@ -244,25 +244,31 @@ def resting(
         Length of the stretch around each sample that must be quiet (s), other than the model's.
     motion : MotionModel
         What is called rest.
+    at : int ndarray, shape (k,), optional
+        Those that are asked of; all where it is not given.
 
     Returns
     -------
-    bool ndarray, shape (n,)
+    bool ndarray, shape (n,) or (k,)
         Where rate and specific force scatter less about their means over the stretch than they may.
     """
     span = motion.rest_span if span is None else span
     centres = np.mean(gyro_body, axis=0), np.mean(accel_body, axis=0)
-    quiet = np.empty(len(time), dtype=bool)
+    asked = time if at is None else time[at]
+    quiet = np.empty(len(asked), dtype=bool)
     for begin in range(0, len(time), CHUNK):
+        own: slice | IntArray = slice(begin, begin + CHUNK)
+        if at is not None:
+            own = np.flatnonzero((at >= begin) & (at < begin + CHUNK))
         here = time[begin : begin + CHUNK]
         first = np.searchsorted(time, here[0] - span / 2)
         last = np.searchsorted(time, here[-1] + span / 2, side="right")
-        lo = np.searchsorted(time[first:last], here - span / 2)
-        hi = np.searchsorted(time[first:last], here + span / 2, side="right")
-        quiet[begin : begin + CHUNK] = (
+        lo = np.searchsorted(time[first:last], asked[own] - span / 2)
+        hi = np.searchsorted(time[first:last], asked[own] + span / 2, side="right")
+        quiet[own] = (
             _variance(gyro_body[first:last] - centres[0], lo, hi) < motion.rest_gyro**2
         ) & (_variance(accel_body[first:last] - centres[1], lo, hi) < motion.rest_accel**2)
-    inside = (time - span / 2 >= time[0]) & (time + span / 2 <= time[-1])
+    inside = (asked - span / 2 >= time[0]) & (asked + span / 2 <= time[-1])
     return quiet & inside
 
 

@@ -99,8 +99,9 @@ def cycles(
         phasor[cycle[row], channel] = samples.phasor_sensor[row, channel]
         cov[cycle[row], channel] = samples.phasor_cov[row, channel]
     else:
-        still_from_measured = measured_from_still.back(samples.time[row])
-        turn = measured_from_still(time)[cycle[row]] @ still_from_measured
+        both = np.concatenate([time, samples.time[row]])
+        measured_from, still_from_measured = measured_from_still.both(both)
+        turn = measured_from[:number][cycle[row]] @ still_from_measured[number:]
         phasor[cycle[row], channel] = (turn @ samples.phasor_sensor[row, channel][..., None])[
             ..., 0
         ]
@@ -143,7 +144,8 @@ def cycle_of(samples: FieldSamples, site: Site) -> IntArray:
     slot = np.array([slot for beacon in site.beacons for _, slot in beacon.tones], dtype=float)
     count = np.maximum(np.sum(samples.valid, axis=1), 1)
     begin = samples.time - (samples.valid @ slot / count + 0.5) * slots.duration
-    return np.cumsum(np.diff(begin, prepend=begin[:1]) > 0.5 * slots.cycle)
+    later = begin[1:] - begin[:-1] > 0.5 * slots.cycle
+    return np.concatenate([[0], np.cumsum(later)])
 
 
 def _marked(

@@ -1,5 +1,7 @@
 """The noise that a window holds, measured beside the tones rather than taken from a data sheet."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from magfusion.units import Array, BoolArray, IntArray
@@ -113,17 +115,16 @@ def smoothed_over_windows(
     unseen : bool ndarray, shape (n,), optional
         Windows without the gyro's turn: their noise is their own.
     """
-    apart = np.diff(centre) > 1.5 * step
+    apart = centre[1:] - centre[:-1] > 1.5 * step
     if unseen is not None:
         apart |= unseen[1:] != unseen[:-1]
     breaks = np.flatnonzero(apart) + 1
     out = np.empty_like(noise_cov)
-    for part in np.split(np.arange(len(centre)), breaks):
-        rows = slice(part[0], part[-1] + 1)
-        total = np.cumsum(noise_cov[rows], axis=0)
-        total = np.concatenate([np.zeros_like(total[:1]), total])
-        n = len(part)
+    for begin, end in pairwise([0, *breaks.tolist(), len(centre)]):
+        rows, n = slice(begin, end), end - begin
+        total = np.zeros((n + 1, *noise_cov.shape[1:]))
+        np.cumsum(noise_cov[rows], axis=0, out=total[1:])
         width = min(windows, n)
-        first = np.clip(np.arange(n) - width // 2, 0, n - width)
+        first = np.minimum(np.maximum(np.arange(n) - width // 2, 0), n - width)
         out[rows] = (total[first + width] - total[first]) / width
     return out

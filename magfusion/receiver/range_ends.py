@@ -42,11 +42,15 @@ class RangeEnds:
 
 def still(waveform: Waveform, first: IntArray, last: IntArray) -> BoolArray:
     """Return in which windows no sample differs from the one before; as `saturated`."""
-    measured = waveform.measured_sensor
-    changed = np.any(measured[1:] != measured[:-1], axis=1)
-    changes = np.concatenate([[0], np.cumsum(changed)])
+    changes = np.concatenate([[0], np.cumsum(_changed(waveform.measured_sensor))])
     held = changes[np.maximum(last - 1, first)] == changes[first]
     return np.asarray(held & (last > first + 1))
+
+
+def _changed(measured: Array) -> BoolArray:
+    """Return which samples (n, 3) differ from the one before, (n - 1,)."""
+    x, y, z = (measured[1:] != measured[:-1]).T
+    return np.asarray(x | y | z)
 
 
 def saturated(
@@ -68,8 +72,7 @@ def saturated(
     if until == 0:
         return spoilt
     measured = waveform.measured_sensor[:until]
-    changed = np.any(measured[1:] != measured[:-1], axis=1)
-    fresh = np.concatenate([[0], np.flatnonzero(changed) + 1])
+    fresh = np.concatenate([[0], np.flatnonzero(_changed(measured)) + 1])
     begin, end = np.searchsorted(fresh, first), np.searchsorted(fresh, last)
     value, time = measured[fresh], waveform.time[fresh]
     known = np.array([(one.low, one.high, one.finest, one.kept) for one in ends]).T

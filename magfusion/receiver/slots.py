@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from typing import Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -70,8 +71,11 @@ def places(site: Site) -> int:
     return 2 + max(slot for beacon in site.beacons for _, slot in beacon.tones if slot is not None)
 
 
+_KEPT: WeakKeyDictionary[Site, Slots | MarkedSlots] = WeakKeyDictionary()
+
+
 def check_kept(site: Site) -> Slots | MarkedSlots:
-    """Return what all beacons of the site keep.
+    """Return what all beacons of the site keep, looked at once.
 
     Raises
     ------
@@ -79,6 +83,9 @@ def check_kept(site: Site) -> Slots | MarkedSlots:
         Where a beacon keeps none or another one, or two coils that do not belong together are
         driven in one slot.
     """
+    known = _KEPT.get(site)
+    if known is not None:
+        return known
     first = next(beacon for beacon in site.beacons if beacon.slots is not None)
     assert first.slots is not None
     for beacon in site.beacons:
@@ -102,6 +109,7 @@ def check_kept(site: Site) -> Slots | MarkedSlots:
                     " give every coil a slot of its own"
                 )
             taken[slot] = beacon.name
+    _KEPT[site] = first.slots
     return first.slots
 
 

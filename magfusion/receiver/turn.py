@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -33,15 +34,19 @@ class Turn:
 
     def back(self, time: Array) -> Array:
         """Return ``still_from_measured`` at times (m,), shape (m, 3, 3)."""
-        return matrices(self.still_from_body(time)) @ np.linalg.inv(self.from_body)
+        return matrices(self.still_from_body(time)) @ self._to_body
 
     def both(self, time: Array) -> tuple[Array, Array]:
         """Return ``measured_from_still`` and its inverse, at times (m,)."""
         still_from_body = matrices(self.still_from_body(time))
         return (
             self.from_body @ np.swapaxes(still_from_body, 1, 2),
-            still_from_body @ np.linalg.inv(self.from_body),
+            still_from_body @ self._to_body,
         )
+
+    @cached_property
+    def _to_body(self) -> Array:
+        return np.asarray(np.linalg.inv(self.from_body))
 
 
 def on_clock(

@@ -48,6 +48,8 @@ class Gate:
     ) -> None:
         self.blocks, self.watch = tuple(blocks), watch
         self.owner = np.array([name for name, _ in channels], dtype=object)
+        names = dict.fromkeys(self.owner.tolist())
+        self._mine = {str(name): np.asarray(self.owner == name) for name in names}
         self.counts = Counter()
         self.distortion = {}
         self.refused_in_a_row = 0
@@ -88,7 +90,7 @@ class Gate:
 
     def _by_beacon(self, distance: Array, chosen: BoolArray) -> dict[str, float]:
         return {
-            str(name): float(np.mean(distance[chosen & (self.owner == name)])) / 6.0
+            name: float(np.mean(distance[chosen & self._mine[name]])) / 6.0
             for name in dict.fromkeys(self.owner[chosen].tolist())
         }
 

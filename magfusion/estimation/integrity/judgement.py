@@ -56,7 +56,7 @@ class Judgement:
 
     def beside(self, *findings: Finding) -> "Judgement":
         """Return it with more to be said."""
-        return replace(self, findings=(*self.findings, *findings))
+        return replace(self, findings=(*self.findings, *findings)) if findings else self
 
     def honest(self, cov: Array) -> Array:
         """Return the covariance of a state as its witnesses allow it; the same where they agree."""

@@ -19,6 +19,7 @@ from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.statistics import SURE
 from magfusion.estimation.integrity.suspects import Inertial, Stream
 from magfusion.estimation.measurements.measurement import Measurement
+from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.state import MOTION, State, states_of
 from magfusion.model.audibility import are_many
 from magfusion.model.parameters import BeaconParameter, Block
@@ -114,10 +115,14 @@ class OnlineScore:
 
     def foresee(self, measurement: Measurement, predicted: State) -> None:
         """Predict a measurement for all that is asked: who asks for less of it finds it there."""
-        if self._sums is not None:
-            self._hear([measurement], predicted.time)
-            asked = self.asked.asked
-            measurement.linearize(states_of([predicted]), predicted.calibration, asked)
+        if self._sums is None:
+            return
+        self._hear([measurement], predicted.time)
+        at = states_of([predicted]), predicted.calibration, self.asked.asked
+        if isinstance(measurement, FieldPhasors):
+            measurement.predicted.of(measurement, *at)
+        else:
+            measurement.linearize(*at)
 
     def _hear(self, measurements: Sequence[Measurement], time: float) -> None:
         """Ask of those among many beacons that are heard, and no more of those long unheard."""

@@ -18,10 +18,10 @@ from magfusion.estimation.state import State, States, states_of
 from magfusion.model.audibility import are_many
 from magfusion.model.field import skew
 from magfusion.model.noise import (
-    measurement_cov,
     paired_whitening,
     sensor_positions,
     stacked,
+    weighed_and_alone,
 )
 from magfusion.model.parameters import (
     CLOCK_RATE,
@@ -32,7 +32,7 @@ from magfusion.model.parameters import (
     linearize_channels,
     predict_channels,
 )
-from magfusion.model.quaternion import matrices, of_vectors
+from magfusion.model.quaternion import cross, matrices, of_vectors
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -169,7 +169,8 @@ class FieldPhasors(Measurement):
         count, channels = ahead.shape
         site = calibration.site
         levers = np.array([sensor.position_body for sensor in site.platform.magnetometers])
-        swing_body = np.cross(twist_body[:, None, :3], levers)[:, site.sensor]
+        swing = cross(twist_body.T[:3, :, None], levers.T[:, None])
+        swing_body = np.moveaxis(swing, 0, -1)[:, site.sensor]
         velocity_body = twist_body[:, None, 3:] + swing_body
         velocity_world = (world_from_body[:, None] @ velocity_body[..., None])[..., 0]
         shift_world = ahead[..., None] * velocity_world
@@ -181,7 +182,7 @@ class FieldPhasors(Measurement):
             (position_world[:, None] + shift_world).reshape(-1, 3),
             np.repeat(twist_body, channels, axis=0),
         )
-        own = np.arange(count * channels), np.tile(np.arange(channels), count)
+        own = np.arange(count * channels), np.arange(count * channels) % channels
         value, by_pose, by_calibration = (
             part[own].reshape(count, channels, *part.shape[2:]) for part in found
         )
@@ -299,21 +300,18 @@ def field_phasors(
     """
     place = sensor_positions(site, poses)
     together = np.maximum(alike, repeats)
-    cov = measurement_cov(
-        site, samples, sensor_world=place, windows=repeats, alike=together, beside=beside
-    )
-    single = repeats * measurement_cov(site, samples, sensor_world=place, beside=beside)
-    more, own = (np.trace(c, axis1=2, axis2=3) for c in (cov, single))
+    cov, single = weighed_and_alone(site, samples, place, repeats, together, beside=beside)
+    more, own = (np.trace(c, axis1=2, axis2=3) for c in (cov, repeats * single))
     excess = np.divide(more, own, out=np.ones_like(own), where=samples.valid)
-    phasor = samples.phasor_sensor
-    by = np.zeros_like(phasor) if by_time_offset is None else by_time_offset
+    measured = stacked(samples.phasor_sensor)
+    by_lag = np.zeros_like(measured) if by_time_offset is None else stacked(by_time_offset)
     return FieldPhasors(
         epoch=epoch,
         time=samples.time,
-        measured=stacked(phasor),
+        measured=measured,
         sqrt_information=whitened_along(paired_whitening(cov, samples.there), samples),
         rate_body=rate_body,
-        by_time_offset=stacked(by),
+        by_time_offset=by_lag,
         applied_offset=applied_offset,
         moving=np.ones(len(epoch), dtype=bool) if standing is None else ~standing,
         ahead=samples.ahead,

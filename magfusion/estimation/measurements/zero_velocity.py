@@ -66,9 +66,10 @@ def quiet_before(imu: ImuSamples, stamps: Array, motion: MotionModel) -> BoolArr
     first, last = np.minimum(first, count - 1), np.maximum(np.minimum(last, count), 1)
     covered = (time[first] <= stamps - span) & (time[last - 1] >= stamps - REACH)
     silent = np.concatenate([[0], np.cumsum(np.diff(time) > LONGEST_SILENCE)])
-    still = resting(time, imu.gyro_body, imu.accel_body, span - REACH, motion=motion)
     middle = np.minimum(np.searchsorted(time, stamps - span / 2), count - 1)
-    return enough & covered & (silent[last - 1] == silent[first]) & still[middle]
+    streams = time, imu.gyro_body, imu.accel_body
+    still = resting(*streams, span - REACH, motion=motion, at=middle)
+    return enough & covered & (silent[last - 1] == silent[first]) & still
 
 
 def may_stand(velocity_world: Array, cov: Array, motion: MotionModel) -> BoolArray:

@@ -66,6 +66,8 @@ class Calibration:
     @property
     def clock_offsets(self) -> Array:
         """What was to be added to each magnetometer's stamps beyond what the site declares (s)."""
+        if not self.others:
+            return np.zeros(len(self.site.platform.magnetometers))
         platform = self.site.platform
         names = [m.name for m in platform.magnetometers] if platform.further else ["magnetometer"]
         return np.array([np.sum(self.others.get(f"{name}.{CLOCK}", 0.0)) for name in names])

@@ -1,0 +1,72 @@
+"""What is calculated of few at a time in another way is the same to the last bit."""
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import B
+
+from magfusion.estimation.state import State, values_of
+from magfusion.model import quaternion
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.site import MotionModel
+from magfusion.model.strapdown import resting
+from magfusion.receiver.slot_phasors import _pseudo_inverse
+from magfusion.simulation.demo_site import demo_site
+
+MANY = quaternion.FEW
+
+
+@pytest.mark.parametrize("count", [1, 3, 50, quaternion.FEW_COMPONENTS // 4])
+def test_few_rotations_are_multiplied_as_many_are(count: int) -> None:
+    rng = np.random.default_rng(1)
+    a, b = (quaternion.unit(rng.standard_normal((4, MANY))) for _ in range(2))
+    few = slice(0, count)
+    product = quaternion.product(a, b)[:, few]
+    assert np.array_equal(quaternion.product(a[:, few], b[:, few]), product)
+    assert np.array_equal(quaternion.matrices(a[:, few]), quaternion.matrices(a)[few])
+    p, q, r, s = a[:, few]
+    assert np.array_equal(product[0], p * b[0, few] - q * b[1, few] - r * b[2, few] - s * b[3, few])
+
+
+def test_a_product_of_one_with_many_is_that_of_each() -> None:
+    rng = np.random.default_rng(2)
+    one, many = rng.standard_normal((4, 1)), rng.standard_normal((4, 20))
+    each = np.hstack([quaternion.product(one, many[:, k : k + 1]) for k in range(20)])
+    assert np.array_equal(quaternion.product(one, many), each)
+
+
+def test_no_turn_has_no_turn() -> None:
+    assert np.array_equal(quaternion.of_vectors(np.zeros((3, 2)))[:, 0], [1.0, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("rank", [1, 3, 4])
+def test_the_inverse_of_a_normal_matrix_is_the_pseudo_inverse(rank: int) -> None:
+    rows = np.random.default_rng(3).standard_normal((5, rank, 4))
+    normal = np.swapaxes(rows, 1, 2) @ rows
+    expected = np.linalg.pinv(normal, hermitian=True)
+    assert _pseudo_inverse(normal) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def test_two_states_have_the_biases_that_were_inserted() -> None:
+    rng = np.random.default_rng(4)
+    calibration = initial_calibration(demo_site(), 0.0)
+    vectors = rng.standard_normal((2, 4, 3))
+    states = [State(0.0, np.eye(3), *each, calibration, np.eye(15)) for each in vectors]
+    values = values_of(states)
+    for k, (_, _, accel, gyro) in enumerate(vectors):
+        bias = gtsam.imuBias.ConstantBias(accel, gyro)
+        assert np.array_equal(values.atConstantBias(B(k)).vector(), bias.vector())
+    assert values.size() == values_of([*states, states[0]]).size() - 3
+
+
+def test_rest_is_told_of_some_samples_as_of_all() -> None:
+    rng = np.random.default_rng(5)
+    time = np.arange(900) / 100.0
+    still = (np.abs(time - 4.0) < 2.0)[:, None]
+    gyro, accel = (rng.standard_normal((900, 3)) * np.where(still, 1e-4, 1.0) for _ in range(2))
+    whole = resting(time, gyro, accel, 1.0, motion=MotionModel())
+    at = np.array([5, 250, 400, 555, 880])
+    assert np.any(whole[at])
+    assert not np.all(whole[at])
+    some = resting(time, gyro, accel, 1.0, motion=MotionModel(), at=at)
+    assert np.array_equal(some, whole[at])
