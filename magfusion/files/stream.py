@@ -274,6 +274,8 @@ def _check_lengths(time: Array, **rows: AnyArray) -> None:
 
 def whole_rows(time: Array, *values: Array) -> tuple[Array, ...]:
     """Return stamps (k,) and values (k, 3) without the rows of which a number is missing."""
+    if all(np.isfinite(rows).all() for rows in values):
+        return time, *values
     whole = np.all([np.all(np.isfinite(rows), axis=1) for rows in values], axis=0)
     return time[whole], *(rows[whole] for rows in values)
 

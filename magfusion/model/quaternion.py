@@ -109,7 +109,7 @@ def of_matrices(rotation: Array) -> Array:
 
     By the largest component: of the other way to write it, none is lost in rounding.
     """
-    (a, b, c), (d, e, f), (g, h, i) = np.moveaxis(rotation, 0, -1)
+    (a, b, c), (d, e, f), (g, h, i) = rotation.transpose(1, 2, 0)
     trace = a + e + i
     largest = np.argmax([trace, a, e, i], axis=0)
     own = np.array(

@@ -7,6 +7,7 @@ best, and the silent ones say which is which.
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.model.once import once_a_site
 from magfusion.model.samples import Waveform
 from magfusion.model.site import Site, Slots
 from magfusion.receiver.slots import carriers_hz, is_marked, is_pulsed, owners, schedule
@@ -19,6 +20,7 @@ STEADY_CYCLES = 4  # of the carrier, over which the mean is the steady field
 LOUDEST_SILENCE = 0.4  # of the weakest driven slot
 
 
+@once_a_site
 def is_searched(site: Site) -> bool:
     """Return whether the stream is to tell when a cycle begins.
 

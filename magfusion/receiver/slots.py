@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 from typing import Literal
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.model.once import once_a_site
 from magfusion.model.site import MarkedSlots, Site, Slots
 from magfusion.receiver.ambient import STRETCH, Removal
 from magfusion.receiver.windows import LockinSettings
@@ -45,6 +45,7 @@ def has_schedule(site: Site) -> bool:
     return any(beacon.slots is not None for beacon in site.beacons)
 
 
+@once_a_site
 def is_marked(site: Site) -> bool:
     """Return whether the log marks when which coil is driven."""
     return any(isinstance(beacon.slots, MarkedSlots) for beacon in site.beacons)
@@ -63,6 +64,7 @@ def schedule(site: Site) -> Slots:
     return slots
 
 
+@once_a_site
 def places(site: Site) -> int:
     """Return into how many slots a cycle is divided; of marked ones the last is the silence."""
     slots = check_kept(site)
@@ -71,11 +73,9 @@ def places(site: Site) -> int:
     return 2 + max(slot for beacon in site.beacons for _, slot in beacon.tones if slot is not None)
 
 
-_KEPT: WeakKeyDictionary[Site, Slots | MarkedSlots] = WeakKeyDictionary()
-
-
+@once_a_site
 def check_kept(site: Site) -> Slots | MarkedSlots:
-    """Return what all beacons of the site keep, looked at once.
+    """Return what all beacons of the site keep.
 
     Raises
     ------
@@ -83,9 +83,6 @@ def check_kept(site: Site) -> Slots | MarkedSlots:
         Where a beacon keeps none or another one, or two coils that do not belong together are
         driven in one slot.
     """
-    known = _KEPT.get(site)
-    if known is not None:
-        return known
     first = next(beacon for beacon in site.beacons if beacon.slots is not None)
     assert first.slots is not None
     for beacon in site.beacons:
@@ -109,7 +106,6 @@ def check_kept(site: Site) -> Slots | MarkedSlots:
                     " give every coil a slot of its own"
                 )
             taken[slot] = beacon.name
-    _KEPT[site] = first.slots
     return first.slots
 
 
@@ -165,6 +161,7 @@ def slot_settings_of(site: Site, lockin: LockinSettings | None) -> SlotSettings:
     return default_slot_settings(site, lockin.mains_hz)
 
 
+@once_a_site
 def is_pulsed(site: Site) -> bool:
     """Return whether the coils are driven by pulses of direct current, without a carrier."""
     return all(np.all(beacon.tone_frequencies_hz == 0.0) for beacon in site.beacons)

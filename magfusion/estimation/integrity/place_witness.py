@@ -30,6 +30,8 @@ def of_place(
         return ()
     margin, sigma = margins(site, world_from_body, position_world, pose_cov[:, 3:, 3:])
     score = margin / sigma
+    if (score >= NEAR).all():  # as nearly always
+        return ()
     return (*_outside(site, time, margin, score), *_near(site, time, margin, score))
 
 

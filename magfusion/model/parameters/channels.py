@@ -12,6 +12,7 @@ import numpy as np
 from magfusion.model.channel_effects import axis_factors
 from magfusion.model.coil_field import Sources, alone, side_by_side
 from magfusion.model.field import observe, observe_from, predict
+from magfusion.model.once import once_a_site
 from magfusion.model.parameters.beacon import BeaconParameter
 from magfusion.model.parameters.parameter import Block, Calibration, PhasorView, dimension
 from magfusion.model.parameters.subset import channels_of, of_beacons, stretches
@@ -46,6 +47,11 @@ class _Group(NamedTuple):
     def parted(self, evaluated: ComplexArray) -> ComplexArray:
         """Return the same with an axis of the beacons in front, if there is but one, too."""
         return evaluated if len(self.beacons) > 1 else evaluated[None]
+
+
+@once_a_site
+def _side_by_side(site: Site) -> list[_Group]:
+    return _groups(site)
 
 
 def _groups(site: Site, *, beside: bool = True) -> list[_Group]:
@@ -128,7 +134,7 @@ def linearize_channels(
     whole = any(not block.parameter.factor_of_phasor for block in blocks)
     elapsed = time - calibration.reference_time
     acting = {beacon.name: _acting(blocks, beacon) for beacon in site.beacons}
-    groups, factors = _groups(site), axis_factors(site)
+    groups, factors = _side_by_side(site), axis_factors(site)
     sensors = enumerate(site.platform.magnetometers)
     for (sensor, magnetometer), group in product(sensors, groups):
         mine = site.of_sensor(sensor)
