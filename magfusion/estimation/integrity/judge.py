@@ -21,6 +21,7 @@ from magfusion.estimation.integrity.recording import BRIDGED, recorded
 from magfusion.estimation.integrity.residual_blocks import fields, fixes, inertial
 from magfusion.estimation.integrity.score import field_residual, moved_estimate, score_of
 from magfusion.estimation.integrity.signal import detected_in
+from magfusion.estimation.integrity.smoothed_compass import compass
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
 from magfusion.estimation.integrity.tuned_noise import tuned_noise
 from magfusion.model.samples import Log
@@ -80,6 +81,7 @@ def _heard(case: Case) -> Iterator[Testimony]:
         of_held = _traces(of_held, prior)
     yield of_held
     yield from residuals
+    yield _traces(compass(case), cause)
     yield _traces(changed(case), cause)
     yield _traces(priors, cause)
     yield _traces(biases, cause)

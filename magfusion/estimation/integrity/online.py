@@ -14,8 +14,8 @@ from scipy.special import chdtri
 from magfusion.estimation.integrity.gate import Gate
 from magfusion.estimation.integrity.judgement import Judgement
 from magfusion.estimation.integrity.running import Running, nothing
-from magfusion.estimation.measurements.earth import AMBIENT_SHARE
-from magfusion.estimation.state import MOTION, State
+from magfusion.estimation.integrity.steady_field import DOUBT, off_earth
+from magfusion.estimation.state import MOTION, ROTATION, State
 from magfusion.model.parameters import Block, Calibration, difference, initial_calibration
 from magfusion.model.samples import SteadyFields
 from magfusion.model.site import Site
@@ -27,7 +27,6 @@ LEAST_SPAN = 1.0  # s; of inertial data, before gravity is judged
 FADES = 20.0  # s; what was said of the beginning and may have passed since
 PASSING = {"not_converged", "diverged", "field_residuals", "geometry", "gap", "separation"}
 RESTARTS_MEMORY = 60.0  # s
-DOUBT = 5.0  # sigmas; of some fifty tests that are made for hours
 LEAST_EXCESS = 2.5  # mean square; the noise was tuned on the few seconds of the start
 SURE = 6.0
 BEYOND_HELP = 0.2  # rad; a bias that turns the vertical farther leaves no state to inflate
@@ -181,7 +180,7 @@ class OnlineWitness:
             self._of_biases(state),
             self._of_calibration(state),
             self._of_gravity(),
-            self._of_earth(),
+            self._of_earth(state),
             self._of_what_happened(state.time),
             self._of_fixes(),
         ]
@@ -335,30 +334,14 @@ class OnlineWitness:
         )
         return Judgement((Finding("gravity_direction", text, verdict, score / DOUBT),), turn=angle)
 
-    def _of_earth(self) -> Judgement:
-        earth = self.site.earth_field_world
-        if earth is None or self._earth.weight < 5.0:
+    def _of_earth(self, state: State) -> Judgement:
+        if self._earth.weight < 5.0:
             return Judgement()
-        size, model = float(np.linalg.norm(earth)), self.site.earth
-        sensor = self.site.platform.magnetometer.sigma
-        horizontal = float(np.hypot(earth[0], earth[1]))
-        usual = (model.strength_sigma**2 + AMBIENT_SHARE**2) * size**2
-        usual += float(np.max(sensor.matrix)) ** 2 * size**2 + float(np.max(sensor.offset)) ** 2
-        usual += (float(np.max(sensor.rotation_sensor)) * size) ** 2
-        east = np.array([-earth[1], earth[0], 0.0]) / max(horizontal, 1e-12)
-        cov = usual * np.eye(3)
-        cov += (model.declination_sigma * horizontal) ** 2 * np.outer(east, east)
-        left = self._earth.mean
-        score = float(np.sqrt(left @ np.linalg.solve(cov, left)))
-        if score < DOUBT:
+        attitude, cov = state.world_from_body, state.cov[ROTATION, ROTATION]
+        off = off_earth(self.site, self._earth.mean, attitude @ cov @ attitude.T)
+        if off is None:
             return Judgement()
-        turn = float(np.linalg.norm(left)) / size
-        text = (
-            f"The steady field differs from the declared Earth field by {1e6 * size * turn:.2g} uT"
-            f" of {1e6 * size:.2g} uT at the estimated attitude: axes or scale of the magnetometer,"
-            " iron on the platform, or a wrong Earth field in the site."
-        )
-        return Judgement((Finding("earth_field", text, weight=score / DOUBT),), turn=turn)
+        return Judgement((off.finding,), turn=off.turn, shift=off.shift(state.position_world))
 
     def _of_what_happened(self, time: float) -> Judgement:
         found = []

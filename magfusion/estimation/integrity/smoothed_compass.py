@@ -1,0 +1,61 @@
+"""The steady field by the poses of a smoothed log in which the Earth's has no part."""
+
+import numpy as np
+
+from magfusion.estimation.integrity.compasses import SPAN, still_means
+from magfusion.estimation.integrity.recording import beginning
+from magfusion.estimation.integrity.steady_field import OffEarth, off_earth
+from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, BoolArray, IntArray
+
+TOGETHER = 3  # spans, whose mean is judged; about the memory of the same test online
+NEAR = 0.5 * SPAN + 1.0  # s; as near the middle of a span a state must be
+
+
+def compass(case: Case) -> Testimony:
+    """Judge the steady field by the poses, and doubt those of the spans where it is another."""
+    site, states, log = case.result.declared.site, case.result.states, case.log
+    if case.result.earth_residual is not None or site.earth_field_world is None:
+        return NOTHING
+    if log.vectors is None or len(site.platform.magnetometer.axes) < 3 or not len(states):
+        return NOTHING
+    means = still_means(beginning(log), site)
+    row, near = _nearest(states, means.time)
+    row, field_body = row[near], means.field_body[near]
+    if len(row) < TOGETHER or not np.all(np.isfinite(field_body)):
+        return NOTHING
+    attitude = states.world_from_body[row]
+    left = np.einsum("nij,nj->ni", attitude, field_body) - site.earth_field_world
+    cov = attitude @ case.pose_cov[row, :3, :3] @ np.swapaxes(attitude, 1, 2)
+    found = [
+        off_earth(site, np.mean(left[k : k + TOGETHER], axis=0), cov[k])
+        for k in range(len(row) - TOGETHER + 1)
+    ]
+    off = [one for one in found if one is not None]
+    if not off:
+        return NOTHING
+    worst = max(off, key=lambda one: one.score)
+    return Testimony((worst.finding,), spread=_spread(states, means.time[near], found))
+
+
+def _spread(states: Trajectory, time: Array, found: list[OffEarth | None]) -> Array:
+    """Return what the poses nearest to each span may be off by, shape (states, 6, 6)."""
+    middle = time[TOGETHER // 2 : len(time) - TOGETHER // 2]
+    nearest = np.argmin(np.abs(states.time[:, None] - middle), axis=1)
+    spread = np.zeros((len(states), 6, 6))
+    for k, one in enumerate(found):
+        if one is None:
+            continue
+        for row in np.flatnonzero(nearest == k).tolist():
+            spread[row, :3, :3] = one.turn**2 * np.eye(3)
+            spread[row, 3:, 3:] = one.shift(states.position_world[row]) ** 2 * np.eye(3)
+    return spread
+
+
+def _nearest(states: Trajectory, time: Array) -> tuple[IntArray, BoolArray]:
+    after = np.clip(np.searchsorted(states.time, time), 0, len(states) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = time - states.time[before] < states.time[after] - time
+    row = np.where(closer, before, after)
+    return row, np.abs(states.time[row] - time) < NEAR
