@@ -9,6 +9,9 @@ from scipy.spatial.transform import Rotation
 from time_slots_and_mains import tracker
 
 from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
+from magfusion.estimation.snapshot.apart import by_motion, linearized, predicted
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.estimation.snapshot.problem import Motion, Problem, State, epochs_of
 from magfusion.estimation.state import States
 from magfusion.model.parameters import initial_calibration, predict_channels
 from magfusion.model.samples import FieldSamples, ImuSamples
@@ -21,6 +24,7 @@ from magfusion.simulation.waveform import usual_rate_hz
 
 SLOTS = Slots(2.5e-3, 4)
 RATE_BODY = np.array([1.2, -0.8, 0.9])  # rad/s; 100 deg/s
+X_WORLD = np.array([1.0, 0.0, 0.0])
 VELOCITY_WORLD = np.array([0.4, -0.3, 0.2])  # m/s
 
 
@@ -126,3 +130,75 @@ def test_a_site_is_simulated_as_fast_as_its_tones_and_slots_need() -> None:
     assert usual_rate_hz(demo_site()) == 400.0
     assert usual_rate_hz(tracker(1e4, SLOTS)) == pytest.approx(25e3)
     assert usual_rate_hz(tracker(0.0, SLOTS)) == pytest.approx(6400.0)
+
+
+def _noisy_cycles(site: Site, count: int, rng: np.random.Generator) -> FieldSamples:
+    """Return cycles of slots with the noise that they declare."""
+    rows = _slot_rows(site, count)
+    noise = 1e-11 * (rng.standard_normal((2, *rows.phasor_sensor.shape)))
+    return cycles(
+        replace(rows, phasor_sensor=rows.phasor_sensor + noise[0] + 1j * noise[1]),
+        turn_of(_imu(), site),
+        site,
+    )
+
+
+def _here(site: Site) -> Site:
+    """Return a site whose beacons have a hemisphere: a lone source leaves the sign open."""
+    half = [replace(b, hemisphere_beacon=b.world_from_beacon.T @ X_WORLD) for b in site.beacons]
+    return replace(site, beacons=tuple(half))
+
+
+def _errors(site: Site, samples: FieldSamples) -> tuple[np.ndarray, np.ndarray]:
+    """Return errors (n, 6) of the most probable fixes, body axes, and their NEES."""
+    fixes, truth = fix_epochs(samples, initial_calibration(site, 0.0)), _poses(samples.time)
+    turn = np.swapaxes(truth.world_from_body, 1, 2) @ fixes.world_from_body[:, 0]
+    off_world = fixes.position_world[:, 0] - truth.position_world
+    off_body = np.einsum("nji,nj->ni", truth.world_from_body, off_world)
+    error = np.hstack([Rotation.from_matrix(turn).as_rotvec(), off_body])
+    whitened = np.linalg.solve(fixes.pose_cov[:, 0], error[..., None])[..., 0]
+    return error, np.sum(error * whitened, axis=1)
+
+
+def test_a_fix_takes_the_motion_within_a_cycle_from_those_beside_it() -> None:
+    site = _here(_site())
+    samples = _noisy_cycles(site, 48, np.random.default_rng(1))
+    error, nees = _errors(site, samples)
+    still, _ = _errors(site, replace(samples, ahead=None))
+    moved = np.linalg.norm(VELOCITY_WORLD) * SLOTS.duration  # m; from slot to slot
+    assert np.sqrt(np.mean(np.sum(still[:, 3:] ** 2, axis=1))) > 0.3 * moved
+    inner = error[1:-1, 3:]
+    assert np.sqrt(np.mean(np.sum(inner**2, axis=1))) < 0.1 * moved
+    assert np.mean(nees) < 12.0
+
+
+def _problem(site: Site, samples: FieldSamples) -> tuple[Problem, State]:
+    calibration = initial_calibration(site, 0.0)
+    (epochs,) = epochs_of(
+        samples, calibration, gravity=None, prior=None, survey_error=False, free=(), gain_sigma=0.1
+    )
+    assert samples.ahead is not None
+    shift = samples.ahead[..., None] * VELOCITY_WORLD
+    problem = replace(epochs.problem, motion=Motion(shift, np.abs(samples.ahead) * 0.3))
+    at = _poses(samples.time)
+    return problem, problem.start(at.world_from_body, at.position_world)
+
+
+def test_derivatives_of_a_fix_in_motion_are_those_of_its_prediction() -> None:
+    site = _site()
+    problem, state = _problem(site, _noisy_cycles(site, 8, np.random.default_rng(2)))
+    assert problem.motion is not None
+    motion = problem.motion
+
+    def after(step: np.ndarray) -> np.ndarray:
+        turn = state.rotation @ Rotation.from_rotvec(step[:3]).as_matrix()
+        place = state.position + state.rotation @ step[3:6]
+        shift = motion.shift_world + motion.spread[..., None] * step[6:]
+        own = replace(problem, motion=motion._replace(shift_world=shift))
+        return predicted(own, state._replace(rotation=turn, position=place))
+
+    expected = central_difference(after, 9, 1e-5)
+    _, by_pose, _ = linearized(problem, state)
+    assert relative_to_group(by_pose[..., :3], expected[..., :3]) < 1e-6
+    assert relative_to_group(by_pose[..., 3:], expected[..., 3:6]) < 1e-6
+    assert relative_to_group(by_motion(problem, state, by_pose), expected[..., 6:]) < 1e-6

@@ -11,13 +11,12 @@ from magfusion.units import Array
 def predicted(problem: Problem, state: State) -> Array:
     """Return the phasors of states, shape (m, channels, 6) (T)."""
     known = problem.at(state)
-    if problem.turned is None:
+    if not _apart(problem):
         phasor = predict_channels(known, problem.time, state.rotation, state.position)
         return stacked(phasor)
     out = np.empty_like(problem.measured)
     for k in range(out.shape[1]):
-        rotation = state.rotation @ problem.turned[:, k]
-        phasor = predict_channels(known, problem.time, rotation, state.position)
+        phasor = predict_channels(known, problem.time, *_pose(problem, state, k))
         out[:, k] = stacked(phasor[:, k])
     return out
 
@@ -34,16 +33,46 @@ def linearized(problem: Problem, state: State) -> tuple[Array, Array, Array]:
     by_nuisance : ndarray, shape (m, channels, 6, nuisances)
     """
     known, blocks, time = problem.at(state), problem.blocks, problem.time
-    if problem.turned is None:
+    if not _apart(problem):
         return linearize_channels(known, blocks, time, state.rotation, state.position)
     parts = []
-    for k in range(problem.turned.shape[1]):
-        turn = problem.turned[:, k]
+    for k in range(problem.measured.shape[1]):
         value, by_pose, by_nuisance = linearize_channels(
-            known, blocks, time, state.rotation @ turn, state.position
+            known, blocks, time, *_pose(problem, state, k)
         )
-        # A step in the body's axes of the epoch is another one in those of then.
-        halves = by_pose[:, k].reshape(len(turn), 6, 2, 3) @ np.swapaxes(turn, 1, 2)[:, None]
-        parts.append((value[:, k], halves.reshape(len(turn), 6, 6), by_nuisance[:, k]))
+        own = by_pose[:, k]
+        if problem.turned is not None:
+            # A step in the body's axes of the epoch is another one in those of then.
+            back = np.swapaxes(problem.turned[:, k], 1, 2)[:, None]
+            own = (own.reshape(len(own), 6, 2, 3) @ back).reshape(own.shape)
+        parts.append((value[:, k], own, by_nuisance[:, k]))
     value, by_pose, by_nuisance = (np.stack(part, axis=1) for part in zip(*parts, strict=True))
     return value, by_pose, by_nuisance
+
+
+def by_motion(problem: Problem, state: State, by_pose: Array) -> Array:
+    """Return what one sigma of the motion does to the phasors, shape (m, channels, 6, 3).
+
+    Parameters
+    ----------
+    by_pose : ndarray, shape (m, channels, 6, 6)
+        As of `linearized`.
+    """
+    assert problem.motion is not None
+    by_place = by_pose[..., 3:] @ np.swapaxes(state.rotation, 1, 2)[:, None]
+    return np.asarray(problem.motion.spread[..., None, None] * by_place)
+
+
+def _apart(problem: Problem) -> bool:
+    """Tell whether channels have poses of their own."""
+    return problem.turned is not None or problem.motion is not None
+
+
+def _pose(problem: Problem, state: State, channel: int) -> tuple[Array, Array]:
+    """Return attitudes and positions when a channel was measured."""
+    rotation, position = state.rotation, state.position
+    if problem.turned is not None:
+        rotation = rotation @ problem.turned[:, channel]
+    if problem.motion is not None:
+        position = position + problem.motion.shift_world[:, channel]
+    return rotation, position

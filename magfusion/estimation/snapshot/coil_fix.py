@@ -250,6 +250,9 @@ class _Problem:
         error = self._error(place) * size / np.sqrt(3.0)
         if self.epochs.swing is not None:  # which way nobody knows: the roll is open
             error = np.hypot(error, self.epochs.swing[epoch] * size / np.sqrt(2.0))
+        if self.epochs.shift is not None:  # a dipole's field falls with the third power
+            away = _distances(self.calibration.site, place)[:, self.calibration.site.owner]
+            error = np.hypot(error, 3.0 * self.epochs.shift[epoch] / away * size / np.sqrt(3.0))
         return np.asarray(np.where(there, np.hypot(noise, error), 1.0))
 
     def normal(self, epoch: IntArray, state: Array, sigma: Array) -> Normal:

@@ -41,8 +41,9 @@ class CoilEpochs:
         Whether the phase tells the sign.
     parts : ndarray, shape (channels,), optional
         How many numbers each tells: two where its field turns and phases are known, else one.
-    swing : ndarray, shape (n, channels), optional
-        How far the coil had turned since, or would, where channels are measured in turn (rad).
+    swing, shift : ndarray, shape (n, channels), optional
+        How far the coil had turned since, or would (rad), and one sigma of how far it had moved
+        (m), where channels are measured in turn.
     """
 
     time: Array
@@ -51,6 +52,7 @@ class CoilEpochs:
     signed: bool
     parts: IntArray | None = None
     swing: Array | None = None
+    shift: Array | None = None
 
     def __len__(self) -> int:
         return len(self.time)
@@ -65,13 +67,16 @@ class CoilEpochs:
             measured = np.where(np.isfinite(measured), np.abs(measured), np.nan)
         parts = np.concatenate([_turning(beacon) for beacon in site.beacons]) if signed else None
         own = fields.time, measured.astype(np.complex128), sigma, signed, parts
-        return CoilEpochs(*own, _swing(fields, site.platform.magnetometer))
+        shift = None
+        if fields.ahead is not None:
+            shift = np.abs(fields.ahead) * site.platform.motion.speed_sigma
+        return CoilEpochs(*own, _swing(fields, site.platform.magnetometer), shift)
 
     def rows(self, kept: BoolArray | slice) -> "CoilEpochs":
         """Return some epochs."""
         own = self.time[kept], self.measured[kept], self.sigma[kept]
-        swing = None if self.swing is None else self.swing[kept]
-        return CoilEpochs(*own, self.signed, self.parts, swing)
+        motion = (None if part is None else part[kept] for part in (self.swing, self.shift))
+        return CoilEpochs(*own, self.signed, self.parts, *motion)
 
     @property
     def heard(self) -> IntArray:

@@ -17,6 +17,7 @@ from magfusion.estimation.snapshot.many import fix_parts, parts_heard
 from magfusion.estimation.snapshot.place import outside
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA, Epochs, Problem, State, epochs_of
 from magfusion.estimation.snapshot.refine import Solved, as_fixes, cost, joined, solved_from
+from magfusion.estimation.snapshot.within_cycle import FEWEST, fixed_in_motion, velocities
 from magfusion.model.audibility import are_many
 from magfusion.model.channel_effects import of_all_sensors
 from magfusion.model.coil_field import is_sized
@@ -86,16 +87,33 @@ def fix_epochs(
             )
 
         return fix_parts(parts_heard(samples, calibration, gravity), calibration, fixed)
-    parts = epochs_of(
-        samples,
-        calibration,
-        gravity=gravity,
-        prior=prior,
-        survey_error=survey_error,
-        free=free,
-        gain_sigma=gain_sigma,
+    parts = list(
+        epochs_of(
+            samples,
+            calibration,
+            gravity=gravity,
+            prior=prior,
+            survey_error=survey_error,
+            free=free,
+            gain_sigma=gain_sigma,
+        )
     )
-    return joined([_solve(epochs) for epochs in parts])
+    found = joined([_solve(epochs) for epochs in parts])
+    if samples.ahead is None or prior is not None or len(found) < FEWEST:
+        return found
+    return _in_motion(parts, found)
+
+
+def _in_motion(parts: list[Epochs], fixes: Fixes) -> Fixes:
+    """Return fixes of coils driven in turn again, with the platform where it was at each."""
+    turned = parts[0].samples.turned is not None
+    velocity, sigma = velocities(fixes, parts[0].problem.calibration.site, turned=turned)
+    found, first = [], 0
+    for epochs in parts:
+        rows = slice(first, first + len(epochs.samples))
+        found.append(fixed_in_motion(epochs, fixes.rows(rows), velocity[rows], sigma[rows]))
+        first = rows.stop
+    return joined(found)
 
 
 def _solve(epochs: Epochs) -> Fixes:

@@ -34,6 +34,17 @@ class Prior(NamedTuple):
         return Prior(self.rotation[chosen], self.position[chosen], sqrt_information)
 
 
+class Motion(NamedTuple):
+    """What a platform moves by until each channel of a cycle is measured."""
+
+    shift_world: Array  # (m, channels, 3) (m)
+    spread: Array  # (m, channels); one sigma of it along each axis, one and the same cause (m)
+
+    def rows(self, chosen: Chosen) -> "Motion":
+        """Return some rows, or rows repeated."""
+        return Motion(self.shift_world[chosen], self.spread[chosen])
+
+
 def _prior(prior: Trajectory) -> Prior:
     cov = prior.pose_cov
     sqrt_information = None if cov is None else np.linalg.inv(np.linalg.cholesky(cov))
@@ -72,6 +83,8 @@ class Problem:
         Poses with their whitening.
     turned : ndarray, shape (m, channels, 3, 3), optional
         As of `magfusion.model.samples.FieldSamples`.
+    motion : Motion, optional
+        Where channels are measured one after the other by a platform that moves.
     """
 
     calibration: Calibration
@@ -83,6 +96,7 @@ class Problem:
     gravity: Gravity | None
     prior: Prior | None
     turned: Array | None = None
+    motion: Motion | None = None
 
     def rows(self, chosen: Chosen) -> "Problem":
         """Return some rows, or rows repeated."""
@@ -95,6 +109,7 @@ class Problem:
             gravity=None if self.gravity is None else self.gravity.rows(chosen),
             prior=None if self.prior is None else self.prior.rows(chosen),
             turned=None if self.turned is None else self.turned[chosen],
+            motion=None if self.motion is None else self.motion.rows(chosen),
         )
 
     @property

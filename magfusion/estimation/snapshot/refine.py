@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.snapshot.apart import linearized, predicted
+from magfusion.estimation.snapshot.apart import by_motion, linearized, predicted
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA, Problem, State, epochs_of
 from magfusion.estimation.snapshot.survey_error import honest_covariance, survey_jacobians, whitened
@@ -288,7 +288,21 @@ def posterior(problem: Problem, solved: Solved) -> tuple[Array, BoolArray]:
         carried = _with_survey(problem, solved, inverse)
         # Where a direction is open there is nothing for the survey to make worse.
         inverse = np.where(determined[..., None, None], carried, inverse)
+    if problem.motion is not None:
+        moved = _by_motion(problem, solved)
+        inverse = inverse + np.where(determined[..., None, None], moved, 0.0)
     return inverse[..., :6, :6], determined
+
+
+def _by_motion(problem: Problem, solved: Solved) -> Array:
+    """Return the covariance of what the motion within the cycle leaves open, (m, found, found)."""
+    _, by_pose, by_nuisance = linearized(problem, solved.state)
+    by_found = np.concatenate([by_pose, by_nuisance], axis=-1)
+    by_shift = by_motion(problem, solved.state, by_pose)
+    rows, shifts = (whitened(problem.sqrt_information, part) for part in (by_found, by_shift))
+    inverse, _ = open_inverse(solved.information)
+    moved = inverse @ np.swapaxes(rows, 1, 2) @ shifts
+    return np.asarray(moved @ np.swapaxes(moved, 1, 2))
 
 
 def _with_survey(problem: Problem, solved: Solved, inverse: Array) -> Array:

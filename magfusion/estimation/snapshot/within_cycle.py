@@ -1,0 +1,110 @@
+"""Where a platform was when each coil of a cycle was driven, as the fixes about it tell.
+
+Coils driven in turn are measured at places that differ by what the platform moves in between; the
+gyroscope tells turns, and nothing at all a shift.  The fixes of the cycles before and after do.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.estimation.snapshot.place import outside
+from magfusion.estimation.snapshot.problem import Epochs, Motion
+from magfusion.estimation.snapshot.refine import as_fixes, solved_from
+from magfusion.model.site import Site
+from magfusion.units import Array, BoolArray
+
+FEWEST = 3  # epochs, below which none has neighbours on both sides
+LONGEST = 1.0  # s; a fix that is farther off says nothing
+
+
+def fixed_in_motion(epochs: Epochs, fixes: Fixes, velocity: Array, sigma: Array) -> Fixes:
+    """Return fixes again, each channel predicted where the platform was when it was measured.
+
+    Parameters
+    ----------
+    velocity : ndarray, shape (n, hypotheses, 3)
+        World axes (m/s).
+    sigma : ndarray, shape (n, hypotheses)
+        Standard deviation of each component (m/s).
+    """
+    ahead = epochs.samples.ahead_or_zero
+    n, count = fixes.cost.shape
+    problem = epochs.reweighed(fixes.world_from_body[:, 0], fixes.position_world[:, 0])
+    problem = epochs.problem if problem is None else problem
+    shift = ahead[:, None, :, None] * velocity[:, :, None]
+    spread = ahead[:, None] * sigma[..., None]
+    rows = replace(
+        problem.rows(np.repeat(np.arange(n), count)),
+        motion=Motion(shift.reshape(-1, *shift.shape[2:]), spread.reshape(n * count, -1)),
+    )
+    start = rows.start(fixes.world_from_body.reshape(-1, 3, 3), fixes.position_world.reshape(-1, 3))
+    start = start._replace(
+        phase=fixes.phase.reshape(n * count, -1), log_gain=fixes.log_gain.reshape(n * count, -1)
+    )
+    solved = solved_from(rows, start)
+    found = as_fixes(rows, solved, count)
+    cost = np.where(np.isfinite(fixes.cost), found.cost + outside(problem, solved, count), np.inf)
+    order = np.argsort(cost, axis=1, kind="stable")
+    parts = {
+        name: part if part.ndim == 1 else part[np.arange(n)[:, None], order]
+        for name, part in vars(replace(found, cost=cost)).items()
+    }
+    return Fixes(**parts)
+
+
+def velocities(fixes: Fixes, site: Site, *, turned: bool) -> tuple[Array, Array]:
+    """Return the velocity of each hypothesis by the nearest ones of the epochs beside it.
+
+    Parameters
+    ----------
+    turned : bool
+        Whether phasors are in the axes of their own times: then that of the body, else that of its
+        magnetometer, whose lever swings.
+
+    Returns
+    -------
+    velocity : ndarray, shape (n, hypotheses, 3)
+        World axes (m/s).
+    sigma : ndarray, shape (n, hypotheses)
+        Standard deviation of each component (m/s); with the usual speed for a prior.
+    """
+    sensor, motion = site.platform.magnetometer, site.platform.motion
+    lever = np.zeros(3) if turned else sensor.position_body
+    place = fixes.position_world + fixes.world_from_body @ lever
+    variance = np.trace(fixes.pose_cov[..., 3:, 3:], axis1=2, axis2=3) / 3.0
+    there = np.isfinite(fixes.cost) & fixes.determined
+    here, unsure = np.arange(len(fixes)), np.full(variance.shape, np.inf)
+    sides = []
+    for beside in (np.maximum(here - 1, 0), np.minimum(here + 1, len(here) - 1)):
+        known = (beside != here) & (np.abs(fixes.time[beside] - fixes.time) < LONGEST)
+        found, own = _nearest(place, variance, there, beside)
+        use = known[:, None] & np.isfinite(own)
+        sides.append(
+            (
+                np.where(use[..., None], found, place),
+                np.where(use, own, variance),
+                np.where(use, fixes.time[beside][:, None], fixes.time[:, None]),
+            )
+        )
+    (before, of_before, begin), (after, of_after, end) = sides
+    run = end - begin
+    some = (run > 0.0) & there
+    step = np.where(some, run, 1.0)
+    velocity = np.where(some[..., None], (after - before) / step[..., None], 0.0)
+    changed = 0.5 * motion.accel_sigma * step
+    square = np.where(some, (of_before + of_after) / step**2 + changed**2, unsure)
+    usual = motion.speed_sigma**2
+    share = usual / (usual + square)
+    return share[..., None] * velocity, np.sqrt(usual * (1.0 - share))
+
+
+def _nearest(place: Array, variance: Array, there: BoolArray, beside: Array) -> tuple[Array, Array]:
+    """Return another epoch's hypothesis nearest to each, and its variance; infinite of none."""
+    away = np.linalg.norm(place[beside][:, None] - place[:, :, None], axis=3)
+    away = np.where(there[beside][:, None], away, np.inf)
+    best = np.argmin(away, axis=2)
+    rows = np.arange(len(place))[:, None]
+    there_is = np.isfinite(np.min(away, axis=2))
+    return place[beside][rows, best], np.where(there_is, variance[beside][rows, best], np.inf)
