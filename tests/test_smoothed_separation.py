@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import binom
 from small_problem import SIGMA, SmallLog
 
-from magfusion.estimation import chain_system, considered, factors, marginals
+from magfusion.estimation import chain_system, considered, factors, marginals, native_rows
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.integrity.separation import protection_levels
 from magfusion.estimation.integrity.smoothed_exclusion import SLACK, separated_smooth
@@ -152,7 +152,7 @@ def _marginals(result: Smoothed) -> tuple[Array, Array, Array]:
 def test_piece_by_piece_a_log_is_separated_as_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     result = _smoothed(_walk(1))
     known = separate_smoothed(result), _marginals(result)
-    for module in (factors, chain_system):
+    for module in (factors, native_rows):
         monkeypatch.setattr(module, "PIECE", 7)
     monkeypatch.setattr(chain_system, "AT_ONCE", 1.0)  # one beacon at once, nothing kept
     monkeypatch.setattr(chain_system, "KEPT", 1.0)

@@ -4,28 +4,26 @@ GTSAM's elimination serves any graph; here all states of a log are one chain, so
 of every state, and what else is asked of all of them, come of one sweep (`solve.chain`).
 """
 
-from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import NamedTuple
 
-import gtsam
 import numpy as np
 
-from magfusion.estimation.factors import CALIBRATION_KEY, CONSIDERED_KEY, PIECE, Factors
+from magfusion.estimation.factors import Factors
 from magfusion.estimation.graph import Estimate, Graph
 from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.native_rows import Columns, NativeRows, each_once
 from magfusion.estimation.solve.chain import Chain
-from magfusion.estimation.state import MOTION, states_in
-from magfusion.model.parameters import Block, difference, dimension, placed
+from magfusion.estimation.state import MOTION, States, states_in
+from magfusion.model.parameters import Block, Calibration, difference, dimension, placed
 from magfusion.model.prior import prior_sqrt_covariance, prior_sqrt_information
 from magfusion.units import Array, BoolArray, IntArray
 
 AT_ONCE = 2e8  # bytes; variants are solved in groups of so much
 KEPT = 1e8  # bytes of rows; what is more is made anew for every group
 SIDES = 6e7  # bytes of right sides at once; what is considered is taken in groups
-_FIRST, _WIDTH = {"x": 0, "v": 6, "b": 9}, {"x": 6, "v": 3, "b": 6}  # in a state's tangent vector
 
 
 class Normal:
@@ -111,7 +109,7 @@ class Piece(NamedTuple):
             own = part[:, kept]
             flat.append(own.reshape(len(own), own.shape[1] * own.shape[2], own.shape[3]))
         # A measurement may have several rows of one state.
-        for once in _each_once(self.epoch):
+        for once in each_once(self.epoch):
             normal.add(self.epoch[once], flat[0][once], None, flat[1][once], flat[2][once])
 
 
@@ -139,20 +137,31 @@ class FieldRows:
         size, states = sum(_size(one) for one in self.known), states_in(self.estimate.values)
         calibration = self.estimate.calibration
         for factors in islice(self.factors.pieces(), len(self.known), None):
-            found = factors.rows(states, calibration, factors.blocks)
-            jacobian = found.jacobian(dimension(factors.blocks))
-            right = np.zeros((*found.error.shape, 1 + self.spread.shape[1]))
-            right[..., 0] = -found.error
-            if self.considered:
-                by_other = factors.rows(states, calibration, self.considered).by_calibration
-                if by_other is not None:
-                    right[..., 1:] = -by_other @ self.spread
-            by_state, by_calibration = jacobian[..., :MOTION], jacobian[..., MOTION:]
-            piece = Piece(factors.measurement.epoch, by_state, by_calibration, right)
+            piece = field_piece(factors, states, calibration, self.considered, self.spread)
             size += _size(piece)
             if size < KEPT:
                 self.known.append(piece)
             yield piece
+
+
+def field_piece(
+    factors: Factors,
+    states: States,
+    calibration: Calibration,
+    considered: tuple[Block, ...],
+    spread: Array,
+) -> Piece:
+    """Return the rows of some epochs of a measurement."""
+    found = factors.rows(states, calibration, factors.blocks)
+    jacobian = found.jacobian(dimension(factors.blocks))
+    right = np.zeros((*found.error.shape, 1 + spread.shape[1]))
+    right[..., 0] = -found.error
+    if considered:
+        by_other = factors.rows(states, calibration, considered).by_calibration
+        if by_other is not None:
+            right[..., 1:] = -by_other @ spread
+    by_state, by_calibration = jacobian[..., :MOTION], jacobian[..., MOTION:]
+    return Piece(factors.measurement.epoch, by_state, by_calibration, right)
 
 
 def _size(piece: Piece) -> int:
@@ -187,27 +196,43 @@ def chain_system(
         Of what is considered, of which the right sides are.
     """
     assert graph.declared is not None
-    size = dimension(graph.blocks)
-    spread = np.zeros((0, 0))
+    spread, by_inertial = np.zeros((0, 0)), None
     if considered:
         spread = prior_sqrt_covariance(graph.declared.site, considered)[:, columns]
-    normal = Normal(graph.epochs, size, spread.shape[1])
-    if size:
+        by_others = graph.by_considered(spread)
+        if by_others is not None and np.any(by_others):  # else the fields alone tell of them
+            by_inertial = by_others.__getitem__
+    beside = Columns(considered, spread, by_inertial)
+    return system_beside(graph, estimate, beside, NativeRows(graph, estimate), columns)
+
+
+def system_beside(
+    graph: Graph,
+    estimate: Estimate,
+    beside: Columns,
+    native: NativeRows,
+    columns: slice = slice(None),
+) -> tuple[Normal, FieldRows | None]:
+    """Return the same, with columns of any parameters for right sides.
+
+    Parameters
+    ----------
+    columns : slice
+        Of what else other logs say of the calibration.
+    """
+    size = dimension(graph.blocks)
+    normal = Normal(graph.epochs, size, beside.number)
+    add_prior(normal, graph, estimate)
+    if size and graph.shift is not None:
+        assert graph.declared is not None
         whitening = prior_sqrt_information(graph.declared.site, graph.blocks)
-        step = difference(graph.declared, estimate.calibration, graph.blocks)
-        normal.corner += whitening.T @ whitening
-        normal.right_border[:, 0] -= whitening.T @ (whitening @ step)
-        if graph.shift is not None:
-            by = graph.shift.by_considered[:, columns]
-            normal.right_border[:, 1 : 1 + by.shape[1]] += whitening.T @ (whitening @ by)
-    for own in _native_rows(graph, estimate, spread, size):
+        by = graph.shift.by_considered[:, columns]
+        normal.right_border[:, 1 : 1 + by.shape[1]] += whitening.T @ (whitening @ by)
+    for own in native.of(beside):
         normal.add(*own)
     fields: FieldRows | None = None
-    felt = [block for block in considered if np.any(spread[block.columns])]
-    of_felt = [spread[block.columns] for block in felt]
     for factors in graph.factors:
-        own_spread = np.concatenate(of_felt) if felt else spread[:0]
-        rows = FieldRows(factors, estimate, placed(felt), own_spread)
+        rows = FieldRows(factors, estimate, *_felt(beside))
         if isinstance(factors.measurement, FieldPhasors):
             fields = rows
             continue
@@ -216,58 +241,20 @@ def chain_system(
     return normal, fields
 
 
-def _each_once(epoch: IntArray) -> Iterator[IntArray]:
-    """Yield rows in groups in which no state comes twice."""
-    left = np.arange(len(epoch))
-    while len(left):
-        _, first = np.unique(epoch[left], return_index=True)
-        yield left[first]
-        left = np.delete(left, first)
+def add_prior(normal: Normal, graph: Graph, estimate: Estimate) -> None:
+    """Add the prior of the calibration."""
+    if not graph.blocks:
+        return
+    assert graph.declared is not None
+    whitening = prior_sqrt_information(graph.declared.site, graph.blocks)
+    step = difference(graph.declared, estimate.calibration, graph.blocks)
+    normal.corner += whitening.T @ whitening
+    normal.right_border[:, 0] -= whitening.T @ (whitening @ step)
 
 
-def _native_rows(
-    graph: Graph, estimate: Estimate, spread: Array, size: int
-) -> Iterator[tuple[IntArray, Array, Array | None, Array, Array]]:
-    """Yield the rows of inertial factors and priors of the motion, those alike together."""
-    by_others = graph.by_considered(spread) if len(spread) else None
-    if by_others is not None and not np.any(by_others):
-        by_others = None  # what the fields alone tell of
-    linear = graph.inertial(estimate, by_others)
-    kinds: dict[tuple[tuple[str, int], ...], list[tuple[int, Array, Array]]] = defaultdict(list)
-    for i in range(linear.size()):
-        factor = linear.at(i)
-        assert isinstance(factor, gtsam.JacobianFactor)
-        symbols = [gtsam.Symbol(key) for key in list(factor.keys())]
-        names = [(chr(symbol.chr()), symbol.index()) for symbol in symbols]
-        first = min(index for name, index in names if name in _FIRST)
-        kind = tuple((name, index - first if name in _FIRST else 0) for name, index in names)
-        kinds[kind].append((first, factor.getA(), factor.getb()))
-    apart = {chr(gtsam.Symbol(CALIBRATION_KEY).chr()): size}
-    apart[chr(gtsam.Symbol(CONSIDERED_KEY).chr())] = spread.shape[1]
-    for kind, found in (
-        (kind, every[begin : begin + PIECE])
-        for kind, every in kinds.items()
-        for begin in range(0, len(every), PIECE)
-    ):
-        jacobian = np.array([by for _, by, _ in found])
-        rows = jacobian.shape[:2]
-        own, after = np.zeros((*rows, MOTION)), np.zeros((*rows, MOTION))
-        border, right = np.zeros((*rows, size)), np.zeros((*rows, 1 + spread.shape[1]))
-        right[..., 0] = np.array([b for _, _, b in found])
-        column = 0
-        for name, later in kind:
-            width = _WIDTH[name] if name in _WIDTH else apart[name]
-            part = jacobian[..., column : column + width]
-            column += width
-            if name in _FIRST:
-                target = own if later == 0 else after
-                target[..., _FIRST[name] : _FIRST[name] + width] = part
-            elif name == "c":
-                border[...] = part
-            else:
-                right[..., 1:] = -part
-        epoch = np.array([first for first, _, _ in found])
-        linked = any(later for _, later in kind)
-        for once in _each_once(epoch):
-            ahead = after[once] if linked else None
-            yield epoch[once], own[once], ahead, border[once], right[once]
+def _felt(beside: Columns) -> tuple[tuple[Block, ...], Array]:
+    """Return the parameters that any column is of, and what makes a step of them."""
+    felt = [block for block in beside.blocks if np.any(beside.spread[block.columns])]
+    if not felt:
+        return (), beside.spread[:0]
+    return placed(felt), np.concatenate([beside.spread[block.columns] for block in felt])

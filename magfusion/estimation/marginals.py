@@ -73,7 +73,7 @@ def marginals(
     """
     linear, ordering = graph.linearized(estimate), graph.ordering
     tree = eliminate(linear, ordering)
-    if _is_chain(graph, considered):
+    if is_chain(graph, considered):
         rows = np.unique(np.linspace(0, graph.epochs - 1, VOUCHED).astype(int)).tolist()
         vouched = {i: np.array(tree.marginalCovariance(X(i))) for i in rows}
         calibration = last_marginal(tree, linear, ordering) if graph.blocks else None
@@ -102,7 +102,7 @@ def marginals(
     return poses, calibration, response
 
 
-def _is_chain(graph: Graph, considered: tuple[Block, ...]) -> bool:
+def is_chain(graph: Graph, considered: tuple[Block, ...]) -> bool:
     """Tell whether one sweep gives all covariances: of one calibration, no log of many hours."""
     columns = [group.stop - group.start for group in column_groups(considered, graph.epochs)]
     most = 1 + max(columns) + dimension(graph.blocks)

@@ -7,7 +7,7 @@ beside it.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from magfusion.estimation.integrity.held import (
     Freed,
     freed_by,
 )
-from magfusion.estimation.integrity.score import Score, score_beside
+from magfusion.estimation.integrity.score import score_beside
 from magfusion.estimation.integrity.statistics import holm, sigmas
 from magfusion.estimation.integrity.suspects import Inertial, Stream, Suspect, spoken_name, suspects
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
@@ -153,7 +153,7 @@ def changed(case: Case) -> Testimony:
     times = [begin + part * length for part in PARTS]
     new = [_blocks(site, at) for at in times]
     every = placed((*score.held, *(block for part in new for block in part)))
-    wide = score_beside(result, every, case.log.imu)
+    wide = score_beside(result, every, case.log.imu, score)
     information, gradient = wide.with_declared()
     asked = [
         Change(suspect, at)
@@ -174,14 +174,14 @@ def changed(case: Case) -> Testimony:
     if not likely:
         return NOTHING
     change, cause = max(likely, key=lambda pair: pair[1].gain)
-    if cause.gain < _throughout(case, wide, information, gradient):
+    if cause.gain < _throughout(case, information, gradient):
         return NOTHING  # it was so from the beginning
     moved = cause.moved[:, :, None] * cause.moved[:, None, :]
     known = wide.by_pose @ cause.known_cov @ np.swapaxes(wide.by_pose, 1, 2)
     return Testimony((_finding(change, cause, prior_sigma(every)),), spread=moved + known)
 
 
-def _throughout(case: Case, wide: Score, information: Array, gradient: Array) -> float:
+def _throughout(case: Case, information: Array, gradient: Array) -> float:
     """Return the most that anything held explains which is wrong all along."""
     assert case.score is not None
     own = slice(0, dimension(case.score.held))
@@ -191,7 +191,7 @@ def _throughout(case: Case, wide: Score, information: Array, gradient: Array) ->
         if (
             found := freed_by(
                 case.pose_cov,
-                replace(wide, by_state=wide.by_state[:, :, own]),
+                case.score,
                 suspect,
                 information[own, own],
                 gradient[own],

@@ -15,9 +15,11 @@ from gtsam.symbol_shorthand import B, V, X
 from magfusion.estimation.batch import Smoothed
 from magfusion.estimation.considered import steps_of_others
 from magfusion.estimation.factors import CALIBRATION_KEY, CONSIDERED_KEY, NUISANCE_KEY
-from magfusion.estimation.graph import Estimate, Graph
-from magfusion.estimation.inertial import ROWS
-from magfusion.estimation.integrity.suspects import TOLERANCE, Inertial, Stream, held_blocks
+from magfusion.estimation.graph import Estimate
+from magfusion.estimation.integrity.held_columns import inertial_columns
+from magfusion.estimation.integrity.score_chain import Responses, Scored, score_of_chain
+from magfusion.estimation.integrity.suspects import TOLERANCE, held_blocks
+from magfusion.estimation.marginals import is_chain
 from magfusion.estimation.measurements.earth import EarthField
 from magfusion.estimation.measurements.measurement import Rows
 from magfusion.estimation.measurements.phasors import FieldPhasors
@@ -46,8 +48,8 @@ class Score:
     spread : ndarray, shape (h, k)
         A root of the covariance of their errors that the site declares; zero where it takes them
         as known.
-    by_state : ndarray, shape (states, 15, h)
-        What a unit of them does to pose, velocity and biases.
+    by_state : ndarray, shape (states, 15 or 6, h)
+        What a unit of them does to pose, velocity and biases; or to the pose alone.
     by_calibration : ndarray, shape (dimension, h)
         What a unit of them does to the calibration that is estimated.
     """
@@ -118,11 +120,32 @@ def score_of(result: Smoothed, imu: ImuSamples) -> Score | None:
     return score_beside(result, held, imu) if held else None
 
 
-def score_beside(result: Smoothed, held: tuple[Block, ...], imu: ImuSamples) -> Score:
-    """Return the score of parameters that a result does not estimate, at least one."""
+def score_beside(
+    result: Smoothed, held: tuple[Block, ...], imu: ImuSamples, known: Score | None = None
+) -> Score:
+    """Return the score of parameters that a result does not estimate, at least one.
+
+    Parameters
+    ----------
+    known : Score, optional
+        Of the first of them: how they move the states is not found again, and of the others only
+        how they move the poses.
+    """
+    inertial = inertial_columns(result, held, imu)
+    found = None
+    if is_chain(result.graph, held):
+        before = None if known is None else Responses(known.by_state, known.by_calibration)
+        found = score_of_chain(result, held, inertial, before)
+    if found is None:
+        found = _by_elimination(result, held, inertial.of(slice(None)))
+    information, gradient, responses = found
+    return Score(held, information, gradient, _declared(result, held), *responses)
+
+
+def _by_elimination(result: Smoothed, held: tuple[Block, ...], by_others: Array) -> Scored:
+    """Return the same of any graph."""
     graph, estimate, size = result.graph, result.estimate, dimension(held)
     unit = np.diag(prior_sigma(held))
-    by_others = _by_stream(result, held, imu) @ unit
     # One system after the other: of a long log each of them is most of what there is.
     left = None
     if result.field_errors:
@@ -149,8 +172,7 @@ def score_beside(result: Smoothed, held: tuple[Block, ...], imu: ImuSamples) -> 
         by_state[:, :, k] = step.vector(keys).reshape(-1, MOTION)
         if result.blocks:
             by_calibration[:, k] = step.at(CALIBRATION_KEY)
-    spread = _declared(result, held)
-    return Score(held, information, gradient, spread, by_state, by_calibration)
+    return Scored(information, gradient, Responses(by_state, by_calibration))
 
 
 def _without_error(net: gtsam.GaussianBayesNet) -> gtsam.GaussianBayesNet:
@@ -171,36 +193,6 @@ def _declared(result: Smoothed, held: tuple[Block, ...]) -> Array:
         if block.key in at:  # one from outside is not tried
             out[at[block.key]] = spread[block.columns]
     return out / prior_sigma(held)[:, None]
-
-
-def _by_stream(result: Smoothed, held: tuple[Block, ...], imu: ImuSamples) -> Array:
-    """Return what the held parameters of the IMU do to its factors, shape (intervals, 15, h)."""
-    states, graph = result.states, result.graph
-    first = _first_inertial(graph)
-    size, count = dimension(held), graph.epochs - 1
-    out = np.zeros((count, ROWS, size))
-    linear = graph.native.linearize(result.estimate.values)
-    calibration = result.calibration
-    time = calibration.on_log_rate(imu).time + calibration.time_offset
-    of_bias = np.zeros((count, ROWS, 6))
-    for k in range(count):
-        factor = linear.at(first + k)
-        assert isinstance(factor, gtsam.JacobianFactor)
-        # A bias that is the same at both ends leaves its random walk alone.
-        whole, column = factor.getA(), 0
-        for key in factor.keys():  # noqa: SIM118
-            symbol = gtsam.Symbol(key).chr()
-            width = 3 if symbol == ord("v") else 6
-            if symbol == ord("b"):
-                of_bias[k] += whole[:, column : column + width]
-            column += width
-    for block in held:
-        if isinstance(block.parameter, Inertial):
-            bias = block.parameter.as_bias(Stream(imu, states.world_from_body))
-            if len(bias) != count:
-                bias = _means(bias, time, states.time)
-            out[:, :, block.columns] = of_bias @ bias
-    return out
 
 
 def moved_estimate(result: Smoothed, score: Score, step: Array) -> Estimate:
@@ -238,16 +230,3 @@ def field_residual(result: Smoothed, estimate: Estimate, *, raw: bool = False) -
     loss = None if raw else alone.loss
     error = Rows(graph.residual(alone, estimate)).weighed(loss)[0].error
     return np.where(result.fields.told, error, np.nan)
-
-
-def _first_inertial(graph: Graph) -> int:
-    return graph.native.size() - (graph.epochs - 1)
-
-
-def _means(value: Array, time: Array, edges: Array) -> Array:
-    """Return the mean of samples between edges; zero where there is none."""
-    at = np.searchsorted(time, edges)
-    total = np.concatenate([np.zeros((1, *value.shape[1:])), np.cumsum(value, axis=0)])
-    number = np.diff(at)
-    sums = total[at[1:]] - total[at[:-1]]
-    return sums / np.maximum(number, 1)[:, None, None]

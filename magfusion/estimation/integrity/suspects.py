@@ -57,6 +57,7 @@ class Inertial(Parameter):
     owner = "imu"
     group = "inertial"
     size: ClassVar[int] = 3
+    of_states: ClassVar[bool] = False  # whether it is told between states, not at samples
 
     def sigma(self, site: Site, owner: str) -> Array:
         """Return zeros: no site declares it."""
@@ -101,7 +102,7 @@ class _GyroAlignment(Inertial):
 
 class _Gravity(Inertial):
     owner, kind, spoken = "site", "gravity", Unit("m/s^2", 1.0)
-    words, size = "the size of gravity", 1
+    words, size, of_states = "the size of gravity", 1, True
 
     def as_bias(self, stream: Stream) -> Array:
         up_body = 0.5 * (stream.world_from_body[1:, 2] + stream.world_from_body[:-1, 2])

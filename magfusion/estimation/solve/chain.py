@@ -78,7 +78,7 @@ def solve_chain(chain: Chain, kept: int, known: Array | None = None) -> ChainSol
     solved = chain.sides
     if solved is None:
         solved = np.concatenate([chain.right, chain.border], axis=-1)
-    inverse = _inverses(chain) if known is None else known
+    inverse = inverses(chain.diagonal, chain.following) if known is None else known
     gain = inverse[:, :-1] @ chain.following
     for i in range(n - 1):
         solved[:, i + 1] -= np.swapaxes(gain[:, i], 1, 2) @ solved[:, i]
@@ -110,14 +110,20 @@ def solve_chain(chain: Chain, kept: int, known: Array | None = None) -> ChainSol
     return ChainSolution(states, border, own, corner, explained, inverse)
 
 
-def _inverses(chain: Chain) -> Array:
-    """Return the inverse of what those before leave of each state, shape (h, n, s, s)."""
-    out, pivot = np.empty_like(chain.diagonal), chain.diagonal[:, 0]
+def inverses(diagonal: Array, following: Array) -> Array:
+    """Return the inverse of what those before leave of each state, shape (h, n, s, s).
+
+    Parameters
+    ----------
+    diagonal, following : ndarray
+        As of `Chain`.
+    """
+    out, pivot = np.empty_like(diagonal), diagonal[:, 0]
     for i in range(out.shape[1]):
         out[:, i] = _inverse(pivot)
         if i + 1 < out.shape[1]:
-            back = np.swapaxes(out[:, i] @ chain.following[:, i], 1, 2)
-            pivot = chain.diagonal[:, i + 1] - back @ chain.following[:, i]
+            back = np.swapaxes(out[:, i] @ following[:, i], 1, 2)
+            pivot = diagonal[:, i + 1] - back @ following[:, i]
     return out
 
 

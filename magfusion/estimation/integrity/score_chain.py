@@ -1,0 +1,102 @@
+"""The score of a log that is one chain of states: a sweep along it, in groups of columns."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.chain_left import left_over
+from magfusion.estimation.chain_system import column_groups, system_beside
+from magfusion.estimation.integrity.held_columns import InertialColumns
+from magfusion.estimation.native_rows import Columns, NativeRows
+from magfusion.estimation.solve.chain import solve_chain
+from magfusion.estimation.state import MOTION
+from magfusion.model.parameters import Block, dimension, placed, prior_sigma
+from magfusion.units import Array
+
+POSE = 6
+
+
+class Responses(NamedTuple):
+    """What a unit of each parameter that is held does.
+
+    Parameters
+    ----------
+    by_state : ndarray, shape (states, 15 or 6, h)
+        To pose, velocity and biases; or to the pose alone.
+    by_calibration : ndarray, shape (dimension, h)
+        To the calibration that is estimated.
+    """
+
+    by_state: Array
+    by_calibration: Array
+
+
+class Scored(NamedTuple):
+    """As of `magfusion.estimation.integrity.score.Score`."""
+
+    information: Array
+    gradient: Array
+    responses: Responses
+
+
+def score_of_chain(
+    result: Smoothed,
+    held: tuple[Block, ...],
+    inertial: InertialColumns,
+    known: Responses | None = None,
+) -> Scored | None:
+    """Return the score; None where the chain is too badly conditioned for one sweep.
+
+    Parameters
+    ----------
+    known : Responses, optional
+        Of the first that are held; then of the others only poses are asked for.
+    """
+    graph, size = result.graph, dimension(held)
+    native = NativeRows(graph, result.estimate)
+    # An error that is constant in place looks like some of them; what freeing them does to the
+    # estimate, which weighs epochs as if there were none, stays the same.
+    every = placed((*held, *result.field_errors))
+    wide = inertial._replace(number=dimension(every))
+    beside = Columns(every, np.diag(prior_sigma(every)), wide.of)
+    try:
+        left = left_over(graph, result.estimate, beside, native)
+        errors = left[1 + size :, 1 + size :] + np.eye(dimension(every) - size)
+        across = left[: 1 + size, 1 + size :]
+        left = left[: 1 + size, : 1 + size] - across @ np.linalg.solve(errors, across.T)
+    except np.linalg.LinAlgError:
+        return None
+    information = 0.5 * (left[1:, 1:] + left[1:, 1:].T)
+    kept = MOTION if known is None else POSE
+    by_state, by_calibration = [np.zeros((graph.epochs, kept, 0))], []
+    by_calibration.append(np.zeros((dimension(graph.blocks), 0)))
+    if known is not None:
+        by_state.append(known.by_state[:, :kept])
+        by_calibration.append(known.by_calibration)
+    inverse = None
+    new = tuple(b for b in held if b.columns.start >= sum(part.shape[1] for part in by_calibration))
+    for columns in _groups(new, graph.epochs):
+        part = inertial.part(columns)
+        own = Columns(held, np.diag(prior_sigma(held))[:, columns], part.of)
+        normal, fields = system_beside(graph, result.estimate, own, native)
+        if fields is not None:
+            for piece in fields.pieces():
+                piece.added_to(normal)
+        found = solve_chain(normal.chain(), kept, inverse)
+        inverse = found.inverse
+        by_state.append(found.states[0, ..., 1:].copy())
+        by_calibration.append(found.border[0, :, 1:])
+        del normal, fields, found  # before the next group: of a long log they are much
+    responses = Responses(np.concatenate(by_state, axis=2), np.concatenate(by_calibration, axis=1))
+    finite = [np.all(np.isfinite(part)) for part in (information, *responses)]
+    return Scored(information, -left[1:, 0], responses) if all(finite) else None
+
+
+def _groups(held: tuple[Block, ...], epochs: int) -> list[slice]:
+    """Return columns of what is held, so many at once that their right sides fit memory."""
+    if not held:
+        return []
+    first = held[0].columns.start
+    groups = column_groups(placed(held), epochs)
+    return [slice(first + group.start, first + group.stop) for group in groups]

@@ -1,0 +1,57 @@
+"""The score by one sweep along the chain is that of GTSAM's elimination."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_problem import small_log
+
+from magfusion.estimation import chain_left, chain_system
+from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.integrity import held_columns, midway, score
+from magfusion.estimation.integrity.score import Score, score_beside, score_of
+from magfusion.model.parameters import placed
+from magfusion.model.samples import ImuSamples
+
+
+def _asked(result: Smoothed, imu: ImuSamples) -> tuple[Score, Score]:
+    """Return the score of what is held, and with what may change in the middle."""
+    known = score_of(result, imu)
+    assert known is not None
+    middle = float(np.mean(result.fields.time))
+    every = placed((*known.held, *midway._blocks(result.declared.site, middle)))
+    return known, score_beside(result, every, imu, known)
+
+
+@pytest.mark.parametrize("estimated", [True, False])
+def test_a_sweep_gives_the_score_of_the_tree(
+    monkeypatch: pytest.MonkeyPatch, *, estimated: bool
+) -> None:
+    small = small_log(3)
+    settings = SmootherSettings(tune=False)
+    if not estimated:
+        settings = SmootherSettings(tune=False, estimate=())
+    result = smooth(small.log, replace(small.site, model_error=1e-3), settings)
+    assert bool(result.blocks) == estimated
+    assert result.field_errors
+    monkeypatch.setattr(score, "score_of_chain", lambda *_: None)
+    trees = _asked(result, small.log.imu)
+    monkeypatch.undo()
+    monkeypatch.setattr(chain_left, "STRETCH", 7)
+    monkeypatch.setattr(held_columns, "STRETCH", 5)
+    monkeypatch.setattr(chain_system, "SIDES", 1.0)  # one block at once
+    for chain, tree in zip(_asked(result, small.log.imu), trees, strict=True):
+        assert np.any(chain.information != tree.information)  # found otherwise
+        unit = np.sqrt(np.diagonal(tree.information))
+        scale = np.where(unit > 0.0, unit, 1.0)
+        np.testing.assert_allclose(
+            chain.information / scale / scale[:, None],
+            tree.information / scale / scale[:, None],
+            atol=1e-7,
+        )
+        np.testing.assert_allclose(chain.gradient / scale, tree.gradient / scale, atol=1e-7)
+        largest = np.max(np.abs(tree.by_pose), axis=(0, 1))
+        apart = np.max(np.abs(chain.by_pose - tree.by_pose), axis=(0, 1))
+        assert np.all(apart <= 1e-7 * largest)
+        np.testing.assert_allclose(chain.by_calibration, tree.by_calibration, atol=1e-7)
+        np.testing.assert_array_equal(chain.spread, tree.spread)
