@@ -29,7 +29,7 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory, interpolate
 from magfusion.units import DEGREE, Array
 
-FIRST_SEED = 30  # constants of the filter were chosen by logs of smaller ones
+FIRST_SEED = 30  # constants of the filter were chosen by logs of other ones: up to 29, 201 to 203
 LOGS = Path(__file__).parents[2] / "shared" / "logs"
 
 

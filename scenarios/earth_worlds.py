@@ -29,6 +29,7 @@ EARTH_WORLD = np.array([0.0, 1.64e-5, -4.14e-5])  # T
 GRAVITY = 9.8  # m/s^2
 RATE = 100.0  # Hz
 REST = 6.0  # s; before it moves
+LIFTED = 0.4  # m; above the table that it rests on first
 REPEATED = 0.3  # of the magnetometer's samples
 IMU = ImuModel(2e-3, 2e-2, 1e-5, 1e-3, 1e-2, 0.1)
 
@@ -50,6 +51,16 @@ class Kind:
     pauses : bool
         Whether it rests now and then.
     magnet : {'none', 'near', 'attached', 'from the start'}
+    late : float
+        Most that the magnetometer lags (s).
+    rest : float
+        Before it moves (s).
+    lifted : bool
+        Whether it rests on a table with iron in it first, and is moved above it.
+    iron : (float, float)
+        Distances of the building's iron (m).
+    walk : float
+        Usual speed of who carries it, to and fro (m/s, each horizontal component).
     """
 
     turning: float = 0.0
@@ -58,6 +69,11 @@ class Kind:
     hertz: float = 0.5
     pauses: bool = False
     magnet: str = "none"
+    late: float = 0.005
+    rest: float = REST
+    lifted: bool = False
+    iron: tuple[float, float] = (1.2, 3.0)
+    walk: float = 0.0
 
 
 KINDS = {
@@ -70,6 +86,26 @@ KINDS = {
     "magnet beside": Kind(turning=0.8, shaking=1.0, hertz=0.3, magnet="near"),
     "magnet attached": Kind(turning=1.5, shaking=1.5, hertz=0.6, magnet="attached"),
     "magnet from the start": Kind(turning=1.5, shaking=1.5, hertz=0.6, magnet="from the start"),
+    "violent carrying": Kind(
+        wobble=0.08,
+        shaking=20.0,
+        hertz=1.5,
+        late=0.015,
+        rest=15.0,
+        lifted=True,
+        iron=(0.7, 1.4),
+    ),
+    "turning, lifted": Kind(
+        turning=3.0,
+        shaking=4.0,
+        hertz=0.8,
+        pauses=True,
+        late=0.015,
+        rest=15.0,
+        lifted=True,
+        iron=(0.7, 1.4),
+    ),
+    "walking": Kind(wobble=0.08, shaking=1.5, hertz=0.9, iron=(6.0, 12.0), walk=1.0),
 }
 
 
@@ -111,7 +147,9 @@ def simulated(
     kind, rng = KINDS[name], np.random.default_rng([seed, *name.encode()])
     time = np.arange(0.0, duration, 1.0 / rate)
     truth, place = _motion(kind, rng, time)
-    world = EARTH_WORLD + _building(rng, place, share)
+    world = EARTH_WORLD + _building(rng, place, share, kind.iron)
+    if kind.lifted:
+        world += _table(rng, place)
     body = np.tile(2e-6 * share * rng.normal(size=3), (len(time), 1))
     if kind.magnet == "near":
         world += _magnet_near(rng, place)
@@ -120,7 +158,7 @@ def simulated(
         body[time >= begun] += _some_way(rng) * rng.uniform(5e-6, 30e-6)
     site = site_as_declared()
     imu = _inertial(rng, time, truth, place, share)
-    wave = _field(rng, time, truth, world, body, share)
+    wave = _field(rng, time, truth, world, body, share, kind.late)
     poses = Trajectory(time, truth.as_matrix(), place)
     return Log(f"{name} x{share:g} {seed}", 0, "simulated", imu, wave, truth=poses), site
 
@@ -141,7 +179,7 @@ def _wave(rng: np.random.Generator, time: Array, hertz: float) -> Array:
 
 def _activity(kind: Kind, rng: np.random.Generator, time: Array) -> Array:
     """Return how much of the motion takes place: 0 at rest, 1 in motion, shape (n, 1)."""
-    edges, now = [REST], REST
+    edges, now = [kind.rest], kind.rest
     while kind.pauses and now < time[-1]:
         moves, rests = rng.uniform(6.0, 12.0), rng.uniform(3.0, 6.0)
         edges += [now + moves, now + moves + rests]
@@ -172,6 +210,11 @@ def _motion(kind: Kind, rng: np.random.Generator, time: Array) -> tuple[Rotation
     arm = rng.uniform(0.4, 0.8) * _some_way(rng)
     truth = Rotation.from_rotvec(np.cross(arm, carried) / (arm @ arm)) * truth
     place = carried + truth.apply(lever)
+    if kind.lifted:
+        up = np.clip((time - kind.rest + 2.0) / 2.0, 0.0, 1.0)
+        place[:, 2] += LIFTED * up**3 * (10.0 - 15.0 * up + 6.0 * up**2)
+    if kind.walk > 0.0:
+        place[:, :2] += np.cumsum(kind.walk * _wave(rng, time, 0.1) * active, axis=0)[:, :2] * step
     return truth, np.asarray(place - place[0])
 
 
@@ -182,10 +225,12 @@ def _dipole(offset: Array, moment: Array) -> Array:
     return np.asarray(1e-7 * (3.0 * along[:, None] * offset / far**5 - moment / far**3))
 
 
-def _building(rng: np.random.Generator, place: Array, share: float) -> Array:
+def _building(
+    rng: np.random.Generator, place: Array, share: float, away: tuple[float, float]
+) -> Array:
     """Return what iron far off adds: much the same everywhere, a little more here than there."""
     added, strength = np.zeros_like(place), np.exp(rng.uniform(np.log(1.5e-7), np.log(8e-7)))
-    for far in rng.uniform(1.2, 3.0, size=4):
+    for far in rng.uniform(*away, size=4):
         moment = _some_way(rng) * strength * far**3 / 1e-7
         added += _dipole(place - far * _some_way(rng), moment)
     usual = np.mean(added, axis=0)
@@ -202,6 +247,13 @@ def _magnet_near(rng: np.random.Generator, place: Array) -> Array:
         centre = 2.0 * away - centre
     found = _dipole(place - centre, _some_way(rng))
     return np.asarray(found * rng.uniform(1e-5, 4e-5) / np.max(np.linalg.norm(found, axis=1)))
+
+
+def _table(rng: np.random.Generator, place: Array) -> Array:
+    """Return what iron in a table adds: microteslas on it, little above it."""
+    below = np.array([*rng.uniform(-0.15, 0.15, size=2), -rng.uniform(0.15, 0.35)])
+    found = _dipole(place - below, _some_way(rng))
+    return np.asarray(found * rng.uniform(1e-6, 3e-6) / np.linalg.norm(found[0]))
 
 
 def _inertial(
@@ -225,11 +277,17 @@ def _inertial(
 
 
 def _field(
-    rng: np.random.Generator, time: Array, truth: Rotation, world: Array, body: Array, share: float
+    rng: np.random.Generator,
+    time: Array,
+    truth: Rotation,
+    world: Array,
+    body: Array,
+    share: float,
+    latest: float,
 ) -> Waveform:
     matrix = np.eye(3) + 0.02 * share * rng.normal(size=(3, 3))
     field = truth.inv().apply(world) @ matrix.T + body
-    late = rng.uniform(0.0, 0.005)  # s
+    late = rng.uniform(0.0, latest)
     field = np.stack([np.interp(time - late, time, c) for c in field.T], axis=1)
     field += 4e-7 * rng.normal(size=field.shape)
     shown = np.arange(len(time))

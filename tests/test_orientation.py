@@ -1,5 +1,6 @@
 """Orientation without beacons, against a truth that knows nothing of the estimator."""
 
+import copy
 import io
 import json
 from dataclasses import replace
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.estimation.orientation.filter import OrientationFilter, Row, updated
-from magfusion.estimation.orientation.layout import ACCEL_BIAS, SIZE, SPEED
+from magfusion.estimation.orientation.layout import ACCEL_BIAS, NEAR, SIZE, SPEED
 from magfusion.estimation.orientation.remarks import remarks
 from magfusion.estimation.orientation.smoother import oriented, pieces
 from magfusion.files.log import write_log
@@ -77,13 +78,14 @@ def test_the_prediction_of_a_stretch_has_its_derivative(attached):
     for stretch in cut[:150]:
         estimator.take(stretch)
     state, matrix = estimator.state, estimator.measured_from_body
+    learnt = copy.deepcopy(estimator)  # the speed, with which the field becomes another
     update = estimator.take(cut[150])
-    other = OrientationFilter(site)
     for k in (0, 1, 2, 4, 6, 7, 9, 11, 12, 15, 20, 21, 23, 25, 30, 36, 39):
         ends = []
         for sign in (1.0, -1.0):
             step = np.zeros(SIZE)
             step[k] = sign * 1e-5
+            other = copy.deepcopy(learnt)
             other.state = state.moved(step, matrix)
             ends.append(update.predicted.step_to(other.take(cut[150]).predicted, matrix))
         off = (ends[0] - ends[1]) / 2e-5 - update.transition[:, k]
@@ -175,6 +177,21 @@ def test_what_swings_with_an_arm_is_not_taken_for_a_bias():
     assert tilt < 0.5
     assert heading < 1.5
     assert np.max(np.abs(found.states[-1].accel_bias)) < 0.1  # m/s^2; as declared, it is 0.005
+
+
+@pytest.mark.parametrize("kind", ["slow carrying", "violent carrying"])
+def test_the_field_becomes_another_on_half_a_metre_of_way(kind):
+    """What is swung past iron at a slower pace would tell an offset, and with it a heading."""
+    log, site = worlds.simulated(kind, 0, duration=25.0, rate=50.0)
+    estimator = OrientationFilter(site)
+    last = [estimator.take(stretch) for stretch in pieces(log, site)][-2]
+    assert not last.stretch.rests
+    length = last.state.time - last.stretch.begin
+    after = -length / np.log(last.transition[NEAR, NEAR][0, 0])
+    late = log.truth.time > 20.0
+    speed = np.gradient(log.truth.position_world[late], log.truth.time[late], axis=0)
+    way = after * np.sqrt(np.mean(np.sum(speed**2, axis=1)))
+    assert 0.25 < way < 1.0
 
 
 def test_a_share_of_a_measurement_moves_a_parameter_less_and_leaves_it_uncertain(smoothed):

@@ -37,6 +37,7 @@ from magfusion.units import Array
 GYRO_SCALE = 0.003  # usual error of a gyroscope's scale and axes
 AMBIENT = 0.02  # of the field's size: usual disturbance of each component, indoors
 SETTLED, MOVED = 10.0, 2.0  # s; over which it changes, at rest and in motion
+WAY = 0.5  # m; on which it becomes another, however soon that is
 MEMORY = 5.0  # s; over which its size is learnt, and that of the speed
 NOISE_MEMORY, NOISE_FACTOR = 10.0, 20.0  # s; samples of the field are not independent
 SYNCHRONY = 0.003  # s; to which samples of field and rate belong together
@@ -212,7 +213,8 @@ class OrientationFilter:
         imu, length = self.site.platform.imu, float(np.sum(stretch.steps))
         begin, whole = state.world_from_body, turn.attitude[-1]
         gained = begin @ turn.push - np.array([0.0, 0.0, self.site.gravity]) * length
-        kept = float(np.exp(-length / (SETTLED if stretch.rests else MOVED)))
+        moved = min(MOVED, WAY / float(np.sqrt(3.0 * self._speed)))
+        kept = float(np.exp(-length / (SETTLED if stretch.rests else moved)))
         transition = np.eye(SIZE)
         transition[TURN, GYRO_BIAS] = begin @ turn.by_bias
         transition[TURN, GYRO_MATRIX] = begin @ turn.by_matrix
