@@ -225,6 +225,7 @@ def _solved(
         standing = standing | stood
         segments = found.estimate.segments
         if tuning and (wave is not None or not by_waveform):
+            give_back_memory()
             latest = noise_of(log, graph, found.estimate, states, wave, declared)
             tuning = done < TUNINGS and plausible(latest) and not same_noise(tuned, latest)
             tuned, settled = latest if plausible(latest) else as_declared(latest), False

@@ -159,9 +159,17 @@ def field_piece(
     if considered:
         by_other = factors.rows(states, calibration, considered).by_calibration
         if by_other is not None:
-            right[..., 1:] = -by_other @ spread
+            right[..., 1:] = -_spread_over(by_other, spread)
     by_state, by_calibration = jacobian[..., :MOTION], jacobian[..., MOTION:]
     return Piece(factors.measurement.epoch, by_state, by_calibration, right)
+
+
+def _spread_over(by_other: Array, spread: Array) -> Array:
+    """Return the columns that a spread makes of those of parameters; most spreads are diagonal."""
+    if not spread.size or np.any(np.count_nonzero(spread, axis=0) > 1):
+        return np.asarray(by_other @ spread)
+    at = np.argmax(np.abs(spread), axis=0)
+    return np.asarray(by_other[..., at] * spread[at, np.arange(len(at))])
 
 
 def _size(piece: Piece) -> int:

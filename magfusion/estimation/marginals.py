@@ -128,6 +128,7 @@ def _of_chain(graph: Graph, estimate: Estimate, considered: tuple[Block, ...]) -
         responses.append(found.border[0, :, 1:])
         solved = found._replace(states=added[None]) if solved is None else solved
         del response, found
+        give_back_memory()
     assert solved is not None
     return _Marginals(solved.cov[0], added, solved.border_cov[0], np.concatenate(responses, axis=1))
 

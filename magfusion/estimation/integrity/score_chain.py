@@ -10,6 +10,7 @@ from magfusion.estimation.chain_system import column_groups, system_beside
 from magfusion.estimation.integrity.held_columns import InertialColumns
 from magfusion.estimation.native_rows import Columns, NativeRows
 from magfusion.estimation.solve.chain import solve_chain
+from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.estimation.state import MOTION
 from magfusion.model.parameters import Block, dimension, placed, prior_sigma
 from magfusion.units import Array
@@ -88,6 +89,7 @@ def score_of_chain(
         by_state.append(found.states[0, ..., 1:].copy())
         by_calibration.append(found.border[0, :, 1:])
         del normal, fields, found  # before the next group: of a long log they are much
+        give_back_memory()
     responses = Responses(np.concatenate(by_state, axis=2), np.concatenate(by_calibration, axis=1))
     finite = [np.all(np.isfinite(part)) for part in (information, *responses)]
     return Scored(information, -left[1:, 0], responses) if all(finite) else None

@@ -12,6 +12,7 @@ from magfusion.estimation.integrity.separation import Separation
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.solve.chain import ChainSolution, solve_chain
+from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.units import Array, BoolArray
 
 # A prior that keeps what is open finite: far wider than anything that is of use.
@@ -51,6 +52,7 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
                 count += len(piece.epoch)
         solved = _without_each(rest, rows, kept, solved)
         del rest, rows  # before the next group: of a long log they are much
+        give_back_memory()
     cost = kept @ square - np.array([one.explained for one in solved])
     numbers = np.array([6 * np.sum(heard & (owner == j)) * count for j in every])
     others = np.array([np.any(heard & (owner != j)) for j in every])
