@@ -8,11 +8,16 @@ from mistake_case import Case, Change, Mistake, again, beacon_waveform, of_wavef
 from scipy.spatial.transform import Rotation
 
 from magfusion.model.site import Beacon
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD
 from magfusion.simulation.disturbance import Ambient, FieldDrift, Spheres
+from magfusion.simulation.rails import laid, rails_option
 from magfusion.simulation.waveform import Mains
 from magfusion.units import Array
 
 _PLACES = np.array([[1.9, 0.2, 0.9], [4.4, 4.6, 1.1], [0.3, 3.0, 1.2], [5.6, 2.2, 0.8]])  # m
+
+_TRACK = "0.05:-3,0.6,0.3:12,0.6,0.3;0.05:-3,0.6,1.8:12,0.6,1.8"
+_CASING = "0.1/0.008:3,4.3,-4:3,4.3,4"
 
 
 def _iron(radius: float) -> Change:
@@ -20,6 +25,18 @@ def _iron(radius: float) -> Change:
     count = len(_PLACES)
     spheres = Spheres(_PLACES, np.full(count, radius), np.full(count, 100.0), np.full(count, 5e6))
     return lambda case: again(case, ambient=Ambient(spheres=spheres))
+
+
+def _rails(text: str) -> Change:
+    """Return bars and tubes of steel, as `magfusion simulate --rails` takes them."""
+
+    def changed(case: Case) -> Case:
+        beacons_world = np.array([beacon.position_world for beacon in case.site.beacons])
+        return again(
+            case, ambient=Ambient(rails=laid(rails_option(text), DEMO_BOX_WORLD, beacons_world))
+        )
+
+    return changed
 
 
 def _false(name: str, gain: Callable[[Array], Array]) -> Change:
@@ -95,6 +112,8 @@ _LINE = ("undeclared_line", "mains")
 MISTAKES = (
     Mistake("iron_4pct", "world", _iron(0.3), ("iron", "field_residuals")),
     Mistake("iron_10pct", "world", _iron(0.4), ("iron", "field_residuals")),
+    Mistake("rails", "world", _rails(_TRACK), ("iron", "field_residuals")),
+    Mistake("casing_beside", "world", _rails(_CASING), ("iron", "field_residuals")),
     Mistake("false_1pct_15s", "world", _false("B", _during(0.01)), _FAULT),
     Mistake("false_5pct_15s", "world", _false("B", _during(0.05)), _FAULT),
     Mistake("false_20pct_15s", "world", _false("B", _during(0.2)), _FAULT),

@@ -14,6 +14,7 @@ from magfusion.results.figures import Figure, Figures, Section, heading
 if TYPE_CHECKING:
     from magfusion.model.site import Site
     from magfusion.simulation.log import Reference, SimulationConfig
+    from magfusion.simulation.pipe import Steel
     from magfusion.units import Array
 
 
@@ -82,6 +83,11 @@ class SimulateSettings(ShaftSettings):
         None,
         "Layers of ground under air, height:S/m from above, e.g. 0:0.01,-20:0.05",
         note="default: the site's conductivity_s_m without end; needs empymod",
+    )
+    rails: str | None = option(
+        None,
+        "Steel bars and tubes, radius[/wall]:x,y,z:x,y,z in m, separated by semicolons",
+        note="e.g. 0.05:-5,3,0:20,3,0 for a rail, 0.1/0.008:3,4,-4:3,4,4 for a casing",
     )
 
 
@@ -157,12 +163,13 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
         site = load_site(settings.site, several=True)
     _refuse_wells(settings, site)
     box = box_option(settings.box)
+    box = DEMO_BOX_WORLD if box is None else box
     reference = reference_option(settings.reference)
     if reference is not None:
         site = replace(site, reference_world=reference.position_world)
     rate_hz = settings.rate or usual_rate_hz(site, settings.burst)
     config = SimulationConfig(
-        box_world=DEMO_BOX_WORLD if box is None else box,
+        box_world=box,
         duration=settings.duration,
         motion=settings.motion,
         imu_rate_hz=settings.imu_rate,
@@ -177,6 +184,7 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
             day_night=office_noise(EPOCH_NS) if settings.ambient == "day-night" else None,
             drift=FieldDrift(settings.drift, DRIFT_TIME) if settings.drift else None,
             layers=None if settings.ground is None else layers_option(settings.ground),
+            rails=_rails(settings.rails, box, site),
             atmosphere=Atmosphere(settings.storms, settings.seed, settings.duration, 0.5 * rate_hz)
             if settings.storms
             else None,
@@ -185,12 +193,34 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
     return run_simulate(site, config, output, settings.seed)
 
 
+def _rails(text: str | None, box_world: Array, site: Site) -> Steel | None:
+    """Return the steel that is asked for, laid about a room (m, shape (2, 3)) and its beacons."""
+    import numpy as np
+
+    from magfusion.simulation.rails import laid, rails_option
+
+    if text is None:
+        return None
+    beacons_world = np.array([beacon.position_world for beacon in site.beacons]).reshape(-1, 3)
+    return laid(rails_option(text), box_world, beacons_world)
+
+
 def _passes(settings: SimulateSettings, site: Site, output: Path) -> Figures:
     """Simulate passes of a magnet in a well, where nothing else is asked for."""
     from magfusion.simulation.layers import layers_option
 
     usual = SimulateSettings(seed=settings.seed)
-    without = ("motion", "box", "iron", "ambient", "drift", "storms", "reference", "random_field")
+    without = (
+        "motion",
+        "box",
+        "iron",
+        "ambient",
+        "drift",
+        "storms",
+        "reference",
+        "random_field",
+        "rails",
+    )
     for name in without:
         if getattr(settings, name) != getattr(usual, name):
             raise InputError(
@@ -254,6 +284,7 @@ def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) 
         drawn = imu.time_offset + imu.time_offset_sigma * float(rng.standard_normal())
         config = replace(config, time_offset=drawn)
     simulated = simulate_log(site, config, rng)
+    rails = None if config.ambient is None else config.ambient.rails
     figures = (
         heading("simulate", simulated.log.name)
         | trust_figures(Trust())
@@ -263,6 +294,7 @@ def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) 
             Figure("imu_samples", len(simulated.log.imu), label="IMU samples"),
             Figure("time_offset_s", simulated.time_offset, "s", section=Section.REPORT),
             Figure("iron_spheres", config.iron),
+            Figure("rails", 0 if rails is None else len(rails.pipes)),
             Figure("random_field", config.random_field, section=Section.REPORT),
         )
     )

@@ -9,6 +9,7 @@ from magfusion.errors import InputError
 from magfusion.model.physics.disturbance import induced_field, sphere_polarizability
 from magfusion.simulation.atmosphere import Atmosphere
 from magfusion.simulation.layers import Layers
+from magfusion.simulation.pipe import Steel
 from magfusion.units import AnyArray, Array, ComplexArray
 
 DAY = 86_400.0  # s
@@ -280,6 +281,7 @@ class Ambient:
     drift: FieldDrift | None = None
     layers: Layers | None = None
     atmosphere: Atmosphere | None = None
+    rails: Steel | None = None
 
     def background_world(self, time: Array, rate_hz: float, rng: np.random.Generator) -> Array:
         """Return noise and drift at the samples of an instrument.

@@ -10,6 +10,8 @@ from magfusion.model.site import Beacon, Coil, Site
 from magfusion.simulation.disturbance import Spheres
 from magfusion.simulation.ground import ground_effect
 from magfusion.simulation.layers import Layers, layered_effect
+from magfusion.simulation.pipe import Steel
+from magfusion.simulation.rails import secondary_world
 from magfusion.simulation.rotor_beacons import Turning
 from magfusion.units import AnyArray, Array, ComplexArray
 
@@ -77,15 +79,20 @@ def phasors_world(
     point_world: Array,
     spheres: Spheres | None = None,
     layers: Layers | None = None,
+    rails: Steel | None = None,
 ) -> ComplexArray:
     """Return the phasor of each tone without phase or drift of the drive, (n, tones, 3) (T).
 
-    With what the spheres, if any, add to it; layers take the place of the beacon's full space.
+    With what the spheres and the rails, if any, add to it, each as if the other were not there;
+    layers take the place of the beacon's full space.
     """
     phasors = _primary_world(beacon, point_world, layers)
     if spheres is not None:
         at_spheres = _primary_world(beacon, spheres.position_world, layers)
         phasors += spheres.secondary_world(at_spheres, beacon.tone_frequencies_hz, point_world)
+    if rails is not None:
+        at_rails = _primary_world(beacon, rails.points_world(), layers)
+        phasors += secondary_world(rails, at_rails, beacon.tone_frequencies_hz, point_world)
     return phasors
 
 

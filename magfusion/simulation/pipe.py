@@ -167,7 +167,7 @@ class Steel:
         point_world : ndarray, shape (3,)
             Of the sensor (m).
         """
-        moment = self._moments(at_segments_world, frequency_hz)
+        moment = self.moments(at_segments_world, frequency_hz)
         field_world = at_point_world.astype(np.complex128)
         for k, (pipe, rows) in enumerate(zip(self.pipes, self._rows(), strict=True)):
             if k == self.about:
@@ -175,7 +175,7 @@ class Steel:
                 ring = _ring_field(pipe, float((point_world - pipe.start_world) @ axis))
                 field_world += (ring @ (moment[rows] @ axis))[:, None] * axis
             else:
-                tensor = _dipole_tensor(point_world - pipe.centres_world())
+                tensor = dipole_tensor(point_world - pipe.centres_world())
                 field_world += np.einsum("nab,nkb->ka", tensor, moment[rows])
         if self.about is None:
             return field_world
@@ -185,12 +185,18 @@ class Steel:
         ends = np.cumsum([0, *(len(pipe.centres_world()) for pipe in self.pipes)]).tolist()
         return [slice(a, b) for a, b in pairwise(ends)]
 
-    def _moments(self, field_world: AnyArray, frequency_hz: float) -> ComplexArray:
-        """Return the moment of each segment, shape (n, k, 3) (A m^2)."""
+    def moments(self, field_world: AnyArray, frequency_hz: float) -> ComplexArray:
+        """Return the moment of each segment, shape (n, k, 3) (A m^2).
+
+        Parameters
+        ----------
+        field_world : ndarray, shape (n, k, 3)
+            Of k sources without steel at `points_world` (T).
+        """
         points, rows = self.points_world(), self._rows()
         n = len(points)
         with np.errstate(divide="ignore", invalid="ignore"):
-            tensor = _dipole_tensor(points[:, None] - points)
+            tensor = dipole_tensor(points[:, None] - points)
         answer = np.zeros((n, 3, 3), dtype=np.complex128)
         for pipe, own in zip(self.pipes, rows, strict=True):
             through, axis, span = pipe.through(frequency_hz), pipe.axis_world, pipe.span
@@ -208,7 +214,7 @@ class Steel:
         return np.asarray(np.swapaxes(found.reshape(n, 3, -1), 1, 2))
 
 
-def _dipole_tensor(offset: Array) -> Array:
+def dipole_tensor(offset: Array) -> Array:
     """Return the field of a dipole over its moment, shape (..., 3, 3) (T / A m^2)."""
     distance = np.linalg.norm(offset, axis=-1)[..., None, None]
     outer = offset[..., :, None] * offset[..., None, :]

@@ -14,6 +14,7 @@ from magfusion.simulation.disturbance import Ambient
 from magfusion.simulation.field import Drives, phasors_world
 from magfusion.simulation.magnetometers import answered
 from magfusion.simulation.motion import Motion
+from magfusion.simulation.rails import magnetised_world
 from magfusion.simulation.slots import Multiplexer, check_slots, slot_gates
 from magfusion.units import Array, ComplexArray
 
@@ -118,6 +119,8 @@ def simulate_waveform(
     field_world = np.zeros((count, 3)) if magnetometer.response else beacons_world(*here)
     if site.earth_field_world is not None:
         field_world += site.earth_field_world
+        if ambient is not None and ambient.rails is not None:
+            field_world += magnetised_world(ambient.rails, site.earth_field_world, point_world)
     if mains is not None:
         field_world += _mains_world(mains, time, rng)
     if ambient is not None:
@@ -185,7 +188,7 @@ def _tones_world(
     """Yield frequency and field of each tone (n, 3), of which the real part is there (Hz, T)."""
     first = 0
     for i, (beacon, drift) in enumerate(zip(site.beacons, drives.drift, strict=True)):
-        phasors = phasors_world(beacon, point_world, ambient.spheres, ambient.layers)
+        phasors = phasors_world(beacon, point_world, ambient.spheres, ambient.layers, ambient.rails)
         if ambient.bending is not None:
             phasors = ambient.bending.bent_world(i, phasors, point_world)
         own = drives.turning.get(beacon.name)

@@ -1,0 +1,149 @@
+"""Rails and pipes of steel in the room: straight bars and tubes, each answering the others.
+
+They are those of `magfusion.simulation.pipe`, with segments short enough for where the platform
+moves and the beacons stand.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.simulation.pipe import Pipe, Steel, dipole_tensor
+from magfusion.units import Array, ComplexArray
+
+FINE = 0.5  # of the distance to the platform and to beacons: length of a segment
+LONGEST = 0.3  # m; of a segment
+FEWEST = 40  # segments of a bar, whose poles are near its ends
+NEAREST = 0.1  # m; from the surface of steel to where the body moves, and to every beacon
+MOST_SEGMENTS = 1500
+TOGETHER = 2_000_000  # components of tensors at once
+
+USAGE = (
+    "write radius:x,y,z:x,y,z of each in m, separated by semicolons; of a tube radius/wall,"
+    " e.g. 0.05:-5,1,0:20,1,0 or 0.1/0.008:3,3,-4:3,3,4"
+)
+
+
+def rails_option(text: str) -> tuple[Pipe, ...]:
+    """Read ``radius[/wall]:x,y,z:x,y,z`` of each (m), separated by semicolons.
+
+    Raises
+    ------
+    InputError
+    """
+    return tuple(_pipe(part.strip(), text) for part in text.split(";"))
+
+
+def _pipe(part: str, text: str) -> Pipe:
+    try:
+        size, start, end = part.split(":")
+        radius, *rest = (float(number) for number in size.split("/"))
+        wall = rest[0] if rest else radius
+        ends = np.array([[float(x) for x in point.split(",")] for point in (start, end)])
+        ends = ends.reshape(2, 3)
+    except ValueError:
+        raise InputError(f"--rails {text!r}: {part!r} is no bar or tube; {USAGE}") from None
+    if not (np.all(np.isfinite(ends)) and 0.0 < wall <= radius < 10.0 and len(rest) < 2):
+        raise InputError(
+            f"--rails {text!r}: {part!r} needs ends in m, and 0 < wall <= radius < 10 m; {USAGE}"
+        )
+    if not np.linalg.norm(ends[1] - ends[0]) > 2.0 * radius:
+        raise InputError(f"--rails {text!r}: {part!r} is not longer than it is thick; {USAGE}")
+    return Pipe(ends[0], ends[1], radius, wall)
+
+
+def laid(pipes: tuple[Pipe, ...], box_world: Array, beacons_world: Array) -> Steel:
+    """Return steel about a room, in segments that are short against every distance to it.
+
+    Parameters
+    ----------
+    box_world : ndarray, shape (2, 3)
+        Lower and upper corner (m) of where the body moves.
+    beacons_world : ndarray, shape (beacons, 3)
+        (m)
+
+    Raises
+    ------
+    InputError
+        If steel comes nearer than `NEAREST` to the box or to a beacon, or crosses itself.
+    """
+    whole = []
+    for number, pipe in enumerate(pipes, 1):
+        along = np.linspace(pipe.start_world, pipe.end_world, 2000)
+        to_box = np.linalg.norm(along - np.clip(along, *box_world), axis=1)
+        to_beacon = np.linalg.norm(along[:, None] - beacons_world, axis=2)
+        away = min(float(np.min(to_box)), float(np.min(to_beacon, initial=np.inf))) - pipe.radius
+        if away < NEAREST:
+            raise InputError(
+                f"--rails: number {number} comes within {max(away, 0.0):.2g} m of where the"
+                f" platform moves (--box) or of a beacon; keep {NEAREST:g} m"
+            )
+        segment = min(max(FINE * away, 0.05), LONGEST, pipe.length / FEWEST)
+        whole.append(replace(pipe, segment=segment))
+    steel = Steel(tuple(whole))
+    count = len(steel.points_world())
+    if count > MOST_SEGMENTS:
+        raise InputError(
+            f"--rails: {count} segments are too many (at most {MOST_SEGMENTS}); lay shorter ones,"
+            " or farther from where the platform moves"
+        )
+    _check_apart(whole)
+    return steel
+
+
+def _check_apart(pipes: list[Pipe]) -> None:
+    for first, pipe in enumerate(pipes):
+        for second in range(first):
+            other = pipes[second]
+            own, others = (np.linspace(p.start_world, p.end_world, 400) for p in (pipe, other))
+            away = float(np.min(np.linalg.norm(own[:, None] - others, axis=2)))
+            if away < pipe.radius + other.radius + 0.5 * min(pipe.segment, other.segment):
+                raise InputError(
+                    f"--rails: numbers {second + 1} and {first + 1} come within {away:.2g} m of"
+                    " each other; what touches is one piece: leave one out, or lay them farther"
+                    " apart"
+                )
+
+
+def secondary_world(
+    steel: Steel, at_segments_world: ComplexArray, frequencies_hz: Array, point_world: Array
+) -> ComplexArray:
+    """Return the phasors that steel adds at points.
+
+    Parameters
+    ----------
+    at_segments_world : complex ndarray, shape (segments, tones, 3)
+        Without steel at `Steel.points_world` (T).
+    frequencies_hz : ndarray, shape (tones,)
+    point_world : ndarray, shape (n, 3)
+        (m)
+
+    Returns
+    -------
+    complex ndarray, shape (n, tones, 3)
+        (T)
+    """
+    moments = np.stack(
+        [
+            steel.moments(at_segments_world[:, [k]], float(frequency_hz))[:, 0]
+            for k, frequency_hz in enumerate(frequencies_hz)
+        ],
+        axis=1,
+    )
+    flat = np.swapaxes(moments, 1, 2).reshape(-1, len(frequencies_hz))  # (segments 3, tones)
+    out = np.empty((len(point_world), len(frequencies_hz), 3), dtype=np.complex128)
+    centres, rows = steel.points_world(), max(TOGETHER // (9 * len(moments)), 1)
+    for first in range(0, len(point_world), rows):
+        part = slice(first, first + rows)
+        tensor = dipole_tensor(point_world[part][:, None] - centres)
+        by_moment = np.swapaxes(tensor, 1, 2).reshape(-1, len(flat))
+        found = (by_moment @ flat.real + 1j * (by_moment @ flat.imag)).reshape(-1, 3, flat.shape[1])
+        out[part] = np.swapaxes(found, 1, 2)
+    return out
+
+
+def magnetised_world(steel: Steel, earth_field_world: Array, point_world: Array) -> Array:
+    """Return what the Earth's field (T), which magnetises steel, adds at points (n, 3) (T)."""
+    even = np.broadcast_to(earth_field_world, (len(steel.points_world()), 1, 3))
+    return np.real(secondary_world(steel, even.astype(complex), np.zeros(1), point_world)[:, 0])
