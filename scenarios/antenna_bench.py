@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from harness import conclude, rms, scenario_parser
 from scipy.spatial.transform import Rotation
-from tracker_live import CURRENT, FORMERS, LAYERS, ROWS, WIRE, loop_field
+from tracker_coils import CURRENT, FORMERS, LAYERS, ROWS, WIRE, loop_field
 
 from magfusion.files.plain_table import POSITION, QUATERNION
 from magfusion.jobs.calibrate_antenna import AntennaSettings, run_calibrate_antenna
@@ -42,7 +42,7 @@ class Config:
     Parameters
     ----------
     size : float
-        Of the formers of the windings, by those of `tracker_live`.
+        Of the formers of the windings, by those of `tracker_coils`.
     gain, tilt_deg, centre
         Of each coil of both antennas (relative, deg about each of two axes, m).
     receiver_radius : float

@@ -1,8 +1,8 @@
 """A tracker whose coils a host drives one after the other, with pauses as they happen.
 
-The world of `tracker_live`: turns of windings by elliptic integrals, a drive that drifts, steps of
-a 16-bit converter, mains, and a head that turns at 100 deg/s.  A host switches the coils: bursts of
-1.6 to 2.4 ms, pauses of 0.2 to 1.3 ms, and now and then 10 to 60 ms in which it was busy.  The
+The world of `tracker_samples`: turns of windings by elliptic integrals, a drive that drifts, steps
+of a 16-bit converter, mains, and a head that turns at 100 deg/s.  A host switches the coils: bursts
+of 1.6 to 2.4 ms, pauses of 0.2 to 1.3 ms, and now and then 10 to 60 ms in which it was busy.  The
 current takes 0.05 ms to rise and to fall, and 0.2 ms of it are marked as nothing.  Told are
 
 1. how far `magfusion fix` and `smooth` are from the truth while the head turns, with a slot beside
@@ -23,9 +23,11 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
-import tracker_live as live
 from harness import conclude, rms, scenario_parser
 from scipy.spatial.transform import Rotation
+from tracker_head import TURNING, Config, Head
+from tracker_pipe import piped
+from tracker_samples import PIECE, sample_times, site_text, waveform
 
 from magfusion.files.log import write_log
 from magfusion.files.trajectory_table import read_trajectory
@@ -100,15 +102,15 @@ def bursts(duration: float, silences: bool, rng: np.random.Generator) -> Bursts:
 class Recording:
     """What was recorded of a head."""
 
-    config: live.Config
-    head: live.Head
+    config: Config
+    head: Head
     wave: tuple[Array, Array]
     imu: tuple[Array, Array, Array]
     bursts: Bursts | None
 
     def site_text(self) -> str:
         """Return the site as its owner would write it."""
-        text = live.site_text(self.config)
+        text = site_text(self.config)
         if self.bursts is None:
             return text
         line = next(line for line in text.splitlines() if "slots: {" in line)
@@ -139,7 +141,7 @@ class Recording:
         """Return the streams as the lines of a driver, every hundredth of a second."""
         time, field = self.wave
         beside = None if self.bursts is None else self.bursts.beside(time)
-        edges = live.PIECE * np.arange(round(self.config.duration / live.PIECE) + 1)
+        edges = PIECE * np.arange(round(self.config.duration / PIECE) + 1)
         lines = []
         for begin, end in pairwise((edges - 1e-9).tolist()):
             own = slice(*np.searchsorted(self.imu[0], [begin, end]))
@@ -166,22 +168,22 @@ def _stamps(time: Array) -> IntArray:
     return np.rint(1e9 * time).astype(np.int64)
 
 
-def record(config: live.Config, *, uneven: bool) -> Recording:
+def record(config: Config, *, uneven: bool) -> Recording:
     """Return what is recorded of a head."""
     rng = np.random.default_rng(config.seed + 1)
-    head, own = live.Head(config), None
+    head, own = Head(config), None
     gates = None
     if uneven:
         schedule = np.random.default_rng([config.seed, 7])
         own = bursts(config.duration, config.carrier_hz == 0.0, schedule)
-        gates = own.gates(live.sample_times(config))
-    wave = live.waveform(config, head, rng, gates)
+        gates = own.gates(sample_times(config))
+    wave = waveform(config, head, rng, gates)
     return Recording(config, head, wave, head.imu(config, rng), own)
 
 
-def errors(found: Trajectory, head: live.Head) -> Errors:
+def errors(found: Trajectory, head: Head) -> Errors:
     """Return the errors of poses while the head turns."""
-    kept = found.time >= live.TURNING
+    kept = found.time >= TURNING
     time = found.time[kept]
     place = found.position_world[kept] - head.place(time)
     own = Rotation.from_matrix(found.world_from_body[kept])
@@ -204,7 +206,7 @@ def of_pipe(made: Recording, told: Told) -> Errors:
     with tempfile.TemporaryDirectory() as directory:
         site = Path(directory) / "site.yaml"
         site.write_text(made.site_text())
-        states, _ = live.piped(site, made.records(told))
+        states, _ = piped(site, made.records(told))
     known = [s for s in states if not s["lost"]]
     time = np.array([s["time"] for s in known])
     turn = Rotation.from_quat([s["quaternion"] for s in known], scalar_first=True)
@@ -214,9 +216,9 @@ def of_pipe(made: Recording, told: Told) -> Errors:
 
 def main() -> None:
     """Print the table and one JSON line."""
-    parser = scenario_parser(__doc__, live.Config.seed, quick="without smooth", output=None)
+    parser = scenario_parser(__doc__, Config.seed, quick="without smooth", output=None)
     given = parser.parse_args()
-    config = live.Config(seed=given.seed, duration=LENGTH)
+    config = Config(seed=given.seed, duration=LENGTH)
     pulsed = replace(config, carrier_hz=0.0)
     worlds = {
         "slots by a clock": (record(config, uneven=False), ("marks",)),
@@ -233,7 +235,7 @@ def main() -> None:
             found[f"{label}, pipe"] = of_pipe(made, told)
     lines = [f"{'turning at 100 deg/s':<34}{'mm':>8}{'deg':>8}{'a second':>10}"]
     for label, one in found.items():
-        rate = one.count / (LENGTH - live.TURNING)
+        rate = one.count / (LENGTH - TURNING)
         lines.append(f"{label:<34}{one.mm:8.3f}{one.deg:8.3f}{rate:10.1f}")
     conclude("\n".join(lines), found)
 

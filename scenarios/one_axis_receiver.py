@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from harness import conclude, rms, scenario_parser
 from scipy.spatial.transform import Rotation
-from tracker_live import loop_field
+from tracker_coils import loop_field
 
 from magfusion.jobs.fix import run_fix
 from magfusion.jobs.inputs import Job

@@ -10,7 +10,7 @@ from antenna_bench import KINDS, Config, Table, holds, run_seed, write_csv
 from conftest import Refuse
 from scipy.spatial.transform import Rotation
 from test_antenna_job import make_survey, nominal
-from tracker_live import loop_field
+from tracker_coils import loop_field
 from tracker_site import body_poses, tracker_site
 
 from magfusion.files.plain_table import ANGLES, POSITION

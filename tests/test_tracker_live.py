@@ -2,11 +2,12 @@
 
 import pytest
 import tracker_live as live
+from tracker_head import RESTING, TURNING, Config
 
 
 @pytest.mark.slow
 def test_a_wound_tracker_is_followed_through_the_pipe() -> None:
-    found = live.run(live.Config(duration=live.TURNING + 2.0, seed=1))
+    found = live.run(Config(duration=TURNING + 2.0, seed=1))
     assert found.states_per_s > 118.0
     assert found.rest_mm < 1.0
     assert found.rest_deg < 0.15
@@ -19,7 +20,7 @@ def test_a_wound_tracker_is_followed_through_the_pipe() -> None:
 
 @pytest.mark.slow
 def test_a_plate_that_is_moved_beside_the_head_is_said_and_the_sigmas_hold() -> None:
-    found = live.run_beside_plate(live.Config(duration=live.PLATE_RUN, plate=True, seed=2))
+    found = live.run_beside_plate(Config(duration=live.PLATE_RUN, plate=True, seed=2))
     assert found.largest_share > 0.03
     assert found.wrongly_said == 0
     assert found.said_after_s < 1.0
@@ -31,7 +32,7 @@ def test_a_plate_that_is_moved_beside_the_head_is_said_and_the_sigmas_hold() -> 
 
 @pytest.mark.slow
 def test_the_side_of_the_source_is_found_by_motion_or_said_to_be_ambiguous() -> None:
-    found = live.run_without_hemisphere(live.Config(duration=live.RESTING + 2.5, seed=1))
+    found = live.run_without_hemisphere(Config(duration=RESTING + 2.5, seed=1))
     assert found.first_s < 5.0
     assert found.wrong == 0.0
     assert found.ambiguous < 1.0
@@ -40,7 +41,7 @@ def test_the_side_of_the_source_is_found_by_motion_or_said_to_be_ambiguous() -> 
 
 @pytest.mark.slow
 def test_a_tracker_without_an_imu_is_followed_through_the_pipe() -> None:
-    config = live.Config(duration=live.TURNING + 2.0, seed=1, inertial=False, rate_hz=60.0)
+    config = Config(duration=TURNING + 2.0, seed=1, inertial=False, rate_hz=60.0)
     found = live.run(config)
     assert found.states_per_s > 59.0
     assert found.rest_mm < 1.0
