@@ -22,7 +22,7 @@ from magfusion.estimation.state import MOTION, State, States, states_in
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Verdict
-from magfusion.receiver.joint import NODES, JointDesign, joint_settings
+from magfusion.receiver.joint import NODES, JointDesign, joint_settings, long_windows
 from magfusion.receiver.windows import default_settings
 
 BOX_WORLD = np.array([[2.0, 2.0, 0.9], [10.0, 6.0, 1.4]])  # m
@@ -70,6 +70,20 @@ def test_only_close_tones_are_told_together() -> None:
     settings = joint_settings(site, None)
     assert settings is not None
     assert settings.window == settings.step < default_settings(site).window
+
+
+def test_why_close_tones_are_not_told_together_is_said() -> None:
+    site = room()
+    two = site.platform.carrying(
+        (site.platform.magnetometer, replace(site.platform.magnetometer, name="second"))
+    )
+    one = replace(site.platform, magnetometer=replace(site.platform.magnetometer, axes="z"))
+    assert long_windows(site, None) == ()
+    for platform, why in ((two, "several magnetometers"), (one, "fewer axes than three")):
+        (finding,) = long_windows(replace(site, platform=platform), None)
+        assert finding.verdict is Verdict.TRUSTWORTHY
+        assert why in finding.text
+        assert long_windows(replace(room(5.0), platform=platform), None) == ()
 
 
 def test_the_directions_of_a_window_are_those_of_its_phasors() -> None:

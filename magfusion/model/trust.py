@@ -70,6 +70,7 @@ CODES = {
     "lever_arm": "the lever arm of the magnetometer is not as declared",
     "log_left_out": "one of several logs has no part in what they refine, as it failed alone",
     "logs_disagree": "a log contradicts the others about the site that they share",
+    "long_windows": "tones are told apart in long windows where short ones could not be used",
     "lost": "nothing explains the fields where the platform is thought to be",
     "low_signal": "beacons are not told from noise",
     "magnetometer_axes": "the magnetometer's axes are left-handed",

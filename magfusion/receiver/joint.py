@@ -14,6 +14,7 @@ import numpy as np
 from magfusion.model.audibility import tones_of
 from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.admission import Grid, Windows, sample_rate_hz
 from magfusion.receiver.design import nuisances_hz
 from magfusion.receiver.lockin_receiver import LEAST_SHARE, LockinReceiver
@@ -38,16 +39,43 @@ def joint_settings(site: Site, asked: LockinSettings | None) -> LockinSettings |
     asked : LockinSettings, optional
         Where windows were asked for nothing else is done.
     """
-    sensor = site.platform.magnetometer
-    alone = len(site.beacons) < 2 or bool(site.platform.further) or bool(sensor.lacking)
-    if asked is not None or alone or has_schedule(site) or not site.platform.inertial:
+    usual = _long(site, asked)
+    if usual is None or bool(site.platform.further) or bool(site.platform.magnetometer.lacking):
+        return None
+    return LockinSettings(SHORT_WINDOW, SHORT_WINDOW, usual.mains_hz, 16)
+
+
+def long_windows(site: Site, asked: LockinSettings | None) -> tuple[Finding, ...]:
+    """Return that close tones are received one by one all the same, and why.
+
+    Parameters
+    ----------
+    asked : LockinSettings, optional
+        As of `joint_settings`.
+    """
+    usual = _long(site, asked)
+    if usual is None or joint_settings(site, asked) is not None:
+        return ()
+    why = "several magnetometers" if site.platform.further else "fewer axes than three"
+    text = (
+        f"Tones of the beacons are so close that windows of {usual.window:.3g} s tell them apart,"
+        f" and with {why} no shorter ones are used: what the platform does within them is known by"
+        " the IMU alone, and states are few. Set the frequencies farther apart"
+        f"{', or navigate by one magnetometer' if site.platform.further else ''}."
+    )
+    return (Finding("long_windows", text, Verdict.TRUSTWORTHY, 0.5),)
+
+
+def _long(site: Site, asked: LockinSettings | None) -> LockinSettings | None:
+    """Return the windows that tell close tones apart; None where the tones are not close."""
+    if asked is not None or len(site.beacons) < 2 or has_schedule(site):
+        return None
+    if not site.platform.inertial:
         return None
     if any(beacon.unknown is not None or not beacon.tones for beacon in site.beacons):
         return None
     usual = default_settings(site)
-    if usual.window <= LONGEST_APART:
-        return None
-    return LockinSettings(SHORT_WINDOW, SHORT_WINDOW, usual.mains_hz, 16)
+    return None if usual.window <= LONGEST_APART else usual
 
 
 @dataclass(frozen=True, eq=False)

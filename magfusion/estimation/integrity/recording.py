@@ -28,6 +28,7 @@ from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Trust, Verdict
+from magfusion.receiver.joint import long_windows
 from magfusion.receiver.windows import LockinSettings
 
 Witness = Callable[[Log, Site | None], Iterable[Finding]]
@@ -90,6 +91,7 @@ def recorded(
             found += iron_on_body(still_means(log, site, IRON_SPAN), site)
     if beacons and site is not None and site.beacons:
         found += [f for f in undeclared_lines(log, site, lockin) if _matters(f)]
+        found += long_windows(site, lockin) if log.waveform is not None else ()
         hearing = heard_in(log, site) if hearing is None else hearing
         if hearing is not None and freed is not None:
             hearing = heard_with_motion(hearing, freed)
