@@ -208,19 +208,10 @@ def _rails(text: str | None, box_world: Array, site: Site) -> Steel | None:
 def _passes(settings: SimulateSettings, site: Site, output: Path) -> Figures:
     """Simulate passes of a magnet in a well, where nothing else is asked for."""
     from magfusion.simulation.layers import layers_option
+    from magfusion.simulation.rails import rails_option
 
     usual = SimulateSettings(seed=settings.seed)
-    without = (
-        "motion",
-        "box",
-        "iron",
-        "ambient",
-        "drift",
-        "storms",
-        "reference",
-        "random_field",
-        "rails",
-    )
+    without = ("motion", "box", "iron", "ambient", "drift", "storms", "reference", "random_field")
     for name in without:
         if getattr(settings, name) != getattr(usual, name):
             raise InputError(
@@ -239,6 +230,7 @@ def _passes(settings: SimulateSettings, site: Site, output: Path) -> Figures:
         rate_hz=settings.rate,
         perturb=settings.perturb,
         layers=None if settings.ground is None else layers_option(settings.ground),
+        beside=() if settings.rails is None else rails_option(settings.rails),
     )
 
 

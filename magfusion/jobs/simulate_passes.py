@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from magfusion.simulation.wells import TwoWells
 
 LEAST_RATE_HZ, SAMPLES_PER_TURN = 50.0, 10.0
+WAY_POINTS = 500  # of a magnet's way, where steel is too near to it
 LEAST_SHARE, MOST_SEGMENT = 0.05, 0.5  # of a segment of steel: of the distance, and in m
 AHEAD = 2.0  # m, at most, of the magnet from where it is abreast, in the middle of its depths
 
@@ -140,6 +141,7 @@ def run_passes(
     sensor = true_site.platform.magnetometer
     rolls = rng.uniform(-np.pi, np.pi, 2)
     passes = wells.passes(rolls, sensor.position_body, rotor.axis_beacon)
+    beside = _laid(beside, passes, wells)
     around = _around(true_site, wells, entry, layers, beside, rng, perturb=perturb)
     log = simulate_passes(true_site, shaft, passes, around, rate_hz, rng, encoder=settings.encoder)
     if site.platform.imu == NO_IMU:
@@ -152,6 +154,19 @@ def run_passes(
         save_site(true_site, directory / "true_site.yaml")
         write_report(directory, figures)
     return figures
+
+
+def _laid(beside: tuple[Pipe, ...], passes: tuple[Pass, ...], wells: TwoWells) -> tuple[Pipe, ...]:
+    """Return steel in segments that are short against how near sensor and magnet come."""
+    import numpy as np
+
+    from magfusion.simulation.rails import beside_wells
+
+    ways_world = [np.stack([one.sensor_world for one in passes])]
+    for one in passes:
+        way = np.linspace(0.0, one.depth[1] - one.depth[0], WAY_POINTS)
+        ways_world.append(one.start_world + way[:, None] * wells.along_world)
+    return beside_wells(beside, ways_world)
 
 
 def _around(

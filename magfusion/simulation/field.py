@@ -11,7 +11,7 @@ from magfusion.simulation.disturbance import Spheres
 from magfusion.simulation.ground import ground_effect
 from magfusion.simulation.layers import Layers, layered_effect
 from magfusion.simulation.pipe import Steel
-from magfusion.simulation.rails import secondary_world
+from magfusion.simulation.rails import layered_at, secondary_world
 from magfusion.simulation.rotor_beacons import Turning
 from magfusion.units import AnyArray, Array, ComplexArray
 
@@ -91,7 +91,7 @@ def phasors_world(
         at_spheres = _primary_world(beacon, spheres.position_world, layers)
         phasors += spheres.secondary_world(at_spheres, beacon.tone_frequencies_hz, point_world)
     if rails is not None:
-        at_rails = _primary_world(beacon, rails.points_world(), layers)
+        at_rails = _at_rails(beacon, rails, layers)
         phasors += secondary_world(rails, at_rails, beacon.tone_frequencies_hz, point_world)
     return phasors
 
@@ -102,7 +102,18 @@ def _primary_world(beacon: Beacon, point_world: Array, layers: Layers | None) ->
     else:
         fields = beacon_fields_world(replace(beacon, conductivity=0.0), point_world)
         fields = fields + layered_effect(beacon, point_world, layers)
-    phasors = np.zeros((len(point_world), len(beacon.tones), 3), dtype=np.complex128)
+    return _by_tone(beacon, fields)
+
+
+def _at_rails(beacon: Beacon, rails: Steel, layers: Layers | None) -> ComplexArray:
+    if layers is None:
+        return _primary_world(beacon, rails.points_world(), None)
+    still = beacon_fields_world(replace(beacon, conductivity=0.0), rails.points_world())
+    return _by_tone(beacon, still + layered_at(rails, beacon, layers))
+
+
+def _by_tone(beacon: Beacon, fields: AnyArray) -> ComplexArray:
+    phasors = np.zeros((len(fields), len(beacon.tones), 3), dtype=np.complex128)
     for j, coil in enumerate(beacon.coils):
         tone = beacon.tones.index((coil.frequency_hz or beacon.frequency_hz, coil.slot))
         phasors[:, tone] += fields[:, j] * np.exp(1j * coil.phase)

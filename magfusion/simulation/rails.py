@@ -9,6 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.model.site import Beacon
+from magfusion.simulation.layers import Layers, layered_effect_at
 from magfusion.simulation.pipe import Pipe, Steel, dipole_tensor
 from magfusion.units import Array, ComplexArray
 
@@ -79,17 +81,49 @@ def laid(pipes: tuple[Pipe, ...], box_world: Array, beacons_world: Array) -> Ste
                 f"--rails: number {number} comes within {max(away, 0.0):.2g} m of where the"
                 f" platform moves (--box) or of a beacon; keep {NEAREST:g} m"
             )
-        segment = min(max(FINE * away, 0.05), LONGEST, pipe.length / FEWEST)
-        whole.append(replace(pipe, segment=segment))
-    steel = Steel(tuple(whole))
-    count = len(steel.points_world())
+        whole.append(replace(pipe, segment=_segment(pipe, away)))
+    _check_count(whole)
+    _check_apart(whole)
+    return Steel(tuple(whole))
+
+
+def beside_wells(pipes: tuple[Pipe, ...], ways_world: list[Array]) -> tuple[Pipe, ...]:
+    """Return steel beside the ways (n, 3) (m) of a sensor and of a magnet, in short segments.
+
+    Raises
+    ------
+    InputError
+        If steel comes nearer than `NEAREST` to a way, or crosses itself.
+    """
+    whole = []
+    for number, pipe in enumerate(pipes, 1):
+        ways = np.concatenate(ways_world)
+        offset = ways - pipe.start_world
+        along = np.clip(offset @ pipe.axis_world, 0.0, pipe.length)[:, None]
+        apart = np.linalg.norm(offset - along * pipe.axis_world, axis=1)
+        away = float(np.min(apart)) - pipe.radius
+        if away < NEAREST:
+            raise InputError(
+                f"--rails: number {number} comes within {max(away, 0.0):.2g} m of the sensor or of"
+                f" the magnet's way; keep {NEAREST:g} m"
+            )
+        whole.append(replace(pipe, segment=_segment(pipe, away)))
+    _check_count(whole)
+    _check_apart(whole)
+    return tuple(whole)
+
+
+def _segment(pipe: Pipe, away: float) -> float:
+    return min(max(FINE * away, 0.05), LONGEST, pipe.length / FEWEST)
+
+
+def _check_count(pipes: list[Pipe]) -> None:
+    count = sum(len(pipe.centres_world()) for pipe in pipes)
     if count > MOST_SEGMENTS:
         raise InputError(
             f"--rails: {count} segments are too many (at most {MOST_SEGMENTS}); lay shorter ones,"
             " or farther from where the platform moves"
         )
-    _check_apart(whole)
-    return steel
 
 
 def _check_apart(pipes: list[Pipe]) -> None:
@@ -141,6 +175,26 @@ def secondary_world(
         found = (by_moment @ flat.real + 1j * (by_moment @ flat.imag)).reshape(-1, 3, flat.shape[1])
         out[part] = np.swapaxes(found, 1, 2)
     return out
+
+
+def layered_at(steel: Steel, beacon: Beacon, layers: Layers) -> ComplexArray:
+    """Return what layered ground adds to each coil's field at the segments, (n, coils, 3) (T).
+
+    Segments may lie in any layer, and as far along as rails do: each is calculated, by heights.
+    """
+    point_world = steel.points_world()
+    added = np.zeros((len(point_world), len(beacon.coils), 3), dtype=np.complex128)
+    heights, level = np.unique(np.round(point_world[:, 2], 6), return_inverse=True)
+    for j, coil in enumerate(beacon.coils):
+        source = (
+            beacon.position_world + beacon.world_from_beacon @ coil.centre_beacon,
+            beacon.world_from_beacon @ coil.moment_beacon,
+            coil.frequency_hz or beacon.frequency_hz,
+        )
+        for k in range(len(heights)):
+            own = level == k
+            added[own, j] = layered_effect_at(*source, point_world[own], layers)
+    return added
 
 
 def magnetised_world(steel: Steel, earth_field_world: Array, point_world: Array) -> Array:
