@@ -267,8 +267,14 @@ class Judgement:
     fulfilled: bool | None  # None where there is no rule
 
 
-def pose_error(scene: Scene, windows: RangingWindows, found: Ranged) -> Array:
-    """Return the error of the pose in the axes of the true high side (6,), rotation first."""
+def pose_error(
+    scene: Scene, windows: RangingWindows, found: Ranged, *, measured: bool = True
+) -> Array:
+    """Return the error of the pose in the axes of the true high side (6,), rotation first.
+
+    Where the angle is not measured, zero of the magnet's turn is anywhere: the truth is turned to
+    the estimate about the magnet's axis, for a covariance holds near by and not half a turn away.
+    """
     own = scene.passes[0]
     rotor_world = own.world_from_rotor
     depth = windows.magnet_from / (1.0 + scene.stretch)
@@ -276,7 +282,10 @@ def pose_error(scene: Scene, windows: RangingWindows, found: Ranged) -> Array:
     place = rotor_world.T @ (own.sensor_world - magnet)
     true = gtsam.Pose3(gtsam.Rot3(rotor_world.T @ scene.wells.side_world), place)
     estimated = gtsam.Pose3(gtsam.Rot3(found.world_from_body), found.position_world)
-    # Along a screw: what is open, a turn about the magnet's axis, is one, however far.
+    if not measured:
+        between = estimated.rotation().matrix() @ true.rotation().matrix().T
+        turn = np.arctan2(between[2, 1] - between[1, 2], between[1, 1] + between[2, 2])
+        true = gtsam.Pose3(gtsam.Rot3.Rx(float(turn)), np.zeros(3)).compose(true)
     return np.asarray(gtsam.Pose3.Logmap(true.between(estimated)))
 
 
@@ -320,7 +329,11 @@ def run_one(case: Case, config: Config, seed: int) -> Row:
         sigma_m=float(np.mean(sigmas)),
         direction_error_deg=float(error[1]),
         depth_error_m=float(error[2]),
-        nees=nees(pose_error(scene, told.windows, found), found, measured=config.encoder),
+        nees=nees(
+            pose_error(scene, told.windows, found, measured=config.encoder),
+            found,
+            measured=config.encoder,
+        ),
         residual_rms=float(np.sqrt(found.chi_square / found.freedom)),
         converged=found.converged,
     )

@@ -47,6 +47,8 @@ def test_a_site_alone_is_simulated_and_ranged(encoder: bool, tmp_path: Path) -> 
     run_command("range", log, "-o", out)
     true, found = (json.loads((path / "report.json").read_text()) for path in (log, out))
     assert found["verdict"] == "trustworthy"
+    assert (out / "range.png").read_bytes()[1:4] == b"PNG"
+    assert "down the hole and by depth" in (out / "report.html").read_text()
     for k in (1, 2):
         for name in ("distance", "high_side", "abreast_depth"):
             unit = "deg" if name == "high_side" else "m"

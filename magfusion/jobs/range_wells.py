@@ -49,6 +49,7 @@ def run_range(settings: RangeSettings, output: Path) -> Figures:
     from magfusion.estimation.relative_wells import Wells
     from magfusion.files.table import Span, write_table
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.results.plots.ranging import RangePicture, write_range_plot
     from magfusion.results.report import write_report
     from magfusion.results.verdict import trust_figures
     from magfusion.units import DEGREE
@@ -94,6 +95,8 @@ def run_range(settings: RangeSettings, output: Path) -> Figures:
     with claimed as whole:
         directory = found_in(whole, trust)
         write_table(columns, directory / "range.parquet")
+        picture = RangePicture(magnet, sensor, places.place, places.cov)
+        write_range_plot(directory / "range.png", picture, high_side=told.high_side)
         write_report(whole, figures)
     refuse_failed(job.log_path, output, trust)
     return figures

@@ -53,6 +53,7 @@ _CAPTIONS = {
     "field_map": "Where the beacons' fields differ from their model",
     "magnetometer": "Magnetometer: field before and after",
     "motion": "Where to hold the platform next, and what that determines",
+    "range": "Where the magnet's well is, down the hole and by depth",
     "stability": "Stability of the estimates",
     "survey": "Places of the survey",
 }
