@@ -8,6 +8,8 @@ is by how many MiB it grew with each minute since the length before.
 
 - ``reading all`` makes an object of each message and lists of numbers, as an importer does that
   knows no better.
+- ``pipe`` is the filter that is given the same raw samples one after the other; of what writes them
+  nothing is counted.
 - ``replay`` runs on a log that lasts an hour a minute: rest at 100 Hz, written as Parquet.
 """
 
@@ -161,6 +163,17 @@ def read_all(path: Path) -> None:
     print({topic: np.array(rows).shape for topic, rows in found.items()})
 
 
+def piped(path: str, site: str) -> None:
+    """Become the filter that reads what a replay of a log writes."""
+    replay = subprocess.Popen(
+        (*PROGRAM, "replay", path, "--format", "msgpack"), stdout=subprocess.PIPE
+    )
+    assert replay.stdout is not None
+    os.dup2(replay.stdout.fileno(), 0)
+    options = ("--site", site, "--format", "msgpack", "--estimator", "ekf")
+    os.execv(sys.executable, (*PROGRAM, "navigate", "-", *options))
+
+
 def commands(room: Path, minutes: float) -> dict[str, tuple[str, ...]]:
     """Return the commands on a length of the walk."""
     bag, out = room / bag_of(minutes), f"{bag_of(minutes)}_"
@@ -175,6 +188,7 @@ def commands(room: Path, minutes: float) -> dict[str, tuple[str, ...]]:
         "smooth": (*job("smooth"), *site),
         "ekf": (*job("navigate"), *site, "--estimator", "ekf"),
         "fixed lag": (*job("navigate"), *site),
+        "pipe": (*ITSELF, "--piped", str(bag), site[1]),
         "replay": (
             *PROGRAM,
             "replay",
@@ -204,17 +218,20 @@ def main() -> None:
     parser.add_argument(
         "--minutes", type=float, nargs="+", default=[1.0, 3.0], help="3 10 30 in full"
     )
-    names = ["reading all", "import", "smooth", "ekf", "fixed lag", "replay"]
+    names = ["reading all", "import", "smooth", "ekf", "fixed lag", "pipe", "replay"]
     parser.add_argument("--only", choices=names, action="append", help="of the commands")
     parser.add_argument("--room", type=Path, help="directory to keep the logs in; else a new one")
     parser.add_argument("--simulate", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--rest", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--read-all", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--piped", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.simulate is not None:
         simulate(options.simulate, options.minutes)
     elif options.rest is not None:
         rest(options.rest, options.minutes[0])
+    elif options.piped is not None:
+        piped(*options.piped)
     elif options.read_all is not None:
         read_all(options.read_all)
     else:
