@@ -15,7 +15,7 @@ from magfusion.estimation.integrity.freeze import Freeze
 from magfusion.estimation.measured import Measured
 from magfusion.estimation.measurements.earth import earth_measurement
 from magfusion.estimation.measurements.measurement import Measurement
-from magfusion.estimation.measurements.model_error import alike_online
+from magfusion.estimation.measurements.model_error import alike_at
 from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.estimation.measurements.signs import OPEN_SIGN, count_open, with_signs
 from magfusion.estimation.measurements.zero_velocity import (
@@ -485,7 +485,6 @@ class Arrivals:
         now, offset = np.zeros(1, dtype=np.int64), np.full(1, self.applied_offset)
         rate_body = (self._rate_body(time) - predicted.gyro_bias_body)[None]
         repeats = max(1.0, float(samples.window[0]) / own)
-        speed = float(np.linalg.norm(predicted.velocity_world))
         phasors = field_phasors(
             predicted.calibration.site,
             samples,
@@ -495,7 +494,7 @@ class Arrivals:
             offset,
             repeats,
             by_offset,
-            alike_online(speed, step, predicted.calibration.site.model_error_length),
+            alike_at(predicted, step),
             np.array([standing]),
         )
         field = None

@@ -173,7 +173,8 @@ def tune(
         out.append(Tuned(name, "noise_factor", noise, white * noise))
         if part.model is not None:
             factor = min(part.model / min(less, 1.0), FAULT)  # faults come first
-            factor = max(factor, 1.0) if self_made[i] else factor
+            if not declared.platform.inertial:  # poses that nothing else ties follow a smooth error
+                factor = max(factor, 1.0)
             out.append(Tuned(name, "model_error", usual, factor * usual))
     smooth = [part.smooth for part in parts.values() if part.model is not None]
     return (*out, *_tuned_imu(system, now, declared, float(np.mean(smooth)) if smooth else 0.0))

@@ -8,7 +8,7 @@ from magfusion.estimation.close_tones import joint_phasors
 from magfusion.estimation.integrity.detection import DETECTION_CHI_SQUARE_ONLINE
 from magfusion.estimation.measured import Measured
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
-from magfusion.estimation.measurements.model_error import alike_online
+from magfusion.estimation.measurements.model_error import alike_at
 from magfusion.estimation.motion_compensation import taken_off
 from magfusion.estimation.state import State, as_trajectory
 from magfusion.model.parameters import predict_channels
@@ -113,7 +113,6 @@ class ShortWindows:
         wanted = predicted.time + receiver.nodes
         off = taken_off(samples, path, imu, calibration, offset, LONGEST_WINDOW, wanted)
         assert off.wanted is not None
-        site, speed = calibration.site, float(np.linalg.norm(predicted.velocity_world))
         found, shown = joint_phasors(
             receiver.designs,
             windows,
@@ -126,7 +125,7 @@ class ShortWindows:
             np.zeros(1, dtype=np.int64),
             rate_body[None],
             np.full(1, offset),
-            alike=alike_online(speed, receiver.settings.step, site.model_error_length),
+            alike=alike_at(predicted, receiver.settings.step),
             standing=np.array([standing]),
             noise=np.array(self._noise).reshape(-1, 3, 3),
         )

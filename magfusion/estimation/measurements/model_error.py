@@ -3,10 +3,19 @@
 Iron is constant in place, so that its error does not average over epochs at one place, nor over
 visits to it.  An error of correlation exp(-d / length) leaves N epochs the information of N / A
 independent ones, where A is the sum of an epoch's correlations with all; each is weighed so.
+
+Online that is no more than the estimator holds together.  With an IMU those are all; a motion
+prior forgets: at steady state an epoch has a gain of sqrt(2) w times its step, where
+w^4 = q^2 / (R step), of white acceleration of density q and errors of variance R (P. R. Kalata,
+IEEE Transactions on Aerospace and Electronic Systems 20, 1984, for small steps); an error that A
+epochs share is what the covariance claims where errors of variance A R have a gain of 1 / A.
 """
 
 import numpy as np
 
+from magfusion.estimation.state import State
+from magfusion.model.noise import model_error
+from magfusion.model.site import Site
 from magfusion.units import Array, IntArray
 
 LONGEST_REST = 20.0  # s; online, longer ones are held together no more: the state has moved on
@@ -74,3 +83,42 @@ def alike_online(speed: float, step: float, length: float) -> float:
         return 1.0
     moved = max(speed * step / length, 2.0 * step / LONGEST_REST)
     return float(1.0 / np.tanh(0.5 * moved))
+
+
+def alike_at(state: State, step: float) -> float:
+    """Return with how many epochs that are held together one has its model error.
+
+    Parameters
+    ----------
+    state : State
+        Predicted at the epoch.
+    step : float
+        Time between epochs (s).
+    """
+    site, speed = state.calibration.site, float(np.linalg.norm(state.velocity_world))
+    alike = alike_online(speed, step, site.model_error_length)
+    if site.platform.replaced is None or alike == 1.0 or step <= 0.0:
+        return alike
+    return min(alike, held_by_prior(site, state.position_world, step))
+
+
+def held_by_prior(site: Site, position_world: Array, step: float) -> float:
+    """Return how many epochs a motion prior holds together, at least one.
+
+    Parameters
+    ----------
+    site : Site
+        Of `magfusion.model.without_imu.on_motion_prior`.
+    position_world : ndarray, shape (3,)
+        (m)
+    step : float
+        Time between epochs (s).
+    """
+    apart = np.array([beacon.position_world for beacon in site.beacons]) - position_world
+    relative = float(np.max(model_error(site)))
+    # A share of the field turns it by as many radians at most, and shifts by that of the distance.
+    turn, shift = relative, relative * float(np.max(np.linalg.norm(apart, axis=1)))
+    imu = site.platform.imu
+    pairs = ((turn, imu.gyro_bias_walk), (shift, imu.accel_noise))
+    held = [np.cbrt((error / density) ** 2 / (4.0 * step**3)) for error, density in pairs]
+    return float(max(1.0, *held))
