@@ -23,7 +23,7 @@ class HeldRoll(Measurement):
 
     Parameters
     ----------
-    axis_body : ndarray, shape (3,)
+    axis_body : ndarray, shape (n, 3)
     world_from_body : ndarray, shape (n, 3, 3)
     """
 
@@ -35,16 +35,18 @@ class HeldRoll(Measurement):
     ) -> Rows:
         """Return the rows at an estimate, one group of one."""
         turn = np.swapaxes(self.world_from_body, 1, 2) @ states.world_from_body
-        about = Rotation.from_matrix(turn).as_rotvec() @ self.axis_body
+        about = np.sum(Rotation.from_matrix(turn).as_rotvec() * self.axis_body, axis=1)
         by_pose = np.zeros((len(turn), 1, 1, 6))
-        by_pose[..., :3] = self.axis_body / SIGMA  # at a turn of which the rest is small
+        # At a turn of which the rest is small.
+        by_pose[..., :3] = self.axis_body[:, None, None] / SIGMA
         return Rows(error=about[:, None, None] / SIGMA, by_pose=by_pose)
 
 
 def held_roll(site: Site, states: Trajectory) -> HeldRoll:
     """Return that the first state has the roll that it has."""
     first = np.zeros(1, dtype=np.int64)
-    return HeldRoll(first, axis_of(site.platform.magnetometer), states.world_from_body[:1])
+    axis_body = axis_of(site.platform.magnetometer)[None]
+    return HeldRoll(first, axis_body, states.world_from_body[:1])
 
 
 def without_roll(states: Trajectory, site: Site, *, signed: bool = True) -> Trajectory:
