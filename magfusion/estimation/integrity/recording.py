@@ -91,7 +91,7 @@ def recorded(
             found += iron_on_body(still_means(log, site, IRON_SPAN), site)
     if beacons and site is not None and site.beacons:
         found += [f for f in undeclared_lines(log, site, lockin) if _matters(f)]
-        found += long_windows(site, lockin) if log.waveform is not None else ()
+        found += long_windows(site, lockin) if log.waveform is not None or log.waveforms else ()
         hearing = heard_in(log, site) if hearing is None else hearing
         if hearing is not None and freed is not None:
             hearing = heard_with_motion(hearing, freed)
