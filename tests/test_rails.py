@@ -1,10 +1,13 @@
 """Rails and tubes of steel in the simulator: limits with a closed form, and what is refused."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import magpylib
 import numpy as np
 import pytest
+from conftest import run_command
 
 from magfusion.errors import InputError
 from magfusion.model.physics.dipole import dipole_field
@@ -192,3 +195,24 @@ def test_steel_beside_wells_keeps_off_the_magnets_way() -> None:
     assert near.segment == pytest.approx(10.0 / 40.0)
     with pytest.raises(InputError, match=r"number 1 comes within .* of the sensor"):
         beside_wells(rails_option("0.05:0,-3,0:0,3,0"), [way])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "rails",
+    [
+        "0.05:-10,1.8,-0.1:15,1.8,-0.1;0.05:-10,3.235,-0.1:15,3.235,-0.1",
+        "0.12/0.01:3,0.4,-6:3,0.4,4",
+    ],
+    ids=["track", "casing"],
+)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_beside_steel_what_is_trusted_is_no_farther_off_than_it_says(
+    rails: str, seed: int, tmp_path: Path
+) -> None:
+    log = tmp_path / "log"
+    run_command("simulate", "-o", log, "--duration", 30, "--seed", seed, "--rails", rails)
+    for job in ("smooth", "navigate"):
+        run_command(job, log, "-o", tmp_path / job)
+        found = json.loads((tmp_path / job / "report.json").read_text())
+        assert found["verdict"] != "trustworthy" or found["nees_mean"] <= 12.0, job
