@@ -1,5 +1,6 @@
 """States as they are made, for Foxglove: a WebSocket server that the app opens."""
 
+import time
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,6 +10,7 @@ from magfusion.files.stream import json_line
 from magfusion.results.odometry import odometry_of
 
 HOST = "127.0.0.1"
+LINGER = 0.5  # s
 _NS = 1_000_000_000
 _STATE = {
     "title": "magfusion.State",
@@ -89,14 +91,14 @@ class FoxgloveServer:
         x, y, z = found.position_world.tolist()
         place = make.Vector3(x=x, y=y, z=z)
         w, x, y, z = found.quaternion.tolist()
-        turn, time = make.Quaternion(x=x, y=y, z=z, w=w), make.Timestamp(*divmod(stamp, _NS))
+        turn, when = make.Quaternion(x=x, y=y, z=z, w=w), make.Timestamp(*divmod(stamp, _NS))
         pose = make.PoseInFrame(
-            timestamp=time,
+            timestamp=when,
             frame_id=self._frame,
             pose=make.Pose(position=place, orientation=turn),
         )
         transform = make.FrameTransform(
-            timestamp=time,
+            timestamp=when,
             parent_frame_id=self._frame,
             child_frame_id=self._child,
             translation=place,
@@ -106,7 +108,9 @@ class FoxgloveServer:
         self._transform.log(transform, log_time=stamp)
 
     def close(self) -> None:
-        """End; who is still connected is told."""
+        """End; who is still connected is told, after what is on its way to them."""
+        if self._state.has_sinks():  # the server drops what it has not sent when it stops
+            time.sleep(LINGER)
         self._server.stop()
 
 
