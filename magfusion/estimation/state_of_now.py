@@ -19,6 +19,7 @@ from magfusion.estimation.input_queue import Arrivals
 from magfusion.estimation.integrity.bank import SubsetBank
 from magfusion.estimation.integrity.judgement import JudgedState, Judgement, told_cov
 from magfusion.estimation.navigator_settings import NavigatorSettings
+from magfusion.estimation.prior_ahead import ahead_by_prior
 from magfusion.estimation.state import State
 from magfusion.units import DEGREE, Array
 
@@ -154,7 +155,10 @@ class StateOfNow:
         if horizon == 0.0:
             return passage
         assert self._departure is not None
-        return ahead(passage, horizon, self._departure.site.gravity, self._held.cov(horizon))
+        site = self._departure.site
+        if not site.platform.inertial:
+            return ahead_by_prior(passage, horizon, site.platform.imu)
+        return ahead(passage, horizon, site.gravity, self._held.cov(horizon))
 
     def _judged(self, passage: Passage, horizon: float) -> list[CarriedState]:
         departure, said = self._departure, self._said
