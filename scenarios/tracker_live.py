@@ -11,7 +11,8 @@ them with an inertial stream as records of 10 ms, and the scenario tells
 4. with ``--plate``, how soon a plate of aluminium that is moved beside the head is said, and
    whether the sigmas hold meanwhile.
 
-``--cycles 480`` has the source drive its coils so often a second.
+``--cycles 480`` has the source drive its coils so often a second; from 625 on, of an own clock, the
+converter takes 40 kHz.
 """
 
 import tempfile

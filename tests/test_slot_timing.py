@@ -1,12 +1,17 @@
 """Slots of a clock of its own, found in the stream and followed."""
 
+import io
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from time_slots_and_mains import tracker
 
 from magfusion.errors import InputError
+from magfusion.files.site import save_site
+from magfusion.jobs.stream import StreamSettings, run_stream
 from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.model.site import Site, Slots
 from magfusion.receiver.cycles import whole_cycles
@@ -24,13 +29,18 @@ def _free(carrier_hz: float, slots: Slots = SLOTS) -> Site:
 
 
 def _stream(
-    carrier_hz: float, start: float, ppm: float, duration: float, signal: float = 1e-7
+    carrier_hz: float,
+    start: float,
+    ppm: float,
+    duration: float,
+    signal: float = 1e-7,
+    slots: Slots = SLOTS,
 ) -> Waveform:
     """Return coils that are driven by a clock of their own, in the Earth field and hum."""
     rng = np.random.default_rng(4)
     time = 1.0 + np.arange(int(duration * RATE_HZ)) / RATE_HZ
     own = (time - start) * (1.0 + 1e-6 * ppm)
-    slot = np.floor(own / SLOTS.duration).astype(int) % 4
+    slot = np.floor(own / slots.duration).astype(int) % 4
     field = signal * np.vstack([rng.standard_normal((3, 3)), np.zeros((1, 3))])
     driven = field[slot] * np.cos(2.0 * np.pi * carrier_hz * own)[:, None]
     hum = 1.5e-7 * np.cos(2.0 * np.pi * 50.0 * time)[:, None] * [0.6, 0.0, 0.8]
@@ -38,9 +48,9 @@ def _stream(
     return Waveform(time, driven + hum + noise + [2e-5, 1e-5, 4e-5])
 
 
-def _late(found: float, start: float) -> float:
+def _late(found: float, start: float, slots: Slots = SLOTS) -> float:
     """Return by how much a cycle is found late (s)."""
-    return (found - start + 0.5 * SLOTS.cycle) % SLOTS.cycle - 0.5 * SLOTS.cycle
+    return (found - start + 0.5 * slots.cycle) % slots.cycle - 0.5 * slots.cycle
 
 
 @pytest.mark.parametrize("start", [0.0, 1.3e-3, 5.1e-3, 7.7e-3])
@@ -50,6 +60,17 @@ def test_a_cycle_is_found_under_hum_in_the_earth_field(carrier_hz: float, start:
     assert found is not None
     # A quarter of a carrier's cycle, and a sample.
     assert abs(_late(found, start)) < 0.25 / carrier_hz + 1.0 / RATE_HZ
+
+
+@pytest.mark.parametrize("cycles_hz", [250.0, 480.0, 500.0, 625.0])
+@pytest.mark.parametrize("start", [0.0, 0.7e-3, 1.13e-3])
+def test_a_cycle_of_few_whole_samples_is_found(cycles_hz: float, start: float) -> None:
+    """Forty samples of every cycle are at the same places of it, and there are none between."""
+    slots = Slots(0.25 / cycles_hz, 4)
+    waveform = _stream(6e3, start, 0.0, 0.3, slots=slots)
+    found = slot_start(waveform, _free(6e3, slots), RATE_HZ)
+    assert found is not None
+    assert abs(_late(found, start, slots)) < 0.25 / 6e3 + 1.0 / RATE_HZ
 
 
 def test_where_no_coil_is_driven_none_is_found() -> None:
@@ -117,3 +138,25 @@ def test_a_whole_log_is_followed_as_a_stream_is() -> None:
 def test_pulses_whose_timing_nobody_knows_are_refused() -> None:
     with pytest.raises(InputError, match=r"pulses of direct current by a clock of its own"):
         SlotReceiver(_free(0.0)).check()
+
+
+def test_the_pipe_says_why_there_is_no_state(tmp_path: Path) -> None:
+    """A stream has no end at which it could be told."""
+    slots = Slots(1.0 / 480.0, 4)
+    save_site(tracker(1e3, slots), tmp_path / "site.yaml")
+    rate_hz, lines = 2e3, []
+    for begin in np.arange(0.0, 8.0, 0.5):
+        time = (begin + np.arange(0.0, 0.5, 1.0 / rate_hz)).tolist()
+        inertial = (begin + np.arange(0.0, 0.5, 0.01)).tolist()
+        gyro, accel = [[0.0, 0.0, 0.01 * (k % 2)] for k in range(50)], [[0.0, 0.0, 9.81]] * 50
+        imu = {"time": inertial, "gyro": gyro, "accel": accel}
+        field = [[2e-5, 1e-5, 1e-9 * (k % 7)] for k in range(len(time))]
+        magnetometer = {"time": time, "field": field}
+        lines.append(json.dumps({"imu": imu, "magnetometer": magnetometer}))
+    source, sink = io.BytesIO("\n".join(lines).encode()), io.BytesIO()
+    run_stream(tmp_path / "site.yaml", StreamSettings(), source, sink, io.StringIO())
+    told = [json.loads(line) for line in sink.getvalue().splitlines()]
+    assert told[0]["reasons"] == []
+    (reason,) = told[-1]["reasons"]
+    assert reason["code"] == "no_start"
+    assert "too slow for slots" in reason["text"]

@@ -8,6 +8,7 @@ from typing import Any, BinaryIO, TextIO
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.estimation.initialization.online import NoStart
 from magfusion.estimation.integrity.judgement import JudgedState
 from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.measurements.signs import along_axis
@@ -33,7 +34,7 @@ from magfusion.jobs.rotor_inputs import AwaitedAngles, check_streamed_rotors
 from magfusion.model.marks import Marks
 from magfusion.model.quaternion import of_matrices
 from magfusion.model.site import Site
-from magfusion.model.trust import Finding
+from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array
 
 _PLACE = {"json": "line", "msgpack": "record"}
@@ -242,7 +243,10 @@ def _last(time: Array) -> float:
 def _waiting(navigator: Navigator, time: float) -> dict[str, Any]:
     """Return a sign of life before the first state, with the reason why a start was refused."""
     nothing: dict[str, Any] = {"time": time, "started": False, "lost": False, "verdict": None}
-    reasons = navigator.why_no_start.trust.reasons
+    why = navigator.why_no_start
+    reasons = why.trust.reasons
+    if not reasons and why != NoStart():
+        reasons = (Finding("no_start", why.reason, Verdict.FAILED),)
     open_ = True if any(reason.code == "ambiguous" for reason in reasons) else None
     return nothing | {"reasons": _said(reasons), "ambiguous": open_}
 

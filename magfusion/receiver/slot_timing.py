@@ -14,6 +14,7 @@ from magfusion.receiver.slots import carriers_hz, is_marked, is_pulsed, owners, 
 from magfusion.units import AnyArray, Array
 
 BINS = 32  # of a slot
+FEWEST_BINS = 6  # of them in which there are samples; a slot has eight
 FEWEST_CYCLES = 4
 LONGEST_FOLD = 0.3  # s; clocks that are 100 ppm apart drift by 30 us
 STEADY_CYCLES = 4  # of the carrier, over which the mean is the steady field
@@ -108,9 +109,14 @@ def _folded(time: Array, measured: Array, site: Site, slots: Slots, rate_hz: flo
     bins = np.floor((time - time[0]) / slots.cycle % 1.0 * slots.count * BINS).astype(np.int64)
     bins = np.minimum(bins, slots.count * BINS - 1)
     count = np.bincount(bins, minlength=slots.count * BINS)
-    if np.any(count == 0):
+    told = np.flatnonzero(count)
+    if len(told) < FEWEST_BINS * slots.count:
         return None
-    return np.asarray(np.bincount(bins, size, minlength=slots.count * BINS) / count)
+    mean = np.bincount(bins, size, minlength=len(count))[told] / count[told]
+    if len(told) == len(count):
+        return np.asarray(mean)
+    # Where whole cycles are whole samples, there are no more places in a cycle than samples.
+    return np.interp(np.arange(len(count)), told, mean, period=len(count))
 
 
 def _alone(measured: Array, length: int) -> Array:
