@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import importlib.util
 import json
 import os
 import subprocess
@@ -226,3 +227,29 @@ assert pandas.Series([1]).sum() == 1
 """
     done = _child("-c", told)
     assert done.returncode == 0, done.stderr
+
+
+def test_a_command_collects_garbage_but_not_among_what_it_imported(
+    tmp_path: Path,
+) -> None:
+    told = """
+import gc, sys
+from magfusion.jobs import smooth
+from magfusion.cli import main
+def run(settings):
+    assert gc.isenabled() and gc.get_freeze_count() > 10_000, gc.get_freeze_count()
+    assert {f"magfusion.{name}" for name in smooth.COMMAND.imports} <= set(sys.modules)
+smooth.COMMAND = smooth.Command(smooth.SmoothSettings, run, imports=smooth.COMMAND.imports)
+sys.argv = ["magfusion", "smooth", "."]
+main()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", told], check=False, capture_output=True, text=True, cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_what_a_command_says_that_it_imports_is_there() -> None:
+    for module, _ in JOBS.values():
+        for name in importlib.import_module(f"magfusion.jobs.{module}").COMMAND.imports:
+            assert importlib.util.find_spec(f"magfusion.{name}") is not None, name

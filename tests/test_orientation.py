@@ -21,7 +21,8 @@ from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.files.stream_contents import imu_content, magnetometer_content, write_record
 from magfusion.jobs.inputs import Job
-from magfusion.jobs.orientation import run_orientation, run_orientation_stream, without_beacons
+from magfusion.jobs.orientation import run_orientation, run_orientation_stream
+from magfusion.jobs.without_beacons import without_beacons
 from magfusion.model.progress import quiet
 from magfusion.model.samples import ImuSamples, Waveform
 

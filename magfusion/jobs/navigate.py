@@ -131,37 +131,17 @@ def run(
     if str(settings.log) == "-":
         _run_pipe(settings, given)
         return None
-    from magfusion.jobs.orientation import run_orientation, without_beacons
+    from magfusion.jobs.without_beacons import refuse_without_beacons, without_beacons
 
     job = settings.job(output)
     if without_beacons(job):
-        _refuse_without_beacons(given)
+        from magfusion.jobs.orientation import run_orientation
+
+        refuse_without_beacons(given)
         return run_orientation("navigate", job, settings.rates, back=False, report=report)
     if given & {"form", "keep_going"}:
         raise InputError("--keep-going and --format belong to a stream; give - in place of a log")
     return run_navigate(settings, output, report)
-
-
-OF_BEACONS = {
-    "blend",
-    "checkpoint",
-    "foxglove",
-    "horizon",
-    "live",
-    "mavlink",
-    "realtime",
-    "resume",
-    "ros2",
-}
-
-
-def _refuse_without_beacons(given: set[str]) -> None:
-    refused = sorted(given & OF_BEACONS)
-    if refused:
-        raise InputError(
-            f"--{refused[0].replace('_', '-')} is not for a site without beacons, where only the"
-            " orientation is found; leave it out"
-        )
 
 
 def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
@@ -179,8 +159,9 @@ def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
     site = load_site(settings.site, without=True, several=True)
     if not site.beacons:
         from magfusion.jobs.orientation import run_orientation_stream
+        from magfusion.jobs.without_beacons import refuse_without_beacons
 
-        _refuse_without_beacons(given)
+        refuse_without_beacons(given)
         with until_closed():
             streams = (binary_input(), binary_output(), sys.stderr)
             run_orientation_stream(site, settings.form, settings.keep_going, *streams)
@@ -425,4 +406,5 @@ COMMAND = Command(
     NavigateSettings,
     run,
     example="magfusion navigate log --estimator ekf -o navigated",
+    imports=("jobs.without_beacons", "jobs.navigate_results", "jobs.replay", "results.screen"),
 )

@@ -16,7 +16,7 @@ from magfusion.estimation.orientation.online import ANYWHERE, TIMING, Orientatio
 from magfusion.estimation.orientation.remarks import doubts, remarks
 from magfusion.estimation.orientation.smoother import Oriented, oriented
 from magfusion.estimation.state import GYRO_BIAS, ROTATION
-from magfusion.files.site import load_site, save_site
+from magfusion.files.site import save_site
 from magfusion.files.stream import Format, json_line, read_records, whole_rows
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
@@ -38,13 +38,6 @@ if TYPE_CHECKING:
 
 LONGEST_STEP = 0.1  # s; of a truth that is compared with
 _PLACE = {"json": "line", "msgpack": "record"}
-
-
-def without_beacons(job: Job) -> bool:
-    """Tell whether a job's site has no beacon, so that only the orientation can be found."""
-    if not job.declared_path.is_file():
-        return False
-    return not load_site(job.declared_path, unknown=True, without=True, several=True).beacons
 
 
 def run_orientation(name: str, job: Job, rate: Rate, *, back: bool, report: Report) -> Figures:

@@ -155,6 +155,8 @@ class Command:
         Called with settings and output when the result has been shown.
     example : str
         With which the help ends.
+    imports : tuple of str
+        Modules of magfusion that it will import, which the program then does at once.
     """
 
     settings: type[Settings]
@@ -167,6 +169,7 @@ class Command:
     fails: bool = True
     after: Callable[[Any, Path], None] | None = None
     example: str = ""
+    imports: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

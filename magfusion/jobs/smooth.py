@@ -109,10 +109,12 @@ class SmoothSettings(
 
 def run(settings: SmoothSettings, output: Path, report: Report = quiet) -> Figures:
     """Smooth a log as the settings ask, or several together; see `run_smooth`, `run_joint`."""
-    from magfusion.jobs.orientation import run_orientation, without_beacons
+    from magfusion.jobs.without_beacons import without_beacons
 
     job = settings.job(output)
     if not settings.more and without_beacons(job):
+        from magfusion.jobs.orientation import run_orientation
+
         return run_orientation("smooth", job, settings.rates, back=True, report=report)
     smoother = settings.smoother(job)
     if settings.more:
@@ -352,4 +354,9 @@ def _save_fixes_instead(
     return reason
 
 
-COMMAND = Command(SmoothSettings, run, example="magfusion smooth log --site site.yaml -o run")
+COMMAND = Command(
+    SmoothSettings,
+    run,
+    example="magfusion smooth log --site site.yaml -o run",
+    imports=("jobs.without_beacons", "jobs.smooth_result", "results.screen"),
+)
