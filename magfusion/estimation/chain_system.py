@@ -169,6 +169,10 @@ def _spread_over(by_other: Array, spread: Array) -> Array:
     if not spread.size or np.any(np.count_nonzero(spread, axis=0) > 1):
         return np.asarray(by_other @ spread)
     at = np.argmax(np.abs(spread), axis=0)
+    first = int(at[0])
+    if np.array_equal(at, np.arange(first, first + len(at))):
+        here = slice(first, first + len(at))
+        return np.asarray(by_other[..., here] * spread[at, np.arange(len(at))])
     return np.asarray(by_other[..., at] * spread[at, np.arange(len(at))])
 
 

@@ -115,8 +115,9 @@ def _fitted(
     fixed, weight = expected[4], np.full(len(square), 1.0 / lag)
     if not bent:
         known, fixed = known[:1], fixed + known[1]
+    log: Array | None = None
     for _ in range(WEIGHINGS):
-        log = likeliest(square, known, fixed, weight, 6, KINDS if bent else KINDS[:1])
+        log = likeliest(square, known, fixed, weight, 6, KINDS if bent else KINDS[:1], log)
         parts = np.exp(2.0 * log)[:, None] * known
         of_model = np.sum(parts[1:3], axis=0) if bent else fixed
         of_model = of_model / (np.sum(parts, axis=0) + fixed)
@@ -125,6 +126,7 @@ def _fitted(
     white = float(np.sum(parts[::3]) / np.sum(known[0]))
     # Of a strong beacon less noise than declared is not to be told from a little model error.
     unsure = LEAST**2 * float(np.sum(known[3:]) / np.sum(known[0]))
+    assert log is not None
     return log, float(np.sqrt(max(white, min(white + unsure, 1.0))))
 
 
@@ -188,6 +190,7 @@ def likeliest(
     weight: Array,
     components: int,
     kinds: Sequence[slice] = (slice(0, 1),),
+    near: Array | None = None,
 ) -> Array:
     """Return the logarithm of what each part's standard deviation is too small by.
 
@@ -206,11 +209,16 @@ def likeliest(
     kinds : sequence of slice
         Parts of which one sigma was declared for all together.  Of the others nothing was: there
         may be none of them.
+    near : ndarray, shape (kinds,), optional
+        What was found with other weights: the search begins there, but never of next to nothing,
+        where the cost has no slope.
     """
     start, least = np.full(len(parts), np.log(LEAST)), np.full(len(parts), NONE)
     for kind in kinds:
         start[kind] = -0.5 * np.log(kind.stop - kind.start)
         least[kind.start] = LEAST
+    if near is not None:
+        start = np.maximum(near, np.log(LEAST))
     gain, width = NORMAL[components], STUDENT + components
 
     scaled = gain * square

@@ -162,13 +162,12 @@ def optimise(
         graph = problem.linearized(estimate)
         while True:
             system = graph if damping == 0.0 else _damped(problem, graph, damping)
-            try:
-                trial = problem.moved(estimate, eliminate(system, problem.ordering).optimize())
-                new_cost = problem.cost(trial)
-            except RuntimeError:
-                new_cost = np.inf
+            trial, new_cost, step = _tried(problem, estimate, system)
             if new_cost <= cost:
                 break
+            rounding = tolerance * (1.0 + cost)
+            if damping == 0.0 and step is not None and _promised(graph, step) <= rounding:
+                return Optimised(estimate, cost, done, converged=True)
             if new_cost <= cost * (1 + STALLED) or damping > DAMPING_STOP:
                 return Optimised(estimate, cost, done, converged=damping <= DAMPING_STOP)
             damping = max(DAMPING_START, 10.0 * damping)
@@ -180,6 +179,23 @@ def optimise(
         if decrease <= tolerance * (1.0 + cost) and damping == 0.0:
             return Optimised(estimate, cost, done, converged=True)
     return Optimised(estimate, cost, done, converged=False)
+
+
+def _tried(
+    problem: Problem[S], estimate: S, system: gtsam.GaussianFactorGraph
+) -> tuple[S, float, gtsam.VectorValues | None]:
+    """Return where a linear system leads, the cost there, and the step; at worst infinite."""
+    try:
+        step = eliminate(system, problem.ordering).optimize()
+        trial = problem.moved(estimate, step)
+        return trial, problem.cost(trial), step
+    except RuntimeError:
+        return estimate, np.inf, None
+
+
+def _promised(graph: gtsam.GaussianFactorGraph, step: gtsam.VectorValues) -> float:
+    """Return by how much a step lowers the cost of the linear graph."""
+    return float(graph.error(gtsam.VectorValues.Zero(step)) - graph.error(step))
 
 
 def _damped(
