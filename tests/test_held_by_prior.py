@@ -6,23 +6,27 @@ import numpy as np
 import pytest
 from test_without_imu import A_HAND, exact, nees
 
+from magfusion.estimation.batch import smooth
 from magfusion.estimation.measurements.model_error import alike_at, held_by_prior
 from magfusion.estimation.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.state import State, as_trajectory
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.platform_motion import MotionPrior
+from magfusion.model.samples import ImuSamples, Log
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
 from magfusion.model.without_imu import on_motion_prior
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.disturbance import draw_bending
-from magfusion.simulation.log import simulate_fields
+from magfusion.simulation.log import EPOCH_NS, simulate_fields
 from magfusion.simulation.motion import Rests, random_walk_motion
 
 HZ, ERROR = 30.0, 0.01
 SPEEDS = {"still": 0.001, "slow": 0.1, "fast": 1.0}  # m/s
 
 
-def followed(seed: int, speed: float, duration: float = 8.0) -> float:
-    """Return the NEES of a filter whose world has just the smooth model error that is declared."""
+def bent(seed: int, speed: float, duration: float = 8.0) -> tuple[Site, Log]:
+    """Return a log of a world that has just the smooth model error that is declared."""
     rng = np.random.default_rng(seed)
     site = replace(exact(A_HAND), model_error=ERROR, model_error_length=1.0)
     rests = Rests(0.0, duration, 0.0)
@@ -32,16 +36,44 @@ def followed(seed: int, speed: float, duration: float = 8.0) -> float:
     bending = draw_bending(rng, ERROR / np.sqrt(3.0), site.model_error_length, len(site.beacons))
     fields = simulate_fields(site, truth, 1e-10, rng, bending=bending)
     fields = replace(fields, window=np.full(len(fields), 1.0 / HZ))
+    return site, Log("bent", EPOCH_NS, "test", ImuSamples.empty(), fields=fields, truth=truth)
+
+
+def followed(site: Site, log: Log) -> Trajectory:
+    """Return the states of a filter."""
+    assert log.fields is not None
     navigator = Navigator(site, NavigatorSettings(estimator="ekf"))
-    for one in fields.epochs():
+    for one in log.fields.epochs():
         navigator.add_fields(one)
-    return nees(as_trajectory([*navigator.take()]), truth)
+    return as_trajectory([*navigator.take()])
+
+
+def sigma_of(states: Trajectory) -> float:
+    """Return the sigma of the position (m)."""
+    assert states.pose_cov is not None
+    return float(np.sqrt(np.mean(np.trace(states.pose_cov[:, 3:, 3:], axis1=1, axis2=2))))
 
 
 @pytest.mark.slow
 def test_sigmas_hold_and_are_not_too_wide_whatever_the_motion() -> None:
-    found = {kind: np.mean([followed(s, v) for s in range(10)]) for kind, v in SPEEDS.items()}
+    found = {}
+    for kind, speed in SPEEDS.items():
+        runs = (bent(seed, speed) for seed in range(10))
+        found[kind] = np.mean([nees(followed(site, log), log.truth) for site, log in runs])
     assert all(1.0 < one < 12.0 for one in found.values()), found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", SPEEDS)
+def test_a_whole_log_claims_what_the_filter_claims(kind: str) -> None:
+    """Offline an error that is constant in place is considered, and no epochs are counted."""
+    found = []
+    for seed in (10, 11, 12):
+        site, log = bent(seed, SPEEDS[kind])
+        states = smooth(log, site).states
+        found.append(nees(states, log.truth))
+        assert 0.7 < sigma_of(states) / sigma_of(followed(site, log)) < 1.5
+    assert 0.5 < np.mean(found) < 12.0, found
 
 
 def test_what_a_prior_holds_is_what_its_steady_filter_holds() -> None:
