@@ -236,11 +236,19 @@ def main() -> None:
         read_all(options.read_all)
     else:
         with tempfile.TemporaryDirectory() as new:
-            measure(options.room or Path(new), sorted(options.minutes), options.only or names)
+            room, minutes = options.room or Path(new), sorted(options.minutes)
+            figures, missed = measure(room, minutes, options.only or names)
+        print(json.dumps(figures))
+        raise SystemExit(1 if missed else 0)
 
 
-def measure(room: Path, minutes: list[float], names: list[str]) -> None:
-    """Make the logs that are not there, run the commands and print what they took."""
+def measure(
+    room: Path, minutes: list[float], names: list[str]
+) -> tuple[list[dict[str, Any]], bool]:
+    """Make the logs that are not there, run the commands and print what they took.
+
+    Returns the figures, and whether a goal was missed.
+    """
     lengths, missed, figures = [BEGINNING, *minutes], False, []
     lacking = [str(m) for m in lengths if not (room / bag_of(m)).exists()]
     if lacking and set(names) != {"replay"}:
@@ -262,8 +270,7 @@ def measure(room: Path, minutes: list[float], names: list[str]) -> None:
             missed |= goal and (found.seconds > GOAL_S or found.mib > GOAL_MIB)
             before = length, found
         figures[-1]["wall_s"] = time.time() - began
-    print(json.dumps(figures))
-    raise SystemExit(1 if missed else 0)
+    return figures, missed
 
 
 if __name__ == "__main__":

@@ -5,13 +5,15 @@ runs them, and their processor time is taken.  What is left of it without start-
 time of the same command with ``--end 10``, is divided by that of a bare loop over GTSAM's
 ``integrateMeasurement`` on as many of the log's inertial samples, timed before and after each
 command: other work on the machine slows down both.  Start-up is divided by the time of importing
-gtsam, scipy, pyarrow and rerun.  A profile of a command is written by ``--profile``.
+gtsam, scipy, pyarrow and rerun.  The last row is ``magfusion --help``; ``--long`` adds half an hour
+at 500 Hz from a bag, by ``bench_long.py``.  ``--profile`` writes a profile of the first command,
+``--flame`` its flame graph, sampled by py-spy, which is installed apart: `pip install py-spy`.
 """
 
 import argparse
 import json
 import os
-import subprocess
+import shutil
 import sys
 import tempfile
 import time
@@ -20,6 +22,7 @@ from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
+from bench_long import GOAL_MINUTES, measure, used
 
 from magfusion.estimation.preintegration import preintegration_parameters
 from magfusion.files.open import open_log
@@ -30,6 +33,7 @@ from magfusion.model.site import Site
 BEGINNING = 10.0  # s; what is taken for start-up
 IMPORTS = "import gtsam, scipy, pyarrow, rerun"
 STARTUP_GOAL = 2.5
+HELP_GOAL = 0.2  # s
 SPREAD_GOAL = 3.0  # p99 over p50
 PROGRAM = (sys.executable, "-m", "magfusion")
 
@@ -48,18 +52,6 @@ GOALS = (
     Goal("ekf", ("navigate", "--estimator", "ekf"), 40.0, 8.0),
     Goal("fixed lag", ("navigate",), 80.0, 12.0),
 )
-
-
-def processor(command: list[str]) -> float:
-    """Run a command; return the processor time that it took (s)."""
-    with tempfile.TemporaryFile() as said:
-        process = subprocess.Popen(command, stdout=said, stderr=said)
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode:
-            said.seek(0)
-            raise SystemExit(f"{' '.join(command)}: {said.read().decode()[-2000:]}")
-    return usage.ru_utime + usage.ru_stime
 
 
 def bare_loop(site: Site, imu: ImuSamples) -> float:
@@ -82,13 +74,12 @@ def measured(goal: Goal, log: Path, site: Site, imu: ImuSamples, room: Path) -> 
     left = ImuSamples(imu.time[later], imu.gyro_body[later], imu.accel_body[later])
     loops = [bare_loop(site, left)]
     output = room / goal.name.replace(" ", "_")
-    beginning = [*PROGRAM, *goal.command, str(log), "--end", str(BEGINNING)]
-    processor([*beginning, "-o", f"{output}_first"])  # keeps byte code, as an installation has
-    whole = [*PROGRAM, *goal.command, str(log), "-o", str(output)]
-    seconds = processor(whole)
+    beginning = (*PROGRAM, *goal.command, str(log), "--end", str(BEGINNING))
+    used((*beginning, "-o", f"{output}_first"))  # keeps byte code, as an installation has
+    seconds = used((*PROGRAM, *goal.command, str(log), "-o", str(output))).seconds
     loops.append(bare_loop(site, left))
-    startup = processor([*beginning, "-o", f"{output}_beginning"])
-    imports = processor([sys.executable, "-c", IMPORTS])
+    startup = used((*beginning, "-o", f"{output}_beginning")).seconds
+    imports = used((sys.executable, "-c", IMPORTS)).seconds
     loops.append(bare_loop(site, left))
     report = json.loads((output / "report.json").read_text())
     found = {
@@ -116,10 +107,17 @@ def told(goal: Goal, found: dict[str, Any]) -> str:
 
 
 def profile(goal: Goal, log: Path, path: Path, room: Path) -> None:
-    """Write the profile of a command, for snakeviz, flameprof or pstats."""
-    profiled = [sys.executable, "-m", "cProfile", "-o", str(path), "-m", "magfusion"]
-    processor([*profiled, *goal.command, str(log), "-o", str(room / "profiled")])
+    """Write the profile of a command, for snakeviz or pstats."""
+    profiled = (sys.executable, "-m", "cProfile", "-o", str(path), "-m", "magfusion")
+    used((*profiled, *goal.command, str(log), "-o", str(room / "profiled")))
     print(f"profile of {goal.name}: {path}")
+
+
+def flame(goal: Goal, log: Path, path: Path, room: Path) -> None:
+    """Write the flame graph of a command, with its calls of compiled code, as SVG."""
+    sampled = ("py-spy", "record", "--native", "--rate", "200", "-o", str(path), "--")
+    used((*sampled, *PROGRAM, *goal.command, str(log), "-o", str(room / "sampled")))
+    print(f"flame graph of {goal.name}: {path}")
 
 
 def main() -> None:
@@ -130,7 +128,11 @@ def main() -> None:
     names = [goal.name for goal in GOALS]
     parser.add_argument("--only", choices=names, action="append", help="of the commands")
     parser.add_argument("--profile", type=Path, help="file of the profile of the first command")
+    parser.add_argument("--flame", type=Path, help="file (SVG) of its flame graph")
+    parser.add_argument("--long", action="store_true", help="half an hour at 500 Hz, too")
     options = parser.parse_args()
+    if options.flame is not None and shutil.which("py-spy") is None:
+        parser.error("--flame needs py-spy, which is not installed: pip install py-spy")
     chosen = [goal for goal in GOALS if options.only is None or goal.name in options.only]
     missed, figures = False, {}
     with tempfile.TemporaryDirectory() as directory:
@@ -138,7 +140,7 @@ def main() -> None:
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         if log is None:
             log = room / "log"
-            processor([*PROGRAM, "simulate", "--duration", str(options.duration), "-o", str(log)])
+            used((*PROGRAM, "simulate", "--duration", str(options.duration), "-o", str(log)))
         imu, site = open_log(log).imu, load_site(log / "site.yaml")
         print(
             "command     processor  start  a loop   loops  goal  of imports   p50/ms  goal  p99/p50"
@@ -150,8 +152,16 @@ def main() -> None:
             if goal.update_ms is not None:
                 missed |= found["update_p50_ms"] > goal.update_ms
                 missed |= found["update_p99_ms"] > SPREAD_GOAL * found["update_p50_ms"]
+        shown = used((*PROGRAM, "--help")).seconds
+        figures["help"] = {"seconds": shown}
+        print(f"{'--help':<10}{shown:8.1f} s   goal: {HELP_GOAL} s")
         if options.profile is not None:
             profile(chosen[0], log, options.profile, room)
+        if options.flame is not None:
+            flame(chosen[0], log, options.flame, room)
+        if options.long:
+            long, over = measure(room, [GOAL_MINUTES], ["smooth"])
+            figures["long"], missed = {"found": long}, missed or over
     print(json.dumps(figures))
     raise SystemExit(1 if missed else 0)
 
