@@ -32,6 +32,7 @@ from magfusion.model.parameters import Block, dimension, retract
 from magfusion.units import Array
 
 ITERATIONS_FAR = 4  # where the prediction is too wide to linearise at
+LAST = slice(MOTION, 2 * MOTION)  # of the first state, the last and the calibration
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,13 +127,13 @@ class SlidingWindow:
         nodes = self.nodes or [Node(self.state, (), None)]
         new = predicted.state if linearization_point is None else linearization_point
         self.nodes = [*nodes, Node(new, tuple(measurements), predicted.link)]
+        cov: Array | None = None
         try:
-            solved: gtsam.GaussianFactorGraph | None = None
             for _ in range(1 if linearization_point is None else ITERATIONS_FAR):
-                solved = self._iterate()
+                cov = self._iterate()
             while self.nodes[-1].state.time - self.nodes[0].state.time > self.lag:
-                self._drop_first(solved)
-                solved = None
+                self._drop_first(cov)
+                cov = None
         except (RuntimeError, np.linalg.LinAlgError) as error:
             self.nodes, self.prior, self.state, self.lagged, self.left = kept
             reason = str(error).strip().splitlines()[0]
@@ -144,19 +145,28 @@ class SlidingWindow:
         self.nodes, self.prior = [], _prior_of(state)
         self.state = self.lagged = state
 
-    def _iterate(self) -> gtsam.GaussianFactorGraph:
-        """Take a step; return the linear graph that it solved."""
-        graph = self._linearized(self.nodes)
-        last = len(self.nodes) - 1
-        solved, rest = eliminate_partial(graph, _keys(range(last), None))
-        information, vector = rest.hessian(_keys([last], self.calibration_key))
-        cov = np.asarray(np.linalg.inv(information))
-        step, cov = consider_update(cov @ vector, cov, self._considered_cov, self.considered)
+    def _iterate(self) -> Array:
+        """Take a step; return the covariance of the first state before it."""
+        graph, last = self._linearized(self.nodes), len(self.nodes) - 1
+        # Both ends stay to the last, so that one elimination tells the covariance of either.
+        solved, rest = eliminate_partial(graph, _keys(range(1, last), None))
+        information, vector = rest.hessian(_keys([0, last], self.calibration_key))
+        oldest, newest = slice(0, MOTION), slice(MOTION, None)
+        by_newest = np.linalg.solve(information[oldest, oldest], information[oldest, newest])
+        own = information[newest, newest] - information[newest, oldest] @ by_newest
+        cov = np.asarray(np.linalg.inv(own))
+        step = cov @ (vector[newest] - vector[oldest] @ by_newest)
+        step, cov = consider_update(step, cov, self._considered_cov, self.considered)
         if not np.all(np.isfinite(step)):
             raise EstimationError("the window's step is not finite")
+        left = vector[oldest] - information[oldest, newest] @ step
+        first = np.asarray(np.linalg.solve(information[oldest, oldest], left))
         given = gtsam.VectorValues()
-        for key, part in _split(step, last, self.calibration_key):
-            given.insert(key, part)
+        for end, part in ((0, first), (last, step[:MOTION])):
+            for key, own in _split(part, end):
+                given.insert(key, own)
+        if self.calibration_key is not None:
+            given.insert(self.calibration_key, step[MOTION:])
         steps = solved.optimize(given)
         calibration = retract(self.nodes[0].state.calibration, self.blocks, step[MOTION:])
         nodes = []
@@ -164,8 +174,8 @@ class SlidingWindow:
             motion = np.concatenate([steps.at(X(i)), steps.at(V(i)), steps.at(B(i))])
             nodes.append(replace(node, state=moved_to(node.state, calibration, motion)))
         self.nodes = nodes
-        self.state = replace(nodes[-1].state, cov=0.5 * (cov + cov.T))
-        return graph
+        self.state = replace(nodes[-1].state, cov=_even(cov))
+        return _cov_without(information, LAST)
 
     @property
     def calibration_key(self) -> int | None:
@@ -199,24 +209,24 @@ class SlidingWindow:
         factor.getb()[...] = right
         return factor
 
-    def _cov_of_first(self, graph: gtsam.GaussianFactorGraph) -> Array:
+    def _cov_of_first(self) -> Array:
         """Return the covariance of the first state, the whole window and its past considered."""
         later = range(len(self.nodes) - 1, 0, -1)
-        _, rest = eliminate_partial(graph, _keys(later, None))
+        _, rest = eliminate_partial(self._linearized(self.nodes), _keys(later, None))
         information, _ = rest.hessian(_keys([0], self.calibration_key))
-        cov = np.linalg.inv(information)
-        return np.asarray(0.5 * (cov + cov.T))
+        return _even(np.asarray(np.linalg.inv(information)))
 
-    def _drop_first(self, solved: gtsam.GaussianFactorGraph | None) -> None:
+    def _drop_first(self, solved: Array | None) -> None:
         """Leave the information of the first node as a prior of the second.
 
         Parameters
         ----------
-        solved : gtsam.GaussianFactorGraph, optional
-            The window's, as its last step solved it: a step later it says the same of sigmas.
+        solved : ndarray, optional
+            Covariance of the first state, as the window's last step solved it: a step later it is
+            the same.
         """
         first, second = self.nodes[:2]
-        cov = self._cov_of_first(self._linearized(self.nodes) if solved is None else solved)
+        cov = self._cov_of_first() if solved is None else solved
         graph = self._linearized([first, replace(second, measurements=())])
         _, rest = eliminate_partial(graph, _keys([0], None), orthogonal=True)
         sqrt_information, right = rest.jacobian(_keys([1], self.calibration_key))
@@ -259,6 +269,17 @@ def _keys(nodes: range | list[int], calibration: int | None) -> gtsam.Ordering:
     return ordering
 
 
-def _split(step: Array, node: int, calibration: int | None) -> list[tuple[int, Array]]:
-    parts = [(X(node), step[:6]), (V(node), step[6:9]), (B(node), step[9:15])]
-    return parts if calibration is None else [*parts, (calibration, step[MOTION:])]
+def _split(step: Array, node: int) -> list[tuple[int, Array]]:
+    return [(X(node), step[:6]), (V(node), step[6:9]), (B(node), step[9:15])]
+
+
+def _cov_without(information: Array, others: slice) -> Array:
+    """Return the covariance of all variables but some."""
+    kept = np.delete(np.arange(len(information)), others)
+    by_kept = information[others, kept]
+    gained = by_kept.T @ np.linalg.solve(information[others, others], by_kept)
+    return _even(np.asarray(np.linalg.inv(information[np.ix_(kept, kept)] - gained)))
+
+
+def _even(cov: Array) -> Array:
+    return np.asarray(0.5 * (cov + cov.T))

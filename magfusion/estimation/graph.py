@@ -21,7 +21,7 @@ from magfusion.estimation.inertial import ROWS, Link
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.prior_factor import PriorShift, prior_factor
 from magfusion.estimation.solve.ordering import nested_dissection
-from magfusion.estimation.state import states_in
+from magfusion.estimation.state import states_in, values_from
 from magfusion.model.parameters import (
     Block,
     Calibration,
@@ -308,16 +308,13 @@ def initial_estimate(
     states: Trajectory, calibration: Calibration, segments: tuple[Calibration, ...] = ()
 ) -> Estimate:
     """Return an estimate with the given states; absent biases are zero."""
-    values = gtsam.Values()
     zero = np.zeros((len(states), 3))
     accel = zero if states.accel_bias_body is None else states.accel_bias_body
     gyro = zero if states.gyro_bias_body is None else states.gyro_bias_body
     velocity = zero if states.velocity_world is None else states.velocity_world
-    for i in range(len(states)):
-        pose = gtsam.Pose3(gtsam.Rot3(states.world_from_body[i]), states.position_world[i])
-        values.insert(X(i), pose)
-        values.insert(V(i), velocity[i])
-        values.insert(B(i), gtsam.imuBias.ConstantBias(accel[i], gyro[i]))
+    at = zip(states.world_from_body, states.position_world, strict=True)
+    poses = [gtsam.Pose3(gtsam.Rot3(rotation), position) for rotation, position in at]
+    values = values_from(poses, list(velocity), list(np.concatenate([accel, gyro], axis=1)))
     return Estimate(values, calibration, segments)
 
 

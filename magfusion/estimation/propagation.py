@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from magfusion.estimation.imu_decimation import thinned
 from magfusion.estimation.inertial import Link, Preintegrated, Steps, inertial_factor, links_between
 from magfusion.estimation.preintegration import cut_at_epochs
 from magfusion.estimation.process_noise import ProcessNoise
@@ -85,7 +86,7 @@ def propagate(
         stream = corrected_imu(calibration, blocks, imu)
         increments = cut_at_epochs(stream, time_offset, epochs, usual)
         increments = replace(increments, bridged=increments.bridged | blind)
-        return Steps(increments, accel, gyro)
+        return Steps(thinned(increments, accel[None], gyro[None]), accel, gyro)
 
     def later_state(found: list[Preintegrated]) -> State:
         after = found[0].predict(before, bias)

@@ -4,9 +4,9 @@ Tangent: rotation and position (body axes, right perturbation of the pose, GTSAM
 (world), accelerometer and gyro bias, then the calibration as `magfusion.model.parameters` has it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import lru_cache
 
 import gtsam
 import numpy as np
@@ -64,33 +64,39 @@ def pose_of(state: State) -> gtsam.Pose3:
 
 def values_of(states: list[State]) -> gtsam.Values:
     """Return states as a graph takes them: pose X(i), velocity V(i) and bias B(i) of each."""
-    if len(states) == 2:
-        values = _with_biases(*states)
-    else:
-        values = gtsam.Values()
-        for i, state in enumerate(states):
-            bias = gtsam.imuBias.ConstantBias(state.accel_bias_body, state.gyro_bias_body)
-            values.insert(B(i), bias)
-    for i, state in enumerate(states):
-        values.insert(X(i), pose_of(state))
-        values.insert(V(i), state.velocity_world)
-    return values
+    biases = [np.concatenate([s.accel_bias_body, s.gyro_bias_body]) for s in states]
+    poses = [pose_of(state) for state in states]
+    return values_from(poses, [state.velocity_world for state in states], biases)
 
 
-@cache
-def _zero_biases() -> gtsam.Values:
-    values, zero = gtsam.Values(), gtsam.imuBias.ConstantBias(np.zeros(3), np.zeros(3))
-    values.insert(B(0), zero)
-    values.insert(B(1), zero)
-    return values
+def values_from(
+    poses: Sequence[gtsam.Pose3], velocity_world: Sequence[Array], bias_body: Sequence[Array]
+) -> gtsam.Values:
+    """Return poses X(i), velocities V(i) (m/s) and biases B(i) of some epochs for a graph.
 
-
-def _with_biases(before: State, after: State) -> gtsam.Values:
-    """Return the biases of two states; to insert them takes ten times as long as to move zeros."""
+    Parameters
+    ----------
+    bias_body : sequence of ndarray, shape (6,)
+        Of the accelerometer, then of the gyro (m/s^2, rad/s).
+    """
     step = gtsam.VectorValues()
-    for i, state in enumerate((before, after)):
-        step.insert(B(i), np.concatenate([state.accel_bias_body, state.gyro_bias_body]))
-    return _zero_biases().retract(step)
+    for i, (velocity, bias) in enumerate(zip(velocity_world, bias_body, strict=True)):
+        step.insert(V(i), velocity)
+        step.insert(B(i), bias)
+    values = _at_rest(len(poses)).retract(step)
+    for i, pose in enumerate(poses):
+        values.insert(X(i), pose)
+    return values
+
+
+@lru_cache(maxsize=32)
+def _at_rest(epochs: int) -> gtsam.Values:
+    """Return zero velocities and biases; to insert a bias takes ten times as long as to move it."""
+    values, zero = gtsam.Values(), gtsam.imuBias.ConstantBias(np.zeros(3), np.zeros(3))
+    for i in range(epochs):
+        values.insert(V(i), np.zeros(3))
+        values.insert(B(i), zero)
+    return values
 
 
 def moved(state: State, blocks: tuple[Block, ...], step: Array) -> State:
