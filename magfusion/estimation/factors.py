@@ -6,7 +6,7 @@ rewritten in place at each iteration.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import gtsam
@@ -200,13 +200,13 @@ def empty_factor(parts: Sequence[tuple[int, int]], rows: int) -> gtsam.JacobianF
     rows : int
         That are to be filled; there may be a few more, which stay zero.
     """
-    unit = gtsam.noiseModel.Unit.Create
     groups = [parts[i : i + 3] for i in range(0, len(parts), 3)]  # no constructor takes more
     graph, ordering = gtsam.GaussianFactorGraph(), gtsam.Ordering()
     for i, group in enumerate(groups):
         own = max(rows - len(groups) + 1, 1) if i == 0 else 1
-        blank: list[Any] = [x for key, width in group for x in (key, np.zeros((own, width)))]
-        blank += [np.zeros(own), unit(own)]
+        right, unit = _nothing(own)
+        blank: list[Any] = [x for key, width in group for x in (key, _zeros(own, width))]
+        blank += [right, unit]
         factor = gtsam.JacobianFactor(*blank)
         if len(groups) == 1:
             return factor
@@ -214,3 +214,13 @@ def empty_factor(parts: Sequence[tuple[int, int]], rows: int) -> gtsam.JacobianF
     for key, _ in parts:
         ordering.push_back(key)
     return gtsam.JacobianFactor(graph, ordering)
+
+
+@lru_cache(maxsize=256)
+def _zeros(rows: int, width: int) -> Array:
+    return np.zeros((rows, width))  # GTSAM copies it
+
+
+@lru_cache(maxsize=64)
+def _nothing(rows: int) -> tuple[Array, gtsam.noiseModel.Unit]:
+    return np.zeros(rows), gtsam.noiseModel.Unit.Create(rows)

@@ -21,7 +21,7 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.waveform import Motion, carriers, predicted_waveform
 from magfusion.receiver.cells import owned_by
-from magfusion.receiver.lockin import WindowOperator, window_operator
+from magfusion.receiver.lockin import WindowOperator
 from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.receiver.turn import on_clock
 from magfusion.units import Array, BoolArray, ComplexArray
@@ -237,15 +237,14 @@ def demodulate_predicted(
         Whether the prediction may be anywhere, so that it tells not whose a phasor is.
     """
     assert receiver.grid is not None
-    assert receiver.admission is not None
     window = receiver.grid.windows(np.array([number]), waveform.time)
     inside = slice(int(window.first[0]), int(window.first[0] + window.count[0]))
     samples = waveform.rows(inside)
     alone = replace(window, first=np.zeros(1, dtype=np.int64))
     calibration = replace(predicted.calibration, time_offset=offset)
     known = on_clock(imu, offset, predicted.gyro_bias_body)
-    site, step = calibration.site, receiver.admission.imu_step
-    operator = window_operator(samples, known, site, receiver.settings, alone, step)
+    site = calibration.site
+    operator = receiver.operator_of_one(samples, known, alone, site)
     if operator.unseen[0]:
         return _without_motion(operator, samples.measured_sensor, site.platform.magnetometer.offset)
     if lost and operator.tone_of_channel is not None:

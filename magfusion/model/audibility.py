@@ -6,6 +6,7 @@ beside it.
 """
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -52,10 +53,16 @@ def tones_of(site: Site) -> Tones:
 
     A beacon that is only planned will have frequencies of its own.
     """
-    frequencies = tone_frequencies(site)
-    if any(slot is not None for beacon in site.beacons for _, slot in beacon.tones):
+    alone = any(slot is not None for beacon in site.beacons for _, slot in beacon.tones)
+    planned = tuple(k if b.planned else -1 for k, b in enumerate(site.beacons) for _ in b.tones)
+    return _tones(tuple(tone_frequencies(site).tolist()), planned, alone=alone)
+
+
+@lru_cache(maxsize=8)
+def _tones(hz: tuple[float, ...], planned: tuple[int, ...], *, alone: bool) -> Tones:
+    frequencies, apart = np.array(hz), np.array(planned)
+    if alone:
         return Tones(frequencies, np.arange(len(frequencies)))
-    apart = np.array([k if b.planned else -1 for k, b in enumerate(site.beacons) for _ in b.tones])
     if np.any(apart >= 0):
         each = np.stack([apart, frequencies], axis=1)
         _, first, of_channel = np.unique(each, axis=0, return_index=True, return_inverse=True)

@@ -218,6 +218,7 @@ def window_operator(
     windows: Windows,
     imu_step: float | None = None,
     designs: Designs | None = None,
+    nyquist_hz: float | None = None,
 ) -> WindowOperator:
     """Return the map from a waveform to phasors, with the gyro's turn of each sample.
 
@@ -233,8 +234,10 @@ def window_operator(
         Usual time between two inertial samples (s): a piece of a stream may have none.
     designs : Designs, optional
         Of the same windows, where they are known.
+    nyquist_hz : float, optional
+        Of the magnetometer, where it is known.
     """
-    nyquist_hz = sample_rate_hz(waveform) / 2.0
+    nyquist_hz = sample_rate_hz(waveform) / 2.0 if nyquist_hz is None else nyquist_hz
     step = usual_step(imu.time, "imu") if imu_step is None else imu_step
     margin = 2.0 * step + 3.0 * site.platform.imu.time_offset_sigma
     silence = silences(imu.time, step, margin)

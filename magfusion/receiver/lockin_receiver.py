@@ -5,6 +5,7 @@ from functools import cached_property
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.model.audibility import tones_of
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.admission import (
@@ -13,7 +14,14 @@ from magfusion.receiver.admission import (
     sample_rate_hz,
 )
 from magfusion.receiver.cells import owned_by
-from magfusion.receiver.design import Designs, separable, variance_growth
+from magfusion.receiver.design import (
+    Designs,
+    Maps,
+    Spacing,
+    nuisances_hz,
+    separable,
+    variance_growth,
+)
 from magfusion.receiver.lockin import WindowOperator, designs_of, window_operator
 from magfusion.receiver.receiver import Receiver
 from magfusion.receiver.windows import LockinSettings, default_settings, sent_frequencies_hz
@@ -33,6 +41,8 @@ class LockinReceiver(Receiver):
         super().__init__(site)
         self._given, self.beside = settings, None
         self._designs: Designs | None = None
+        self._even: dict[Spacing, Maps] = {}
+        self._even_by: tuple[LockinSettings, bytes] | None = None
 
     @property
     def settings(self) -> LockinSettings:
@@ -103,6 +113,34 @@ class LockinReceiver(Receiver):
         if known is None or known.windows is not windows or known.time is not waveform.time:
             known = self._designs = designs_of(waveform, site, self.settings, windows)
         return window_operator(waveform, imu, site, self.settings, windows, designs=known)
+
+    def operator_of_one(
+        self, waveform: Waveform, imu: ImuSamples, window: Windows, site: Site
+    ) -> WindowOperator:
+        """Return the map from the samples of one window to its phasors."""
+        assert self.admission is not None
+        nyquist_hz = 0.5 / self.admission.magnetometer_step
+        tones_hz = tones_of(site).frequencies_hz
+        lines_hz = nuisances_hz(self.settings, tones_hz, nyquist_hz)
+        even = self._even_maps(tones_hz)
+        designs = Designs(self.settings, tones_hz, lines_hz, waveform.time, window, even)
+        return window_operator(
+            waveform,
+            imu,
+            site,
+            self.settings,
+            window,
+            self.admission.imu_step,
+            designs,
+            nyquist_hz,
+        )
+
+    def _even_maps(self, tones_hz: Array) -> dict[Spacing, Maps]:
+        """Return the maps that are kept of evenly spaced samples: none by other settings."""
+        by = (self.settings, tones_hz.tobytes())
+        if self._even_by != by:
+            self._even, self._even_by = {}, by
+        return self._even
 
     def _driven(self, windows: Windows) -> BoolArray:
         return np.ones(len(windows), dtype=bool)
