@@ -99,6 +99,8 @@ def thinned(increments: Increments, accel_bias: Array, gyro_bias: Array) -> Incr
         fill no pair, and those of a fast turn.
     """
     steps = np.diff(increments.first)
+    if steps.max(initial=0) < FEWEST_LEFT * JOINED[-1]:
+        return increments
     for i, joined in enumerate(JOINED):
         long = (steps >= FEWEST_LEFT * joined) & ~increments.bridged
         if i > 0:

@@ -8,7 +8,8 @@ from numpy.linalg import norm
 
 from magfusion.errors import InputError
 from magfusion.estimation.integrity.detection import only
-from magfusion.estimation.motion_stretches import joined, stretches
+from magfusion.estimation.motion_shape import MotionShape
+from magfusion.estimation.motion_stretches import joined, only_stretch, stretches
 from magfusion.estimation.sending import Sending
 from magfusion.estimation.state import State, as_trajectory
 from magfusion.model.audibility import Owned, only_owned, owned_at
@@ -16,6 +17,7 @@ from magfusion.model.channel_effects import tone_frequencies
 from magfusion.model.field import observe_earth
 from magfusion.model.noise import calibration_error, model_error, sensor_positions
 from magfusion.model.parameters import Calibration, linearize_channels, predict_channels
+from magfusion.model.quaternion import unit
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -23,7 +25,7 @@ from magfusion.model.waveform import Motion, carriers, predicted_waveform
 from magfusion.receiver.cells import owned_by
 from magfusion.receiver.lockin import WindowOperator
 from magfusion.receiver.lockin_receiver import LockinReceiver
-from magfusion.receiver.turn import on_clock
+from magfusion.receiver.turn import BodyTurn, on_clock
 from magfusion.units import Array, BoolArray, ComplexArray
 
 # By how much a motion that was found without an IMU errs within a window, one sigma.
@@ -81,6 +83,16 @@ class TakenOff(NamedTuple):
     wanted: Trajectory | None
 
 
+class KnownMotion(NamedTuple):
+    """The motion along the samples of one window, and its turn at them (4, samples).
+
+    As of `MotionShape.turned_at`.
+    """
+
+    shape: MotionShape
+    turned: Array
+
+
 def taken_off(
     samples: Waveform,
     path: Trajectory,
@@ -89,6 +101,7 @@ def taken_off(
     time_offset: float,
     window: float,
     wanted: Array | None = None,
+    known: KnownMotion | None = None,
 ) -> TakenOff:
     """Return what a prediction along a motion leaves of samples.
 
@@ -102,16 +115,23 @@ def taken_off(
         A beacon is predicted that is felt in windows so long (s).
     wanted : ndarray, shape (m,), optional
         Other times at which the motion is asked for (s).
+    known : KnownMotion, optional
+        The motion, where it is known.
     """
     site, measured_sensor = calibration.site, samples.measured_sensor
     earth = np.zeros(3) if site.earth_field_world is None else site.earth_field_world
     unexplained, change = np.empty_like(measured_sensor), np.empty_like(measured_sensor)
     sending, others = Sending.of(calibration, window), []
-    for stretch in stretches(samples.time, path, imu, time_offset, site.gravity):
+    along = (
+        stretches(samples.time, path, imu, time_offset, site.gravity)
+        if known is None
+        else only_stretch(samples.time, known.shape)
+    )
+    for stretch in along:
         shape = stretch.shape
         for rows in stretch.pieces(sending.at_once):
             time = samples.time[rows]
-            motion = shape.at(time)
+            motion = shape.at(time, None if known is None else known.turned[:, rows])
             heard = sending.along(motion)
             predicted, change[rows] = predicted_waveform(
                 motion,
@@ -135,6 +155,7 @@ def demodulate_about(
     path: Trajectory | None = None,
     *,
     wanted: Array | None = None,
+    motion: KnownMotion | None = None,
 ) -> MotionCompensated:
     """Demodulate what a prediction of the waveform leaves, and add the phasors at the centres.
 
@@ -151,11 +172,14 @@ def demodulate_about(
         States between which the motion is interpolated, where they are not those of the windows.
     wanted : ndarray, shape (m,), optional
         Other times at which the motion is asked for (s), with what is left of the samples.
+    motion : KnownMotion, optional
+        Along the samples, where it is known.
     """
     site, known = calibration.site, states if path is None else path
     samples = Waveform(operator.designs.time, measured_sensor)
     window = operator.designs.settings.window
-    off = taken_off(samples, known, imu, calibration, calibration.time_offset, window, wanted)
+    offset = calibration.time_offset
+    off = taken_off(samples, known, imu, calibration, offset, window, wanted, motion)
     earth, sending, unexplained = off.earth_world, off.sending, off.unexplained_sensor
     rest, left = operator.demodulate(unexplained)
     at_centre = predict_channels(
@@ -244,13 +268,19 @@ def demodulate_predicted(
     calibration = replace(predicted.calibration, time_offset=offset)
     known = on_clock(imu, offset, predicted.gyro_bias_body)
     site = calibration.site
-    operator = receiver.operator_of_one(samples, known, alone, site)
+    centre, path = as_trajectory([predicted]), as_trajectory([before, predicted])
+    shape = MotionShape.of(path, imu, offset, site.gravity)
+    turned = shape.turned_at(samples.time)
+    turn = BodyTurn(unit(turned), unit(shape.turned_at(window.centre)))
+    operator = receiver.operator_of_one(samples, known, alone, site, turn)
     if operator.unseen[0]:
         return _without_motion(operator, samples.measured_sensor, site.platform.magnetometer.offset)
     if lost and operator.tone_of_channel is not None:
         return _by_strength(operator, samples.measured_sensor, receiver.site)
-    centre, path = as_trajectory([predicted]), as_trajectory([before, predicted])
-    found = demodulate_about(operator, samples.measured_sensor, centre, imu, calibration, path)
+    motion = KnownMotion(shape, turned)
+    found = demodulate_about(
+        operator, samples.measured_sensor, centre, imu, calibration, path, motion=motion
+    )
     length = receiver.settings.window
     if not blind:
         return found

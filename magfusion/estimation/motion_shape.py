@@ -138,13 +138,20 @@ class MotionShape:
             reach=low_pass_reach(imu) if reach is None else reach,
         )
 
-    def at(self, wanted: Array) -> Trajectory:
+    def turned_at(self, wanted: Array) -> Array:
+        """Return ``body(0)_from_body`` at any times (m,), quaternions (4, m), scalar first."""
+        near = self._near(wanted)
+        return turn_at(self.chain[:, near], self.time[near], self.gyro_body[near], wanted)
+
+    def at(self, wanted: Array, turned: Array | None = None) -> Trajectory:
         """Return the motion at any times.
 
         Parameters
         ----------
         wanted : ndarray, shape (m,)
             Strictly increasing (s).
+        turned : ndarray, shape (4, m), optional
+            As of `turned_at`, where it is known.
 
         Returns
         -------
@@ -156,11 +163,11 @@ class MotionShape:
         path = own, self.position_world[near], self.velocity_world[near]
         position, velocity = hermite(*path, wanted)
         known = self.states.time
-        inside = np.clip(wanted, known[0], known[-1])
+        inside = np.minimum(np.maximum(wanted, known[0]), known[-1])
         lack, slope = hermite(known, *self._lack, inside)
         attitude = product(
             _turn_at(known, self.world_from_start, self._spread, wanted),
-            turn_at(self.chain[:, near], own, self.gyro_body[near], wanted),
+            self.turned_at(wanted) if turned is None else turned,
         )
         beyond = (wanted - inside)[:, None]
         return Trajectory(
@@ -203,7 +210,7 @@ class MotionShape:
         """
         near, known, late = self._near(wanted), self.states.time, self._by_offset
         own = self.time[near]
-        inside = np.clip(wanted, known[0], known[-1])
+        inside = np.minimum(np.maximum(wanted, known[0]), known[-1])
         held_back, slope = hermite(known, *late.at_states, inside)
         change = own, late.position[near], late.velocity[near]
         by_position = hermite(*change, wanted)[0] - held_back
@@ -305,7 +312,8 @@ def _turn_at(known: Array, turn: Array, between: Array, wanted: Array) -> Array:
     """
     if len(known) == 1:
         return np.repeat(turn, len(wanted), axis=1)
-    inside = np.clip(wanted, known[0], known[-1])
-    index = np.clip(np.searchsorted(known, inside, side="right") - 1, 0, len(known) - 2)
-    share = (inside - known[index]) / np.diff(known)[index]
+    inside = np.minimum(np.maximum(wanted, known[0]), known[-1])
+    index = np.searchsorted(known, inside, side="right") - 1
+    index = np.minimum(np.maximum(index, 0), len(known) - 2)
+    share = (inside - known[index]) / (known[1:] - known[:-1])[index]
     return product(turn[:, index], of_vectors(share * between[:, index]))

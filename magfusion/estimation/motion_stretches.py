@@ -51,6 +51,11 @@ class Stretch:
         return self.shape.at(own)
 
 
+def only_stretch(time: Array, shape: MotionShape) -> Iterator[Stretch]:
+    """Yield samples (n,) (s) of which one shape tells the motion."""
+    yield Stretch(0, len(time), -np.inf, np.inf, shape)
+
+
 def stretches(
     time: Array, path: Trajectory, imu: ImuSamples, time_offset: float, gravity: float
 ) -> Iterator[Stretch]:
@@ -68,8 +73,7 @@ def stretches(
         (m/s^2)
     """
     if len(time) <= STRETCH:
-        shape = MotionShape.of(path, imu, time_offset, gravity)
-        yield Stretch(0, len(time), -np.inf, np.inf, shape)
+        yield from only_stretch(time, MotionShape.of(path, imu, time_offset, gravity))
         return
     reach, stamps = low_pass_reach(imu), imu.time + time_offset
     margin = 2 * reach + 2 * MARGIN  # what is averaged is averaged again

@@ -25,12 +25,14 @@ def hermite(known: Array, value: Array, slope: Array, wanted: Array) -> tuple[Ar
     -------
     tuple of ndarray, shape (m, k)
     """
-    index = np.clip(np.searchsorted(known, wanted, side="right") - 1, 0, len(known) - 2)
-    step = (known[index + 1] - known[index])[:, None]
-    share = (wanted - known[index])[:, None] / step
-    rise, begin, end = value[index + 1] - value[index], slope[index] * step, slope[index + 1] * step
+    index = np.searchsorted(known, wanted, side="right") - 1
+    index = np.minimum(np.maximum(index, 0), len(known) - 2)  # as clip, which costs more of few
+    later, from_time, from_value = index + 1, known[index], value[index]
+    step = (known[later] - from_time)[:, None]
+    share = (wanted - from_time)[:, None] / step
+    rise, begin, end = value[later] - from_value, slope[index] * step, slope[later] * step
     square, cube = 3.0 * rise - 2.0 * begin - end, begin + end - 2.0 * rise
     return (
-        value[index] + share * (begin + share * (square + share * cube)),
+        from_value + share * (begin + share * (square + share * cube)),
         (begin + share * (2.0 * square + 3.0 * share * cube)) / step,
     )

@@ -98,9 +98,9 @@ class Designs:
 
     def _at_once(self) -> int:
         """Return how many windows are demodulated at once."""
-        most = int(np.max(self.windows.count, initial=1))
+        most = int(self.windows.count.max(initial=1))
         columns = 6 * len(self.frequencies_hz) + 2
-        return int(np.clip(LARGEST // (8 * most * columns), 1, CHUNK))
+        return min(max(LARGEST // (8 * most * columns), 1), CHUNK)
 
     def _size(self) -> int:
         return sum(map(_size, self.kept.values()))

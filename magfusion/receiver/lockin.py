@@ -27,7 +27,13 @@ from magfusion.receiver.noise import (
     not_below,
     smoothed_over_windows,
 )
-from magfusion.receiver.turn import body_turn_of, measured_from_body, on_clock, standing_in
+from magfusion.receiver.turn import (
+    BodyTurn,
+    body_turn_of,
+    measured_from_body,
+    on_clock,
+    standing_in,
+)
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import AnyArray, Array, BoolArray, ComplexArray, IntArray
 
@@ -219,6 +225,7 @@ def window_operator(
     imu_step: float | None = None,
     designs: Designs | None = None,
     nyquist_hz: float | None = None,
+    turn: BodyTurn | None = None,
 ) -> WindowOperator:
     """Return the map from a waveform to phasors, with the gyro's turn of each sample.
 
@@ -236,15 +243,18 @@ def window_operator(
         Of the same windows, where they are known.
     nyquist_hz : float, optional
         Of the magnetometer, where it is known.
+    turn : BodyTurn, optional
+        How the stream turns, where that is known; where it has gaps it is found anew.
     """
     nyquist_hz = sample_rate_hz(waveform) / 2.0 if nyquist_hz is None else nyquist_hz
     step = usual_step(imu.time, "imu") if imu_step is None else imu_step
     margin = 2.0 * step + 3.0 * site.platform.imu.time_offset_sigma
     silence = silences(imu.time, step, margin)
-    still_from_body = body_turn_of(standing_in(imu, silence))
-    from_body = measured_from_body(site)
-    at_centre = matrices(inverse(still_from_body(windows.centre)))
-    still = still_from_body(waveform.time)
+    if turn is None or len(silence[0]) > 1:  # the last one is behind the stream
+        still_from_body = body_turn_of(standing_in(imu, silence))
+        turn = BodyTurn(still_from_body(waveform.time), still_from_body(windows.centre))
+    from_body, still = measured_from_body(site), turn.at_samples
+    at_centre = matrices(inverse(turn.at_centres))
     lacking = site.platform.magnetometer.lacking
     if lacking:
         from_body = np.eye(3)

@@ -24,6 +24,7 @@ from magfusion.receiver.design import (
 )
 from magfusion.receiver.lockin import WindowOperator, designs_of, window_operator
 from magfusion.receiver.receiver import Receiver
+from magfusion.receiver.turn import BodyTurn
 from magfusion.receiver.windows import LockinSettings, default_settings, sent_frequencies_hz
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -115,9 +116,9 @@ class LockinReceiver(Receiver):
         return window_operator(waveform, imu, site, self.settings, windows, designs=known)
 
     def operator_of_one(
-        self, waveform: Waveform, imu: ImuSamples, window: Windows, site: Site
+        self, waveform: Waveform, imu: ImuSamples, window: Windows, site: Site, turn: BodyTurn
     ) -> WindowOperator:
-        """Return the map from the samples of one window to its phasors."""
+        """Return the map from the samples of one window to its phasors, as of `window_operator`."""
         assert self.admission is not None
         nyquist_hz = 0.5 / self.admission.magnetometer_step
         tones_hz = tones_of(site).frequencies_hz
@@ -133,6 +134,7 @@ class LockinReceiver(Receiver):
             self.admission.imu_step,
             designs,
             nyquist_hz,
+            turn,
         )
 
     def _even_maps(self, tones_hz: Array) -> dict[Spacing, Maps]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,6 +48,16 @@ class Turn:
     @cached_property
     def _to_body(self) -> Array:
         return np.asarray(np.linalg.inv(self.from_body))
+
+
+class BodyTurn(NamedTuple):
+    """The ``still_from_body`` of an inertial stream: at samples (4, m), at windows' centres (4, n).
+
+    Unit quaternions, scalar first.
+    """
+
+    at_samples: Array
+    at_centres: Array
 
 
 def on_clock(

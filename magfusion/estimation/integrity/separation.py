@@ -30,6 +30,9 @@ MOST_DEG = 180.0  # an attitude level beyond it says nothing
 SINGLE_HOLDS = 0.215  # probability of a tail below which a single number bounds it
 LEAST = 1e-30  # rad, m; a deviation below it is none
 PARTS = (slice(0, 3), slice(3, 6))  # rotation, position
+ROWS = np.arange(POSE).reshape(2, 3, 1)  # of the blocks of both, shape (2, 3, 3) with
+COLUMNS = np.arange(POSE).reshape(2, 1, 3)
+UNIT = np.eye(3)
 
 
 class Radius(NamedTuple):
@@ -66,22 +69,22 @@ class Radius(NamedTuple):
 
 def radii(cov: Array) -> Radius:
     """Return the norms of rotation and position, shape (..., 2), of covariances (..., 6, 6)."""
-    blocks = np.stack([cov[..., part, part] for part in PARTS], axis=-3)
+    blocks = cov[..., ROWS, COLUMNS]
     # What is known exactly may round below.
     trace = np.maximum(np.einsum("...ii->...", blocks), 0.0)
-    largest = np.clip(_largest_eigenvalue(blocks), 0.0, trace)
+    largest = np.minimum(np.maximum(_largest_eigenvalue(blocks), 0.0), trace)
     return Radius(np.sqrt(trace), np.sqrt(largest))
 
 
 def _largest_eigenvalue(matrix: Array) -> Array:
     """Return the largest eigenvalue of symmetric matrices (..., 3, 3), by its closed form."""
     mean = np.einsum("...ii->...", matrix) / 3.0
-    rest = matrix - mean[..., None, None] * np.eye(3)
+    rest = matrix - mean[..., None, None] * UNIT
     size = np.sqrt(np.einsum("...ij,...ij->...", rest, rest) / 6.0)
     scaled = rest / np.where(size > 0.0, size, 1.0)[..., None, None]
     (a, b, c), (_, d, e), (_, _, f) = np.moveaxis(scaled, (-2, -1), (0, 1))
     half = 0.5 * (a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d))
-    return mean + 2.0 * size * np.cos(np.arccos(np.clip(half, -1.0, 1.0)) / 3.0)
+    return mean + 2.0 * size * np.cos(np.arccos(np.minimum(np.maximum(half, -1.0), 1.0)) / 3.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,19 +120,27 @@ class Separation:
     rows: Array
 
     @cached_property
+    def _sigmas(self) -> Radius:
+        """All that follow, shape (n, 1 + 2 beacons, 2)."""
+        return radii(np.concatenate([self.cov[:, None], self.subset_cov, self.separation_cov], 1))
+
+    def _part(self, rows: slice | int) -> Radius:
+        return Radius(*(part[:, rows] for part in self._sigmas))
+
+    @property
     def sigma(self) -> Radius:
         """Of the estimate with all, shape (n, 2): rotation and position."""
-        return radii(self.cov)
+        return self._part(0)
 
-    @cached_property
+    @property
     def subset_sigma(self) -> Radius:
         """Of the estimates without a beacon, shape (n, beacons, 2)."""
-        return radii(self.subset_cov)
+        return self._part(slice(1, 1 + self.step.shape[1]))
 
-    @cached_property
+    @property
     def separation_sigma(self) -> Radius:
         """Of the steps, shape (n, beacons, 2)."""
-        return radii(self.separation_cov)
+        return self._part(slice(1 + self.step.shape[1], None))
 
     @cached_property
     def shift(self) -> Array:

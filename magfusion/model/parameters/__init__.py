@@ -223,11 +223,12 @@ def prior_sigma(blocks: tuple[Block, ...]) -> Array:
 
 def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) -> Calibration:
     """Return the calibration moved by a tangent vector, shape (dimension,)."""
-    if not np.any(step):
+    if not step.any():
         return calibration
+    own = np.array(step)  # GTSAM's vectors are read-only
     for block in blocks:
-        part = np.array(step[block.columns])  # GTSAM's vectors are read-only
-        if np.any(part):
+        part = own[block.columns]
+        if part.any():
             calibration = block.parameter.moved(calibration, block.owner, part)
     return calibration
 
