@@ -1,0 +1,102 @@
+"""Windows that are demodulated one by one: keeping designs of even samples changes nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from magfusion.model.samples import ImuSamples, Waveform
+from magfusion.model.site import Site
+from magfusion.receiver.design import ALIKE, evenly_spaced
+from magfusion.receiver.lockin import WindowOperator, window_operator
+from magfusion.receiver.lockin_receiver import LockinReceiver
+from magfusion.receiver.turn import BodyTurn, body_turn_of, on_clock
+from magfusion.receiver.windows import LockinSettings
+from magfusion.simulation.demo_site import demo_site
+from magfusion.simulation.field import synchronised_drives
+from magfusion.simulation.motion import static_motion
+from magfusion.simulation.waveform import simulate_waveform
+from magfusion.units import ComplexArray
+
+RATE_HZ = 2000.0 / 7.0  # a step of 0.2 s holds no whole number of samples
+SETTINGS = LockinSettings(window=0.4, step=0.2)  # s
+STILL = static_motion(np.array([3.0, 2.5, 1.0]), Rotation.from_rotvec([0.1, -0.2, 0.7]))
+
+
+def recorded(jitter: float) -> tuple[Site, Waveform, ImuSamples]:
+    """Return ten seconds whose stamps are told in ns, and jitter (s)."""
+    site, rng = demo_site(), np.random.default_rng(3)
+    wave = simulate_waveform(STILL, site, synchronised_drives(site), RATE_HZ, 10.0, rng)
+    stamps = np.rint(1e9 * (wave.time + jitter * rng.standard_normal(len(wave)))) * 1e-9
+    time = np.arange(0.0, 10.0, 0.005)
+    turning = np.array([0.2, -0.1, 0.3]) * np.sin(time)[:, None]
+    return site, replace(wave, time=stamps), ImuSamples(time, turning, np.zeros((len(time), 3)))
+
+
+def one_by_one(
+    receiver: LockinReceiver, site: Site, wave: Waveform, imu: ImuSamples
+) -> tuple[list[WindowOperator], list[WindowOperator]]:
+    """Return the operators of all windows as they are kept, and as each is made by itself."""
+    windows = receiver.whole(wave, imu)[0]
+    known = on_clock(imu, site.platform.imu.time_offset)
+    turned, own, alone = body_turn_of(known), [], []
+    for k in range(len(windows)):
+        window = windows.rows(slice(k, k + 1))
+        first, count = int(window.first[0]), int(window.count[0])
+        samples = wave.rows(slice(first, first + count))
+        here = replace(window, first=np.zeros(1, dtype=np.int64))
+        turn = BodyTurn(turned(samples.time), turned(here.centre))
+        own.append(receiver.operator_of_one(samples, known, here, site, turn))
+        alone.append(window_operator(samples, known, site, SETTINGS, here))
+    return own, alone
+
+
+def phasors(operator: WindowOperator, wave: Waveform) -> ComplexArray:
+    first = int(np.searchsorted(wave.time, operator.designs.time[0]))
+    rows = slice(first, first + len(operator.designs.time))
+    return operator.demodulate(wave.measured_sensor[rows])[0].phasor_sensor
+
+
+def furthest(kept: list[WindowOperator], alone: list[WindowOperator], wave: Waveform) -> float:
+    """Return by how much phasors differ, as a share of the largest."""
+    found = np.array([[phasors(o, wave) for o in pair] for pair in zip(kept, alone, strict=True)])
+    return float(np.max(np.abs(found[:, 0] - found[:, 1])) / np.max(np.abs(found)))
+
+
+def test_even_samples_share_a_few_designs_and_phasors_are_the_same() -> None:
+    site, wave, imu = recorded(jitter=0.0)
+    receiver = LockinReceiver(site, SETTINGS)
+    kept, alone = one_by_one(receiver, site, wave, imu)
+    assert len(kept) > 40
+    assert furthest(kept, alone, wave) < ALIKE
+    assert len(receiver._even) <= 14  # seven spacings, and what rounding makes of them
+
+
+def test_what_was_asked_before_does_not_matter() -> None:
+    site, wave, imu = recorded(jitter=0.0)
+    kept, _ = one_by_one(LockinReceiver(site, SETTINGS), site, wave, imu)
+    again, _ = one_by_one(LockinReceiver(site, SETTINGS), site, wave, imu)
+    last = again[-1].designs
+    fresh = replace(again[-1], designs=replace(last, even={}, kept={}, asked=set()))
+    assert np.array_equal(phasors(kept[-1], wave), phasors(fresh, wave))
+
+
+def test_uneven_samples_have_designs_of_their_own() -> None:
+    site, wave, imu = recorded(jitter=2e-6)  # s
+    receiver = LockinReceiver(site, SETTINGS)
+    kept, alone = one_by_one(receiver, site, wave, imu)
+    assert furthest(kept, alone, wave) < 1e-12
+    assert not receiver._even
+
+
+@pytest.mark.parametrize("error", [0.9, 5.0])
+def test_times_are_even_within_three_steps(error: float) -> None:
+    step = 1e-9  # s
+    time = np.linspace(-0.2, 0.2, 81)
+    assert evenly_spaced(time, step) is not None
+    time[40] += 3.0 * error * step
+    found = evenly_spaced(time, step)
+    assert (found is None) == (error > 1.0)
+    if found is not None:
+        assert np.max(np.abs(found[1] - time)) <= 3.0 * step
