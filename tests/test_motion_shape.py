@@ -98,7 +98,11 @@ def test_a_motion_changes_with_the_clock_as_its_difference() -> None:
     zero = np.zeros((len(states.time), 3))
     states = replace(states, gyro_bias_body=zero, accel_bias_body=zero)
     wanted = np.arange(2.0, 18.0, 0.0113)
-    turn, push = MotionShape.of(states, imu, 0.0, site.gravity).by_time_offset(wanted)
+    shape = MotionShape.of(states, imu, 0.0, site.gravity)
+    now, (turn, push) = shape.changing_at(wanted)
+    same = motion_at(states, imu, 0.0, site.gravity, wanted)
+    assert np.array_equal(now.world_from_body, same.world_from_body)
+    np.testing.assert_allclose(now.position_world, same.position_world, rtol=0, atol=1e-12)  # m
     step, slow = 1e-3, low_passed(imu)
     ahead, behind = (motion_at(states, slow, s, site.gravity, wanted) for s in (step, -step))
     back = np.swapaxes(behind.world_from_body, 1, 2)

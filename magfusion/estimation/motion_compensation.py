@@ -131,14 +131,15 @@ def taken_off(
         shape = stretch.shape
         for rows in stretch.pieces(sending.at_once):
             time = samples.time[rows]
-            motion = shape.at(time, None if known is None else known.turned[:, rows])
+            turned = None if known is None else known.turned[:, rows]
+            motion, change_of = shape.changing_at(time, turned)
             heard = sending.along(motion)
             predicted, change[rows] = predicted_waveform(
                 motion,
                 heard,
                 earth,
                 carriers(tone_frequencies(heard.site), time),
-                Motion(*shape.by_time_offset(time)),
+                Motion(*change_of),
             )
             unexplained[rows] = measured_sensor[rows] - predicted
         if wanted is not None:
@@ -269,7 +270,8 @@ def demodulate_predicted(
     known = on_clock(imu, offset, predicted.gyro_bias_body)
     site = calibration.site
     centre, path = as_trajectory([predicted]), as_trajectory([before, predicted])
-    shape = MotionShape.of(path, imu, offset, site.gravity)
+    assert receiver.admission is not None
+    shape = MotionShape.of(path, imu, offset, site.gravity, usual=receiver.admission.imu_step)
     turned = shape.turned_at(samples.time)
     turn = BodyTurn(unit(turned), unit(shape.turned_at(window.centre)))
     operator = receiver.operator_of_one(samples, known, alone, site, turn)

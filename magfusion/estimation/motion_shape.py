@@ -71,7 +71,9 @@ class MotionShape:
     accel_world, velocity_world, position_world : ndarray, shape (n, 3)
         As integrated from rest at the origin (m/s^2, m/s, m).
     reach : int
-        Inertial samples on either side over which `by_time_offset` averages.
+        Inertial samples on either side over which `changing_at` averages.
+    usual : float
+        Usual time between two inertial samples (s).
     """
 
     states: Trajectory
@@ -85,6 +87,7 @@ class MotionShape:
     position_world: Array
     gravity: float
     reach: int
+    usual: float
 
     @staticmethod
     def of(
@@ -93,6 +96,7 @@ class MotionShape:
         time_offset: float,
         gravity: float,
         reach: int | None = None,
+        usual: float | None = None,
     ) -> "MotionShape":
         """Integrate an inertial stream through states.
 
@@ -104,11 +108,14 @@ class MotionShape:
             (m/s^2)
         reach : int, optional
             Where the samples are a part of a stream that has its own.
+        usual : float, optional
+            Usual time between two samples (s), where it is known.
         """
         if states.velocity_world is None or states.gyro_bias_body is None:
             raise ValueError("states must have velocity and biases")
         assert states.accel_bias_body is not None
         time = imu.time + time_offset
+        usual = float(np.median(np.diff(imu.time))) if usual is None else usual
         gyro = imu.gyro_body - interpolated(time, states.time, states.gyro_bias_body)
         accel = imu.accel_body - interpolated(time, states.time, states.accel_bias_body)
         chain = turn_from_gyro(time, gyro)
@@ -135,7 +142,8 @@ class MotionShape:
             velocity_world=velocity,
             position_world=position,
             gravity=gravity,
-            reach=low_pass_reach(imu) if reach is None else reach,
+            reach=low_pass_reach(usual) if reach is None else reach,
+            usual=usual,
         )
 
     def turned_at(self, wanted: Array) -> Array:
@@ -158,24 +166,61 @@ class MotionShape:
         Trajectory
             Pose and velocity.
         """
-        near = self._near(wanted)
-        own = self.time[near]
-        path = own, self.position_world[near], self.velocity_world[near]
+        near, known = self._near(wanted), self.states.time
+        path = self.time[near], self.position_world[near], self.velocity_world[near]
         position, velocity = hermite(*path, wanted)
-        known = self.states.time
         inside = np.minimum(np.maximum(wanted, known[0]), known[-1])
         lack, slope = hermite(known, *self._lack, inside)
-        attitude = product(
-            _turn_at(known, self.world_from_start, self._spread, wanted),
-            self.turned_at(wanted) if turned is None else turned,
-        )
-        beyond = (wanted - inside)[:, None]
         return Trajectory(
             time=wanted,
-            world_from_body=matrices(unit(attitude)),
-            position_world=position + lack + slope * beyond,
+            world_from_body=self._attitude(wanted, turned),
+            position_world=position + lack + slope * (wanted - inside)[:, None],
             velocity_world=velocity + slope,
         )
+
+    def changing_at(
+        self, wanted: Array, turned: Array | None = None
+    ) -> tuple[Trajectory, tuple[Array, Array]]:
+        """Return the motion at any times as `at`, and its derivative by the IMU's time offset.
+
+        The states stay where they are.  The stream's shape comes later by it: everywhere the body
+        has yet to turn and to move as much as it does in that time, less what it has at the states.
+        Rate and specific force are averaged (`low_passed`): white noise in a derivative would pass
+        for information.
+
+        Returns
+        -------
+        Trajectory
+            Pose and velocity.
+        tuple of ndarray, shape (m, 3)
+            Rotation (rad/s) and position (m/s), world axes.
+        """
+        near, known, late = self._near(wanted), self.states.time, self._by_offset
+        own = self.time[near]
+        place = np.concatenate([self.position_world[near], late.position[near]], axis=1)
+        speed = np.concatenate([self.velocity_world[near], late.velocity[near]], axis=1)
+        position, velocity = hermite(own, place, speed, wanted)
+        inside = np.minimum(np.maximum(wanted, known[0]), known[-1])
+        value, change = (
+            np.concatenate([lack, -held], axis=1)
+            for lack, held in zip(self._lack, late.at_states, strict=True)
+        )
+        lack, slope = hermite(known, value, change, inside)
+        position += lack + slope * (wanted - inside)[:, None]
+        motion = Trajectory(
+            time=wanted,
+            world_from_body=self._attitude(wanted, turned),
+            position_world=position[:, :3],
+            velocity_world=velocity[:, :3] + slope[:, :3],
+        )
+        by_rotation = interpolated(wanted, known, late.rate_at_states)
+        by_rotation -= interpolated(wanted, own, late.rate[near])
+        return motion, (by_rotation, position[:, 3:])
+
+    def _attitude(self, wanted: Array, turned: Array | None) -> Array:
+        turned = self.turned_at(wanted) if turned is None else turned
+        start = _turn_at(self.states.time, self.world_from_start, self._spread, wanted)
+        return matrices(unit(product(start, turned)))
 
     def _near(self, wanted: Array) -> slice:
         """Return the inertial samples that tell of some times, with a few about them."""
@@ -195,28 +240,6 @@ class MotionShape:
     def _spread(self) -> Array:
         """The turn that is spread between each state and the next, shape (3, states - 1) (rad)."""
         return _between(self.world_from_start)
-
-    def by_time_offset(self, wanted: Array) -> tuple[Array, Array]:
-        """Return the derivative of the motion by the IMU's time offset, the states where they are.
-
-        The stream's shape comes later by it: everywhere the body has yet to turn and to move as
-        much as it does in that time, less what it has at the states.  Rate and specific force are
-        averaged (`low_passed`): white noise in a derivative would pass for information.
-
-        Returns
-        -------
-        tuple of ndarray, shape (m, 3)
-            Rotation (rad/s) and position (m/s), world axes.
-        """
-        near, known, late = self._near(wanted), self.states.time, self._by_offset
-        own = self.time[near]
-        inside = np.minimum(np.maximum(wanted, known[0]), known[-1])
-        held_back, slope = hermite(known, *late.at_states, inside)
-        change = own, late.position[near], late.velocity[near]
-        by_position = hermite(*change, wanted)[0] - held_back
-        by_position -= slope * (wanted - inside)[:, None]
-        by_rotation = interpolated(wanted, known, late.rate_at_states)
-        return by_rotation - interpolated(wanted, own, late.rate[near]), by_position
 
     @cached_property
     def _by_offset(self) -> "_ByOffset":
@@ -240,7 +263,7 @@ class MotionShape:
         # since the beginning must not matter there.
         since = self.time - self.time[0]
         late = self._averaged(since) - since
-        uneven = np.flatnonzero(np.abs(late) > 0.5 * float(np.median(np.diff(self.time))))
+        uneven = np.flatnonzero(np.abs(late) > 0.5 * self.usual)
         position[uneven] -= late[uneven, None] * speed[uneven]
         velocity = self._averaged(speed)
         del speed

@@ -75,7 +75,7 @@ def stretches(
     if len(time) <= STRETCH:
         yield from only_stretch(time, MotionShape.of(path, imu, time_offset, gravity))
         return
-    reach, stamps = low_pass_reach(imu), imu.time + time_offset
+    reach, stamps = low_pass_reach(_usual(imu)), imu.time + time_offset
     margin = 2 * reach + 2 * MARGIN  # what is averaged is averaged again
     for first in range(0, len(time), STRETCH):
         last = min(first + STRETCH, len(time))
@@ -94,6 +94,10 @@ def joined(parts: list[Trajectory]) -> Trajectory:
         return parts[0]
     known = (name for name, value in vars(parts[0]).items() if value is not None)
     return Trajectory(**{k: np.concatenate([getattr(p, k) for p in parts]) for k in known})
+
+
+def _usual(imu: ImuSamples) -> float:
+    return float(np.median(np.diff(imu.time)))
 
 
 def _about(time: Array, known: Array, stamps: Array, margin: int) -> tuple[slice, slice]:

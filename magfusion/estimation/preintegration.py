@@ -163,7 +163,7 @@ def low_passed(imu: ImuSamples) -> ImuSamples:
 
     White noise in a derivative would pass for information on the time offset.
     """
-    size = 2 * low_pass_reach(imu) + 1
+    size = 2 * low_pass_reach(_usual(imu)) + 1
     gyro, accel = (
         uniform_filter1d(stream, size, axis=0, mode="nearest")
         for stream in (imu.gyro_body, imu.accel_body)
@@ -186,7 +186,7 @@ def low_passed_rate_at(imu: ImuSamples, time_offset: float, wanted: Array) -> Ar
     ndarray, shape (m, 3)
         (rad/s)
     """
-    last, reach = len(imu) - 1, low_pass_reach(imu)
+    last, reach = len(imu) - 1, low_pass_reach(_usual(imu))
     before = np.clip(np.searchsorted(imu.time, wanted - time_offset) - 1, 0, max(last - 1, 0))
     after = np.minimum(before + 1, last)
     ends = np.zeros((2, len(wanted), 3))
@@ -197,7 +197,10 @@ def low_passed_rate_at(imu: ImuSamples, time_offset: float, wanted: Array) -> Ar
     return np.asarray(((1.0 - share) * ends[0] + share * ends[1]) / (2 * reach + 1))
 
 
-def low_pass_reach(imu: ImuSamples) -> int:
-    """Return over how many samples on either side `low_passed` averages."""
-    usual = float(np.median(np.diff(imu.time)))
+def low_pass_reach(usual: float) -> int:
+    """Return over how many samples, ``usual`` apart (s), `low_passed` averages on either side."""
     return int(0.5 * RATE_SPAN / usual)
+
+
+def _usual(imu: ImuSamples) -> float:
+    return float(np.median(np.diff(imu.time)))

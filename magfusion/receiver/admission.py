@@ -248,19 +248,19 @@ def silences(imu_time: Array, step: float, margin: float) -> tuple[Array, Array]
 
 
 def meets_silence(
-    windows: Windows, length: float, time: Array, silence: tuple[Array, Array]
+    windows: Windows, length: float, step: float, silence: tuple[Array, Array]
 ) -> BoolArray:
     """Return which windows of a length (s) lack inertial samples.
 
     Parameters
     ----------
-    time : ndarray
-        Of all samples of the magnetometer (s).
+    step : float
+        Usual time between two samples of the magnetometer (s).
     silence : tuple of ndarray
         As from `silences`.
     """
     begin, end = windows.centre - length / 2.0, windows.centre + length / 2.0
-    return meets(*silence, begin, end - LATEST_USE * float(np.median(np.diff(time))))
+    return meets(*silence, begin, end - LATEST_USE * step)
 
 
 def meets(begin: Array, end: Array, span_begin: Array, span_end: Array) -> BoolArray:

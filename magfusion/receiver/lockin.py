@@ -269,7 +269,7 @@ def window_operator(
         still_from_body=still,
         measured_from_still=from_body @ at_centre,
         declared_noise=site.platform.magnetometer.noise_density * float(np.sqrt(nyquist_hz)),
-        unseen=meets_silence(windows, settings.window, waveform.time, silence),
+        unseen=meets_silence(windows, settings.window, 0.5 / nyquist_hz, silence),
         apart=np.zeros(len(windows), dtype=bool),
         lacking=lacking,
         tone_of_channel=tones.of_channel if tones.reused else None,
