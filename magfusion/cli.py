@@ -252,6 +252,9 @@ def _import_uncollected(modules: tuple[str, ...]) -> None:
     """
     if gc.isenabled():
         return
+    from magfusion.model.numpy_tools import import_tools_later
+
+    import_tools_later()
     for module in modules:
         import_module(f"magfusion.{module}")
     gc.freeze()

@@ -229,6 +229,42 @@ assert pandas.Series([1]).sum() == 1
     assert done.returncode == 0, done.stderr
 
 
+def test_tools_of_numpy_wait_until_somebody_asks() -> None:
+    told = """
+import sys
+from magfusion.model.numpy_tools import TOOLS, import_tools_later
+import_tools_later()
+import scipy.spatial.transform
+names = ["numpy." + name for name in TOOLS]
+assert not any(name in sys.modules for name in names)
+import numpy as np
+np.testing.assert_array_equal(np.ones(2), np.ones(2))
+assert np.f2py.__name__ == "numpy.f2py" and callable(np.f2py.get_include)
+assert callable(np.ctypeslib.as_array)
+"""
+    done = _child("-c", told)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_filter_does_without_statistics_and_whoever_asks_for_them_has_them() -> None:
+    told = """
+import sys
+import numpy as np
+from magfusion.estimation.without_statistics import without_statistics
+with without_statistics():
+    from filterpy.kalman import ExtendedKalmanFilter
+kalman = ExtendedKalmanFilter(dim_x=1, dim_z=1)
+kalman.update(np.array([1.0]), lambda _: np.eye(1), lambda x: x[0])
+assert "scipy.stats" not in sys.modules
+assert abs(kalman.log_likelihood + 0.5 * (np.log(4.0 * np.pi) + 0.5)) < 1e-12
+import filterpy.stats, scipy.stats
+assert filterpy.stats.norm_cdf((0.0, 1.0), 0.0, 1.0) == scipy.stats.norm.cdf(1.0) - 0.5
+assert scipy.stats.chi2.cdf(0.0, 1) == 0.0
+"""
+    done = _child("-c", told)
+    assert done.returncode == 0, done.stderr
+
+
 def test_a_command_collects_garbage_but_not_among_what_it_imported(
     tmp_path: Path,
 ) -> None:

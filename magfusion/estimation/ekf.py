@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import leaves_out
 from magfusion.estimation.propagation import Propagated
 from magfusion.estimation.state import MOTION, State, between, consider_update, moved, states_of
+from magfusion.estimation.without_statistics import without_statistics
 from magfusion.model.parameters import Block
 from magfusion.units import Array
 
@@ -38,11 +40,16 @@ def telling_rows(
     return error[kept], jacobian[kept]
 
 
-def _step(cov: Array, error: Array, jacobian: Array) -> tuple[Array, Array]:
-    from filterpy.kalman import ExtendedKalmanFilter  # brings scipy.stats, a second of every start
+@cache
+def _filter() -> type:
+    with without_statistics():
+        from filterpy.kalman import ExtendedKalmanFilter
+    return ExtendedKalmanFilter
 
+
+def _step(cov: Array, error: Array, jacobian: Array) -> tuple[Array, Array]:
     size = len(cov)
-    kalman = ExtendedKalmanFilter(dim_x=size, dim_z=len(error))
+    kalman = _filter()(dim_x=size, dim_z=len(error))
     kalman.x = np.zeros(size)  # filterpy's own (n, 1) would broadcast to a matrix
     kalman.P = cov
     kalman.update(
