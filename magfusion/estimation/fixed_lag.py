@@ -124,16 +124,14 @@ class SlidingWindow:
             Where the window cannot be solved; it is then as it was.
         """
         kept = (self.nodes, self.prior, self.state, self.lagged, self.left)
-        nodes = self.nodes or [Node(self.state, (), None)]
+        nodes, passed = self.nodes or [Node(self.state, (), None)], self._has_passed(0)
         new = predicted.state if linearization_point is None else linearization_point
         self.nodes = [*nodes, Node(new, tuple(measurements), predicted.link)]
-        cov: Array | None = None
         try:
-            for _ in range(1 if linearization_point is None else ITERATIONS_FAR):
+            cov = self._iterate(passed=passed)
+            for _ in range(0 if linearization_point is None else ITERATIONS_FAR - 1):
                 cov = self._iterate()
-            while self.nodes[-1].state.time - self.nodes[0].state.time > self.lag:
-                self._drop_first(cov)
-                cov = None
+            self._tell_passed(cov)
         except (RuntimeError, np.linalg.LinAlgError) as error:
             self.nodes, self.prior, self.state, self.lagged, self.left = kept
             reason = str(error).strip().splitlines()[0]
@@ -141,16 +139,31 @@ class SlidingWindow:
 
     def replace_state(self, state: State) -> None:
         """Go on from another state, with its covariance for all that was known."""
-        self.left = [*self.left, *(n.state for n in self.nodes if n.state.time < state.time)]
+        untold = self.nodes[1:] if self._has_passed(0) else self.nodes
+        self.left = [*self.left, *(n.state for n in untold if n.state.time < state.time)]
         self.nodes, self.prior = [], _prior_of(state)
         self.state = self.lagged = state
 
-    def _iterate(self) -> Array:
-        """Take a step; return the covariance of the first state before it."""
-        graph, last = self._linearized(self.nodes), len(self.nodes) - 1
+    def _has_passed(self, number: int) -> bool:
+        """Return whether a node is older than the lag: a first one is told, and leaves next."""
+        nodes = self.nodes
+        return len(nodes) > 1 and nodes[-1].state.time - nodes[number].state.time > self.lag
+
+    def _iterate(self, *, passed: bool = False) -> Array:
+        """Take a step; return the covariance of the first state before it.
+
+        Parameters
+        ----------
+        passed : bool
+            Whether the first node leaves, as it is linearised with all others.
+        """
+        graph, begin = self._linearized(self.nodes), 0
+        if passed:
+            graph, begin = self._without_first(graph), 1
+        last = begin + len(self.nodes) - 1
         # Both ends stay to the last, so that one elimination tells the covariance of either.
-        solved, rest = eliminate_partial(graph, _keys(range(1, last), None))
-        information, vector = rest.hessian(_keys([0, last], self.calibration_key))
+        solved, rest = eliminate_partial(graph, _keys(range(begin + 1, last), None))
+        information, vector = rest.hessian(_keys([begin, last], self.calibration_key))
         oldest, newest = slice(0, MOTION), slice(MOTION, None)
         by_newest = np.linalg.solve(information[oldest, oldest], information[oldest, newest])
         own = information[newest, newest] - information[newest, oldest] @ by_newest
@@ -162,7 +175,7 @@ class SlidingWindow:
         left = vector[oldest] - information[oldest, newest] @ step
         first = np.asarray(np.linalg.solve(information[oldest, oldest], left))
         given = gtsam.VectorValues()
-        for end, part in ((0, first), (last, step[:MOTION])):
+        for end, part in ((begin, first), (last, step[:MOTION])):
             for key, own in _split(part, end):
                 given.insert(key, own)
         if self.calibration_key is not None:
@@ -170,7 +183,7 @@ class SlidingWindow:
         steps = solved.optimize(given)
         calibration = retract(self.nodes[0].state.calibration, self.blocks, step[MOTION:])
         nodes = []
-        for i, node in enumerate(self.nodes):
+        for i, node in enumerate(self.nodes, begin):
             motion = np.concatenate([steps.at(X(i)), steps.at(V(i)), steps.at(B(i))])
             nodes.append(replace(node, state=moved_to(node.state, calibration, motion)))
         self.nodes = nodes
@@ -196,18 +209,37 @@ class SlidingWindow:
         linear.push_back(self._prior_factor(states[0]))
         return linear
 
-    def _prior_factor(self, first: State) -> gtsam.JacobianFactor:
+    def _prior_factor(self, first: State, number: int = 0) -> gtsam.JacobianFactor:
+        """Return the prior of a node's state."""
         prior = self.prior
-        right = prior.right - prior.sqrt_information @ between(
-            prior.linearization_point, first, self.blocks
-        )
-        parts = [(X(0), 6), (V(0), 3), (B(0), 6)]
+        moved = between(prior.linearization_point, first, self.blocks)
+        right = prior.right - prior.sqrt_information @ moved
+        parts = [(X(number), 6), (V(number), 3), (B(number), 6)]
         if self.blocks:
             parts.append((CALIBRATION_KEY, dimension(self.blocks)))
         factor = empty_factor(parts, len(right))
         factor.getA()[...] = prior.sqrt_information
         factor.getb()[...] = right
         return factor
+
+    def _tell_passed(self, cov: Array) -> None:
+        """Tell the states that are older than the lag; the last of them leaves with the next epoch.
+
+        Then the whole window is linearised where it is now, and none of it twice.
+
+        Parameters
+        ----------
+        cov : ndarray
+            Of the first state, as the last step solved it: a step later it is the same.
+        """
+        while self._has_passed(0):
+            self.lagged = replace(self.nodes[0].state, cov=cov)
+            self.left = [*self.left, self.lagged]
+            if not self._has_passed(1):
+                return
+            first, second = self.nodes[:2]
+            self._leave(self._linearized([first, replace(second, measurements=())]))
+            cov = self._cov_of_first()
 
     def _cov_of_first(self) -> Array:
         """Return the covariance of the first state, the whole window and its past considered."""
@@ -216,26 +248,26 @@ class SlidingWindow:
         information, _ = rest.hessian(_keys([0], self.calibration_key))
         return _even(np.asarray(np.linalg.inv(information)))
 
-    def _drop_first(self, solved: Array | None) -> None:
-        """Leave the information of the first node as a prior of the second.
+    def _without_first(self, graph: gtsam.GaussianFactorGraph) -> gtsam.GaussianFactorGraph:
+        """Return a window's linear graph without its first node, whose information is a prior."""
+        own, others = gtsam.GaussianFactorGraph(), gtsam.GaussianFactorGraph()
+        keys = {X(0), V(0), B(0)}
+        for i in range(graph.size()):
+            factor = graph.at(i)
+            (others if keys.isdisjoint(factor.keys()) else own).push_back(factor)
+        self._leave(own)
+        others.push_back(self._prior_factor(self.nodes[0].state, 1))
+        return others
 
-        Parameters
-        ----------
-        solved : ndarray, optional
-            Covariance of the first state, as the window's last step solved it: a step later it is
-            the same.
-        """
+    def _leave(self, graph: gtsam.GaussianFactorGraph) -> None:
+        """Let the first node go: what a linear graph says of it is a prior of the second."""
         first, second = self.nodes[:2]
-        cov = self._cov_of_first() if solved is None else solved
-        graph = self._linearized([first, replace(second, measurements=())])
         _, rest = eliminate_partial(graph, _keys([0], None), orthogonal=True)
         sqrt_information, right = rest.jacobian(_keys([1], self.calibration_key))
         passed = second.state.time - first.state.time
         noise = self.process_noise.cov(second.state.calibration, second.state.time, passed)
         sqrt_information, right = self._carried(sqrt_information, right, noise)
         self.prior = Prior(second.state, sqrt_information, right)
-        self.lagged = replace(first.state, cov=cov)
-        self.left = [*self.left, self.lagged]
         self.nodes = self.nodes[1:]
 
     def _carried(self, sqrt_information: Array, right: Array, noise: Array) -> tuple[Array, Array]:

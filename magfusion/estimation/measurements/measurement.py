@@ -10,6 +10,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import repeat
 from typing import Self
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -183,10 +184,17 @@ def joined(parts: Iterable[Measurement], epochs: Iterable[int] | None = None) ->
     return out
 
 
+_KINDS: WeakKeyDictionary[Measurement, str] = WeakKeyDictionary()
+
+
 def _kind(part: Measurement) -> str:
-    values = ((name, getattr(part, name)) for name in _compared(type(part)))
-    shared = {name: value for name, value in values if not isinstance(value, np.ndarray)}
-    return f"{type(part).__qualname__} {shared}"
+    """Return what is the same of all that are joined; a window asks it of each at every epoch."""
+    known = _KINDS.get(part)
+    if known is None:
+        values = ((name, getattr(part, name)) for name in _compared(type(part)))
+        shared = {name: value for name, value in values if not isinstance(value, np.ndarray)}
+        known = _KINDS[part] = f"{type(part).__qualname__} {shared}"
+    return known
 
 
 @cache
