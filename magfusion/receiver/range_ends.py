@@ -74,6 +74,10 @@ def saturated(
     measured = waveform.measured_sensor[:until]
     fresh = np.concatenate([[0], np.flatnonzero(_changed(measured)) + 1])
     begin, end = np.searchsorted(fresh, first), np.searchsorted(fresh, last)
+    # The ends know of those before, but for how long the last of them kept its value.
+    new = int(np.searchsorted(waveform.time[fresh], min(one.until for one in ends), side="right"))
+    known_until = max(min(new, int(begin.min())) - LONGEST, 0)
+    fresh, begin, end = fresh[known_until:], begin - known_until, end - known_until
     value, time = measured[fresh], waveform.time[fresh]
     known = np.array([(one.low, one.high, one.finest, one.kept) for one in ends]).T
     low = np.minimum(np.minimum.accumulate(value), known[0])
