@@ -115,6 +115,8 @@ def smoothed_over_windows(
     unseen : bool ndarray, shape (n,), optional
         Windows without the gyro's turn: their noise is their own.
     """
+    if len(centre) == 1:
+        return noise_cov
     apart = centre[1:] - centre[:-1] > 1.5 * step
     if unseen is not None:
         apart |= unseen[1:] != unseen[:-1]
