@@ -17,7 +17,7 @@ def _stream(seed: int) -> Waveform:
     field = np.clip(step * np.round(field / step), -9.0, 9.0)
     if seed % 4 == 0:
         field = np.repeat(field[::3], 3, axis=0)
-    return Waveform(0.0035 * np.arange(count), np.asarray(field, dtype=np.float64))
+    return Waveform(np.linspace(0.0, 3.15, count, endpoint=False), field)
 
 
 @pytest.mark.parametrize("before", [30, 300])
