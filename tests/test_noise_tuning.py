@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from magfusion.estimation import variance_components
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.integrity.tuned_noise import tuned_noise
 from magfusion.estimation.noise_tuning import Tuned, tuned_site
+from magfusion.estimation.solve.bounded import minimise_curved
 from magfusion.estimation.variance_components import KINDS, NORMAL, STUDENT, likeliest
 from magfusion.files.site import load_site, save_site
 from magfusion.model.samples import Log
@@ -38,7 +40,8 @@ def declared(imu: float = 1.0, model: float = 1.0) -> Site:
     return replace(site, model_error=model * site.model_error, platform=platform)
 
 
-Cost = Callable[[np.ndarray], tuple[float, np.ndarray]]
+Cost = Callable[[np.ndarray], float]
+Curved = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def found(result: Smoothed, key: str) -> np.ndarray:
@@ -155,21 +158,50 @@ def test_of_a_strong_beacon_nothing_is_found_that_was_not_declared() -> None:
     assert np.mean(noise + white) == pytest.approx(1.0, abs=0.2)
 
 
-def test_the_slope_of_the_likelihood_is_its_derivative(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slope_and_curvature_of_the_likelihood_are_its_derivatives(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     asked: list[tuple[np.ndarray, np.ndarray]] = []
 
-    def compare(cost: Cost, start: np.ndarray, *_: object, **__: object) -> np.ndarray:
+    def compare(cost: Cost, curved: Curved, start: np.ndarray, *_: object) -> np.ndarray:
         at, step = start + 0.3, 1e-6 * np.eye(len(start))
-        slope = [(cost(at + one)[0] - cost(at - one)[0]) / 2e-6 for one in step]
-        asked.append((cost(at)[1], np.array(slope)))
+        slope = [(cost(at + one) - cost(at - one)) / 2e-6 for one in step]
+        curvature = [(curved(at + one)[0] - curved(at - one)[0]) / 2e-6 for one in step]
+        asked.append((curved(at)[0], np.array(slope)))
+        asked.append((curved(at)[1], np.array(curvature)))
         return start
 
-    monkeypatch.setattr(variance_components, "minimise_sloped", compare)
+    monkeypatch.setattr(variance_components, "minimise_curved", compare)
     rng = np.random.default_rng(0)
     parts, square = rng.uniform(0.1, 2.0, (4, 50)), rng.chisquare(6, 50)
     likeliest(square, parts, np.full(50, 0.1), np.full(50, 0.5), 6, KINDS)
-    ((given, expected),) = asked
-    assert given == pytest.approx(expected, rel=1e-6)
+    assert len(asked) == 2
+    for given, expected in asked:
+        assert given == pytest.approx(expected, rel=1e-6)
+
+
+def test_no_quasi_newton_search_finds_a_likelier_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of parts that are there and of parts that are not, among them two that are much alike."""
+    behind: list[float] = []
+
+    def compare(cost: Cost, curved: Curved, start: np.ndarray, limits: np.ndarray) -> np.ndarray:
+        options = {"maxiter": 500, "ftol": 1e-15, "gtol": 1e-9}
+        other = minimize(cost, start, method="L-BFGS-B", bounds=limits, options=options)
+        found = minimise_curved(cost, curved, start, limits)
+        assert np.all((found >= limits[:, 0]) & (found <= limits[:, 1]))
+        behind.append(cost(found) - float(other.fun))
+        return found
+
+    monkeypatch.setattr(variance_components, "minimise_curved", compare)
+    rng = np.random.default_rng(0)
+    time = np.tile(np.arange(1, 9), 60)
+    for _ in range(20):
+        parts = np.stack([np.ones(480), 4.0 / time, 4.0 / time**2, rng.uniform(0.1, 3.0, 480)])
+        sizes = rng.permutation([1.0, 0.5, 0.0, 0.0]) * rng.uniform(0.3, 3.0, 4)
+        square = (sizes**2 @ parts + 0.1) * rng.chisquare(6, 480)
+        likeliest(square, parts, np.full(480, 0.1), np.full(480, 0.5), 6, KINDS)
+    assert len(behind) == 20
+    assert max(behind) < 1e-3  # of a log-likelihood
 
 
 @pytest.mark.slow

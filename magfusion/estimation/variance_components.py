@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 
 from magfusion.estimation.residual_shares import ChannelErrors
-from magfusion.estimation.solve.bounded import minimise_sloped
+from magfusion.estimation.solve.bounded import minimise_curved
 from magfusion.units import Array
 
 PRIOR = float(np.log(2.0))  # of the logarithm of a declared sigma
@@ -224,20 +224,30 @@ def likeliest(
     scaled = gain * square
     reach, constant = scaled / STUDENT, width * scaled
 
-    def cost(log: Array) -> tuple[float, Array]:
+    def cost(log: Array) -> float:
+        squares = np.exp(2.0 * log)
+        variance = squares @ parts + fixed
+        bounded = width * np.log1p(reach / variance)
+        likelihood = 0.5 * float(weight @ (components * np.log(variance) + bounded))
+        priors = [np.log(np.sum(squares[kind])) / PRIOR for kind in kinds]
+        return likelihood + 0.125 * float(np.sum(np.square(priors)))
+
+    def curved(log: Array) -> tuple[Array, Array]:
         squares = np.exp(2.0 * log)
         by = squares[:, None] * parts
         variance = np.sum(by, axis=0) + fixed
-        bounded = width * np.log1p(reach / variance)
-        likelihood = 0.5 * float(weight @ (components * np.log(variance) + bounded))
-        left = components - constant / (STUDENT * variance + scaled)
-        slope = by @ (weight * left / variance)
+        heavy = STUDENT * variance + scaled
+        left = (components - constant / heavy) / variance
+        bend = (STUDENT * constant / heavy**2 - left) / variance
+        slope = by @ (weight * left)
+        curvature = 2.0 * (by * (weight * bend)) @ by.T + np.diag(2.0 * slope)
         for kind in kinds:
             total = float(np.sum(squares[kind]))
-            prior = 0.5 * np.log(total) / PRIOR
-            likelihood += 0.5 * prior**2
-            slope[kind] += prior / PRIOR * squares[kind] / total
-        return likelihood, slope
+            share, off = squares[kind] / total, 0.5 * np.log(total) / PRIOR**2
+            slope[kind] += off * share
+            curvature[kind, kind] += 2.0 * off * np.diag(share)
+            curvature[kind, kind] += (1.0 / PRIOR**2 - 2.0 * off) * np.outer(share, share)
+        return slope, curvature
 
     limits = np.log(np.stack([least, np.full(len(parts), MOST)], axis=1))
-    return minimise_sloped(cost, start, limits, steps=200, decrease=1e-14)
+    return minimise_curved(cost, curved, start, limits)
