@@ -253,8 +253,10 @@ def _import_uncollected(modules: tuple[str, ...]) -> None:
     if gc.isenabled():
         return
     from magfusion.model.numpy_tools import import_tools_later
+    from magfusion.model.scipy_notes import leave_notes_out
 
     import_tools_later()
+    leave_notes_out()
     for module in modules:
         import_module(f"magfusion.{module}")
     gc.freeze()
