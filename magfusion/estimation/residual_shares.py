@@ -9,7 +9,7 @@ from magfusion.estimation.factors import CONSIDERED_KEY
 from magfusion.estimation.graph import Estimate, Graph
 from magfusion.estimation.inertial import ROWS
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.solve.bordered import eliminate
+from magfusion.estimation.solve.bordered import eliminate, eliminate_in_sequence
 from magfusion.estimation.state import states_in
 from magfusion.model.field import model_error_cov
 from magfusion.model.noise import cholesky, sensor_positions
@@ -102,6 +102,7 @@ class Leavings:
         )
         assert rows.by_pose is not None
         self._by_pose = rows.by_pose.reshape(len(error), -1, 6)
+        self._net = eliminate_in_sequence(self._linear, self._ordering)
         self._error, self._inertial_error = self._left_of_all()
         self._draw(site, sensor_positions(site, poses), windows)
 
@@ -167,12 +168,21 @@ class Leavings:
 
     def _left_of_all(self) -> tuple[Array, Array]:
         """Return what the linear system leaves of its right-hand sides."""
-        step = eliminate(self._linear, self._ordering).optimize()
+        step = self._step()
         rows = np.zeros((len(self._error), self._error[0].size))
         for row, factor, told in zip(rows, self._fields, self._told, strict=True):
             row[told] = factor.error_vector(step)[: row[told].size]
         kept = rows.reshape(self._error.shape) / self._weight
         return kept, self._rows_of([factor.error_vector(step) for factor in self._inertial])
+
+    def _step(self) -> gtsam.VectorValues:
+        """Return the solution of the linear system with the right-hand sides that it has now."""
+        if self._net is None:
+            return eliminate(self._linear, self._ordering).optimize()
+        # One elimination serves them all: its triangle and its transpose are solved with each.
+        uphill = self._linear.gradientAtZero()
+        step = self._net.backSubstitute(self._net.backSubstituteTranspose(uphill))
+        return step.scale(-1.0)
 
     def _rows_of(self, errors: list[Array]) -> Array:
         """Return inertial errors in their units, shape (intervals, 15)."""

@@ -78,6 +78,19 @@ def eliminate(
         return graph.eliminateMultifrontal(ordering, gtsam.EliminateQR)
 
 
+def eliminate_in_sequence(
+    graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
+) -> gtsam.GaussianBayesNet | None:
+    """Return the conditionals of a linear graph, to be solved with other right-hand sides.
+
+    None where Cholesky fails: of QR's triangle alone such solutions have half the digits.
+    """
+    try:
+        return graph.eliminateSequential(ordering)
+    except RuntimeError:
+        return None
+
+
 def eliminate_partial(
     graph: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, *, orthogonal: bool = False
 ) -> tuple[gtsam.GaussianBayesNet, gtsam.GaussianFactorGraph]:
