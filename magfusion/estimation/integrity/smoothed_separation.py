@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.estimation import chain_system as chains
+from magfusion.estimation.chain_parts import Part, parts_of
 from magfusion.estimation.batch import Smoothed
 from magfusion.estimation.chain_system import FieldRows, Normal, chain_system, column_groups
 from magfusion.estimation.convergence import OPEN_ROTATION
@@ -110,11 +111,12 @@ def _without_each(
     """
     per_variant = 8.0 * 4.0 * (rest.diagonal.size + rest.border.size + rest.right.size)
     group = max(1, int(chains.AT_ONCE / per_variant))
+    parts = parts_of(rows, kept, rest)
     out, whole, alone = list(before), np.zeros((0, 6, 0)), np.zeros((0, 6, 6))
     for first in range(0, len(kept), group):
         some = slice(first, first + group)
         known = np.array([one.inverse for one in before[some]]) if before else None
-        found = _solved(rest, rows, kept[some], known)
+        found = _solved(rest, parts, kept[some], known)
         for k, states in enumerate(found.states):
             response = states[..., 1:]
             if first + k == 0:
@@ -134,11 +136,12 @@ def _without_each(
 
 
 def _solved(
-    rest: Normal, rows: FieldRows, some: BoolArray, known: Array | None = None
+    rest: Normal, parts: list[Part], some: BoolArray, known: Array | None = None
 ) -> ChainSolution:
     """Solve some variants at once; ``known`` is as of `solve_chain`."""
     chain, variants = rest.variants(len(some))
-    for piece in rows.pieces():
-        for normal, channels in zip(variants, some, strict=True):
-            piece.added_to(normal, channels)
+    for normal, channels in zip(variants, some, strict=True):
+        for part in parts:
+            if np.all(channels[part.channels]):
+                part.added_to(normal)
     return solve_chain(chain, 6, known)
