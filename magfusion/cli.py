@@ -252,11 +252,13 @@ def _import_uncollected(modules: tuple[str, ...]) -> None:
     """
     if gc.isenabled():
         return
+    from magfusion.estimation.solve.memory import keep_memory
     from magfusion.model.numpy_tools import import_tools_later
     from magfusion.model.scipy_notes import leave_notes_out
 
     import_tools_later()
     leave_notes_out()
+    keep_memory()
     for module in modules:
         import_module(f"magfusion.{module}")
     gc.freeze()

@@ -78,20 +78,21 @@ class Normal:
         own, after : ndarray, shape (m, rows, 15)
             By the state, and by the next.
         border : ndarray, shape (m, rows, calibration)
-        right : ndarray, shape (m, rows, 1 + considered)
+        right : ndarray, shape (m, rows, k)
+            The first k of 1 + considered; of the others there is nothing.
         """
-        back = np.swapaxes(own, 1, 2)
+        back, felt = np.swapaxes(own, 1, 2), right.shape[-1]
         self.diagonal[epoch] += back @ own
         self.border[epoch] += back @ border
-        self.right[epoch] += back @ right
+        self.right[epoch, :, :felt] += back @ right
         self.corner += np.einsum("mrc,mrd->cd", border, border, optimize=True)
-        self.right_border += np.einsum("mrc,mrd->cd", border, right, optimize=True)
+        self.right_border[:, :felt] += np.einsum("mrc,mrd->cd", border, right, optimize=True)
         if after is not None:
             ahead = np.swapaxes(after, 1, 2)
             self.diagonal[epoch + 1] += ahead @ after
             self.following[epoch] += back @ after
             self.border[epoch + 1] += ahead @ border
-            self.right[epoch + 1] += ahead @ right
+            self.right[epoch + 1, :, :felt] += ahead @ right
 
 
 class Piece(NamedTuple):

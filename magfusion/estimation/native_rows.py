@@ -92,6 +92,8 @@ class NativeRows:
     ) -> Iterator[tuple[IntArray, Array, Array | None, Array, Array]]:
         """Yield the rows of factors whose first state is one of some, as `Normal.add` takes them.
 
+        Those of which no column is felt have the first of the right sides alone.
+
         Parameters
         ----------
         begin, end : int
@@ -111,7 +113,8 @@ class NativeRows:
         rows = jacobian.shape[:2]
         own, after = np.zeros((*rows, MOTION)), np.zeros((*rows, MOTION))
         border = np.zeros((*rows, dimension(self.graph.blocks)))
-        right = np.zeros((*rows, 1 + columns.number))
+        beside = kind.inertial and columns.inertial is not None
+        right = np.zeros((*rows, 1 + (columns.number if beside else 0)))
         right[..., 0], column = kind.right[some], 0
         for name, later in kind.names:
             target, width = own if later == 0 else after, _WIDTH[name]
