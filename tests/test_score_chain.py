@@ -9,18 +9,16 @@ from small_problem import small_log
 from magfusion.estimation import chain_left, chain_system
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.integrity import held_columns, midway, score
-from magfusion.estimation.integrity.score import Score, score_beside, score_of
-from magfusion.model.parameters import placed
+from magfusion.estimation.integrity.score import Score, answered, scores_of
 from magfusion.model.samples import ImuSamples
 
 
 def _asked(result: Smoothed, imu: ImuSamples) -> tuple[Score, Score]:
     """Return the score of what is held, and with what may change in the middle."""
-    known = score_of(result, imu)
-    assert known is not None
     middle = float(np.mean(result.fields.time))
-    every = placed((*known.held, *midway._blocks(result.declared.site, middle)))
-    return known, score_beside(result, every, imu, known)
+    found = scores_of(result, imu, midway._blocks(result.declared.site, middle))
+    assert found is not None
+    return found.held, answered(result, found.every, imu)
 
 
 @pytest.mark.parametrize("estimated", [True, False])
@@ -34,7 +32,7 @@ def test_a_sweep_gives_the_score_of_the_tree(
     result = smooth(small.log, replace(small.site, model_error=1e-3), settings)
     assert bool(result.blocks) == estimated
     assert result.field_errors
-    monkeypatch.setattr(score, "score_of_chain", lambda *_: None)
+    monkeypatch.setattr(score, "left_of_chain", lambda *_: None)
     trees = _asked(result, small.log.imu)
     monkeypatch.undo()
     monkeypatch.setattr(chain_left, "STRETCH", 7)

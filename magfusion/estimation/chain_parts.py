@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.estimation.chain_system import FieldRows, Normal
-from magfusion.units import Array, BoolArray, IntArray
+from magfusion.units import BoolArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ def parts_of(rows: FieldRows, kept: BoolArray, like: Normal) -> list[Part]:
         Equations to which they will be added.
     """
     patterns = np.unique(kept[:, np.any(kept, axis=0)], axis=1).T
-    groups = [np.all(kept.T == pattern, axis=1) for pattern in patterns]
+    groups = [np.all(pattern == kept.T, axis=1) for pattern in patterns]
     felt = np.zeros((len(groups), like.right.shape[-1]), dtype=bool)
     felt[:, 0] = True
     for piece in rows.pieces():

@@ -6,6 +6,7 @@ one that lowers it most names the cause; after it has moved, the next is asked.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -136,10 +137,23 @@ def gains(combine: Array, information: Array, gradient: Array) -> Array:
     return np.asarray(np.sum(chi_square - PER_PARAMETER * kept, axis=1))
 
 
-def freed_by(
-    pose_cov: Array, score: Score, suspect: Suspect, information: Array, gradient: Array
-) -> Freed | None:
-    """Free a suspect; None where nothing tells of it."""
+class Told(NamedTuple):
+    """What a log tells of a suspect, as of `Freed`."""
+
+    step: Array
+    direction: Array
+    information: Array
+    chi_square: float
+    freedom: int
+
+    @property
+    def log_p(self) -> float:
+        """Logarithm of the probability that chance does as much."""
+        return float(log_p_chi_square(self.chi_square, self.freedom))
+
+
+def told_of(suspect: Suspect, information: Array, gradient: Array) -> Told | None:
+    """Return what freeing a suspect gains; None where nothing tells of it."""
     combine = suspect.combine
     value, vector = np.linalg.eigh(combine.T @ information @ combine)
     kept = value > FARTHEST**-2
@@ -147,19 +161,20 @@ def freed_by(
         return None
     vector, value = combine @ vector[:, kept], value[kept]
     along = vector.T @ gradient
-    step = vector @ (along / value)
-    moved = score.by_pose @ step
+    gained, freedom = float(np.sum(along**2 / value)), int(np.sum(kept))
+    return Told(vector @ (along / value), vector, value, gained, freedom)
+
+
+def freed_by(
+    pose_cov: Array, score: Score, suspect: Suspect, information: Array, gradient: Array
+) -> Freed | None:
+    """Free a suspect; None where nothing tells of it."""
+    told = told_of(suspect, information, gradient)
+    if told is None:
+        return None
+    moved = score.by_pose @ told.step
     solved = np.linalg.solve(pose_cov, moved[..., None])[..., 0]
-    return Freed(
-        suspect,
-        step,
-        vector,
-        value,
-        float(np.sum(along**2 / value)),
-        int(np.sum(kept)),
-        moved,
-        np.sum(moved * solved, axis=1),
-    )
+    return Freed(suspect, *told, moved, np.sum(moved * solved, axis=1))
 
 
 def _cause(case: Case, score: Score, freed: list[Freed], before: Array) -> Freed | None:

@@ -13,13 +13,13 @@ from magfusion.estimation.batch import Smoothed
 from magfusion.estimation.graph import Estimate
 from magfusion.estimation.integrity.close_residuals import together
 from magfusion.estimation.integrity.held import held
-from magfusion.estimation.integrity.midway import changed
+from magfusion.estimation.integrity.midway import changed, steps_asked
 from magfusion.estimation.integrity.outcome import convergence, geometry, rivals
 from magfusion.estimation.integrity.place_witness import of_place
 from magfusion.estimation.integrity.priors_of_log import bias_change, calibration_change
 from magfusion.estimation.integrity.recording import BRIDGED, recorded
 from magfusion.estimation.integrity.residual_blocks import fields, fixes, inertial
-from magfusion.estimation.integrity.score import field_residual, moved_estimate, score_of
+from magfusion.estimation.integrity.score import field_residual, moved_estimate, scores_of
 from magfusion.estimation.integrity.signal import detected_in
 from magfusion.estimation.integrity.smoothed_compass import compass
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
@@ -55,7 +55,9 @@ def judged(result: Smoothed, log: Log) -> tuple[Smoothed, Trust]:
     at = result.states
     place = of_place(result.declared.site, at.time, at.world_from_body, at.position_world, pose_cov)
     trust |= Trust(place)
-    case = Case(result, log, score_of(result, log.imu), pose_cov)
+    scores = scores_of(result, log.imu, steps_asked(result))
+    score, wide = (None, None) if scores is None else scores
+    case = Case(result, log, score, pose_cov, wide)
     factor, spread = np.ones(len(pose_cov)), np.zeros_like(pose_cov)
     for said in _heard(case):
         trust |= Trust(said.findings, said.unverified)

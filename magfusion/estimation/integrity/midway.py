@@ -11,13 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magfusion.estimation.batch import Smoothed
 from magfusion.estimation.integrity.held import (
     COVERED,
     HOPELESS,
     Freed,
     freed_by,
+    told_of,
 )
-from magfusion.estimation.integrity.score import score_beside
+from magfusion.estimation.integrity.score import answered
 from magfusion.estimation.integrity.statistics import holm, sigmas
 from magfusion.estimation.integrity.suspects import Inertial, Stream, Suspect, spoken_name, suspects
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
@@ -30,7 +32,6 @@ from magfusion.model.parameters import (
     Block,
     Parameter,
     dimension,
-    placed,
     prior_sigma,
 )
 from magfusion.model.parameters.parameter import PhasorView
@@ -141,31 +142,45 @@ class Change:
     begin: float
 
 
-def changed(case: Case) -> Testimony:
-    """Ask what may have changed while the log ran."""
-    result, score = case.result, case.score
+def steps_asked(result: Smoothed) -> list[Block]:
+    """Return the steps of parameters that a log is asked for; none of one that is too short."""
+    return [block for part in _asked(result).values() for block in part]
+
+
+def _asked(result: Smoothed) -> dict[float, list[Block]]:
+    """Return them by when they would be (s)."""
     site, time = result.declared.site, result.fields.time
-    if score is None or not 1 < len(site.beacons) <= MOST_BEACONS or len(time) < FEWEST:
-        return NOTHING
+    if not 1 < len(site.beacons) <= MOST_BEACONS or len(time) < FEWEST:
+        return {}
     begin, length = float(time[0]), float(time[-1] - time[0])
     if length < SHORTEST or len(result.graph.segments) > 1:
+        return {}
+    return {begin + part * length: _blocks(site, begin + part * length) for part in PARTS}
+
+
+def changed(case: Case) -> Testimony:
+    """Ask what may have changed while the log ran."""
+    result, wide, parts = case.result, case.wide, _asked(case.result)
+    if wide is None or not parts:
         return NOTHING
-    times = [begin + part * length for part in PARTS]
-    new = [_blocks(site, at) for at in times]
-    every = placed((*score.held, *(block for part in new for block in part)))
-    wide = score_beside(result, every, case.log.imu, score)
+    every = wide.held
     information, gradient = wide.with_declared()
     asked = [
         Change(suspect, at)
-        for at, part in zip(times, _again(every, new), strict=True)
+        for at, part in zip(parts, _again(every, list(parts.values())), strict=True)
         for suspect in _suspects(part, dimension(every))
     ]
+    told = [(one, told_of(one.suspect, information, gradient)) for one in asked]
+    known = [(one, found.log_p) for one, found in told if found is not None]
+    speaks = holm([log_p for _, log_p in known], BUDGET)
+    if not np.any(speaks):
+        return NOTHING
+    wide = answered(result, wide, case.log.imu)
     freed = [
         (one, found)
-        for one in asked
+        for one, _ in known
         if (found := freed_by(case.pose_cov, wide, one.suspect, information, gradient)) is not None
     ]
-    speaks = holm([found.log_p for _, found in freed], BUDGET)
     likely = [
         pair
         for pair, significant in zip(freed, speaks, strict=True)
@@ -177,8 +192,8 @@ def changed(case: Case) -> Testimony:
     if cause.gain < _throughout(case, information, gradient):
         return NOTHING  # it was so from the beginning
     moved = cause.moved[:, :, None] * cause.moved[:, None, :]
-    known = wide.by_pose @ cause.known_cov @ np.swapaxes(wide.by_pose, 1, 2)
-    return Testimony((_finding(change, cause, prior_sigma(every)),), spread=moved + known)
+    sure = wide.by_pose @ cause.known_cov @ np.swapaxes(wide.by_pose, 1, 2)
+    return Testimony((_finding(change, cause, prior_sigma(every)),), spread=moved + sure)
 
 
 def _throughout(case: Case, information: Array, gradient: Array) -> float:

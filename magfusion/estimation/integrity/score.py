@@ -6,7 +6,9 @@ says what each would change to, by how much the cost would fall, and how the pos
 system is solved again.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -16,16 +18,29 @@ from magfusion.estimation.batch import Smoothed
 from magfusion.estimation.considered import steps_of_others
 from magfusion.estimation.factors import CALIBRATION_KEY, CONSIDERED_KEY, NUISANCE_KEY
 from magfusion.estimation.graph import Estimate
-from magfusion.estimation.integrity.held_columns import inertial_columns
-from magfusion.estimation.integrity.score_chain import Responses, Scored, score_of_chain
+from magfusion.estimation.integrity.held_columns import InertialColumns, inertial_columns
+from magfusion.estimation.integrity.score_chain import (
+    Left,
+    Responses,
+    left_of_chain,
+    responses_of_chain,
+)
 from magfusion.estimation.integrity.suspects import TOLERANCE, held_blocks
 from magfusion.estimation.marginals import is_chain
 from magfusion.estimation.measurements.earth import EarthField
 from magfusion.estimation.measurements.measurement import Rows
 from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.native_rows import NativeRows
 from magfusion.estimation.solve.bordered import eliminate_partial
 from magfusion.estimation.state import MOTION
-from magfusion.model.parameters import Block, Calibration, dimension, prior_sigma, retract
+from magfusion.model.parameters import (
+    Block,
+    Calibration,
+    dimension,
+    placed,
+    prior_sigma,
+    retract,
+)
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.samples import ImuSamples
 from magfusion.units import Array
@@ -109,6 +124,32 @@ def score_of(result: Smoothed, imu: ImuSamples) -> Score | None:
     imu : ImuSamples
         As it was recorded.
     """
+    scores = scores_of(result, imu)
+    return None if scores is None else scores.held
+
+
+class Scores(NamedTuple):
+    """The score of everything that is held, and with what else is asked.
+
+    Parameters
+    ----------
+    held : Score
+    every : Score
+        Its responses may be those of the first of its parameters alone: see `answered`.
+    """
+
+    held: Score
+    every: Score
+
+
+def scores_of(result: Smoothed, imu: ImuSamples, beside: Sequence[Block] = ()) -> Scores | None:
+    """Return the score of everything that a result holds; None where there is nothing to ask.
+
+    Parameters
+    ----------
+    beside : sequence of Block
+        What else is asked, in the same sweep.
+    """
     graph = result.graph
     if not graph.measurements or result.fix_response is not None:
         return None
@@ -117,32 +158,64 @@ def score_of(result: Smoothed, imu: ImuSamples) -> Score | None:
         return None  # nothing contradicts a lone beacon but that a path ought to be short
     steady = any(isinstance(m, EarthField) for m in graph.measurements)
     held = held_blocks(known, result.blocks, steady=steady)
-    return score_beside(result, held, imu) if held else None
-
-
-def score_beside(
-    result: Smoothed, held: tuple[Block, ...], imu: ImuSamples, known: Score | None = None
-) -> Score:
-    """Return the score of parameters that a result does not estimate, at least one.
-
-    Parameters
-    ----------
-    known : Score, optional
-        Of the first of them: how they move the states is not found again, and of the others only
-        how they move the poses.
-    """
-    inertial = inertial_columns(result, held, imu)
-    found = None
-    if is_chain(result.graph, held):
-        before = None if known is None else Responses(known.by_state, known.by_calibration)
-        found = score_of_chain(result, held, inertial, before)
+    if not held:
+        return None
+    every = placed((*held, *beside))
+    inertial = inertial_columns(result, every, imu)
+    found = _by_chain(result, held, every, inertial)
     if found is None:
-        found = _by_elimination(result, held, inertial.of(slice(None)))
-    information, gradient, responses = found
-    return Score(held, information, gradient, _declared(result, held), *responses)
+        found = _by_elimination(result, every, inertial.of(slice(None)))
+    left, responses = found
+    wide = Score(every, *left, _declared(result, every), *responses)
+    return Scores(_first(wide, held), wide)
 
 
-def _by_elimination(result: Smoothed, held: tuple[Block, ...], by_others: Array) -> Scored:
+def _first(score: Score, held: tuple[Block, ...]) -> Score:
+    """Return the score of the first of its parameters."""
+    own = slice(0, dimension(held))
+    return Score(
+        held,
+        score.information[own, own],
+        score.gradient[own],
+        score.spread[own],
+        score.by_state[..., own],
+        score.by_calibration[:, own],
+    )
+
+
+def _by_chain(
+    result: Smoothed, held: tuple[Block, ...], every: tuple[Block, ...], inertial: InertialColumns
+) -> tuple[Left, Responses] | None:
+    """Return what is left of all, and how the first move the states, of one chain of states."""
+    if not is_chain(result.graph, every):
+        return None
+    native = NativeRows(result.graph, result.estimate)
+    left = left_of_chain(result, every, inertial, native)
+    if left is None:
+        return None
+    own = inertial.part(slice(0, dimension(held)))
+    responses = responses_of_chain(result, held, own, native)
+    return None if responses is None else (left, responses)
+
+
+def answered(result: Smoothed, score: Score, imu: ImuSamples) -> Score:
+    """Return a score that tells of all its parameters how they move the poses."""
+    if score.by_calibration.shape[1] == dimension(score.held):
+        return score
+    inertial = inertial_columns(result, score.held, imu)
+    native = NativeRows(result.graph, result.estimate)
+    known = Responses(score.by_state, score.by_calibration)
+    responses = responses_of_chain(result, score.held, inertial, native, known)
+    if responses is None:
+        left, responses = _by_elimination(result, score.held, inertial.of(slice(None)))
+        score = replace(score, information=left.information, gradient=left.gradient)
+    by_state, by_calibration = responses
+    return replace(score, by_state=by_state, by_calibration=by_calibration)
+
+
+def _by_elimination(
+    result: Smoothed, held: tuple[Block, ...], by_others: Array
+) -> tuple[Left, Responses]:
     """Return the same of any graph."""
     graph, estimate, size = result.graph, result.estimate, dimension(held)
     unit = np.diag(prior_sigma(held))
@@ -172,7 +245,7 @@ def _by_elimination(result: Smoothed, held: tuple[Block, ...], by_others: Array)
         by_state[:, :, k] = step.vector(keys).reshape(-1, MOTION)
         if result.blocks:
             by_calibration[:, k] = step.at(CALIBRATION_KEY)
-    return Scored(information, gradient, Responses(by_state, by_calibration))
+    return Left(information, gradient), Responses(by_state, by_calibration)
 
 
 def _without_error(net: gtsam.GaussianBayesNet) -> gtsam.GaussianBayesNet:

@@ -33,29 +33,24 @@ class Responses(NamedTuple):
     by_calibration: Array
 
 
-class Scored(NamedTuple):
-    """As of `magfusion.estimation.integrity.score.Score`."""
-
-    information: Array
-    gradient: Array
-    responses: Responses
-
-
-def score_of_chain(
-    result: Smoothed,
-    held: tuple[Block, ...],
-    inertial: InertialColumns,
-    known: Responses | None = None,
-) -> Scored | None:
-    """Return the score; None where the chain is too badly conditioned for one sweep.
+class Left(NamedTuple):
+    """What is left of parameters that are held, as of `magfusion.estimation.integrity.score.Score`.
 
     Parameters
     ----------
-    known : Responses, optional
-        Of the first that are held; then of the others only poses are asked for.
+    information : ndarray, shape (h, h)
+    gradient : ndarray, shape (h,)
     """
+
+    information: Array
+    gradient: Array
+
+
+def left_of_chain(
+    result: Smoothed, held: tuple[Block, ...], inertial: InertialColumns, native: NativeRows
+) -> Left | None:
+    """Return what is left; None where the chain is too badly conditioned for one sweep."""
     graph, size = result.graph, dimension(held)
-    native = NativeRows(graph, result.estimate)
     # An error that is constant in place looks like some of them; what freeing them does to the
     # estimate, which weighs epochs as if there were none, stays the same.
     every = placed((*held, *result.field_errors))
@@ -69,9 +64,27 @@ def score_of_chain(
     except np.linalg.LinAlgError:
         return None
     information = 0.5 * (left[1:, 1:] + left[1:, 1:].T)
+    return Left(information, -left[1:, 0]) if np.all(np.isfinite(left)) else None
+
+
+def responses_of_chain(
+    result: Smoothed,
+    held: tuple[Block, ...],
+    inertial: InertialColumns,
+    native: NativeRows,
+    known: Responses | None = None,
+) -> Responses | None:
+    """Return what a unit of each does; None where rounding is all.
+
+    Parameters
+    ----------
+    known : Responses, optional
+        Of the first that are held; then of the others only poses are asked for.
+    """
+    graph = result.graph
     kept = MOTION if known is None else POSE
-    by_state, by_calibration = [np.zeros((graph.epochs, kept, 0))], []
-    by_calibration.append(np.zeros((dimension(graph.blocks), 0)))
+    by_state = [np.zeros((graph.epochs, kept, 0))]
+    by_calibration = [np.zeros((dimension(graph.blocks), 0))]
     if known is not None:
         by_state.append(known.by_state[:, :kept])
         by_calibration.append(known.by_calibration)
@@ -91,8 +104,7 @@ def score_of_chain(
         del normal, fields, found  # before the next group: of a long log they are much
         give_back_memory()
     responses = Responses(np.concatenate(by_state, axis=2), np.concatenate(by_calibration, axis=1))
-    finite = [np.all(np.isfinite(part)) for part in (information, *responses)]
-    return Scored(information, -left[1:, 0], responses) if all(finite) else None
+    return responses if all(np.all(np.isfinite(part)) for part in responses) else None
 
 
 def _groups(held: tuple[Block, ...], epochs: int) -> list[slice]:

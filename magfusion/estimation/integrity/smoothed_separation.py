@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.estimation import chain_system as chains
-from magfusion.estimation.chain_parts import Part, parts_of
 from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.chain_parts import Part, parts_of
 from magfusion.estimation.chain_system import FieldRows, Normal, chain_system, column_groups
 from magfusion.estimation.convergence import OPEN_ROTATION
 from magfusion.estimation.integrity.separation import Separation

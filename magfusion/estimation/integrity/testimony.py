@@ -21,12 +21,15 @@ class Case:
         Of everything held; None where there is none.
     pose_cov : ndarray, shape (states, 6, 6)
         As the estimator claims it.
+    wide : Score, optional
+        With the steps that parameters may have made, as of `scores_of`.
     """
 
     result: Smoothed
     log: Log
     score: Score | None
     pose_cov: Array
+    wide: Score | None = None
 
 
 @dataclass(frozen=True, eq=False)
