@@ -39,6 +39,7 @@ from magfusion.model.without_imu import logged, require_motion_prior
 from magfusion.units import Array, BoolArray, IntArray
 
 QUIET = 0.3  # sigmas; a last pass that moved the poses by less has converged all the same
+ON_THE_WAY, CONVERGED = 1e-4, 1e-6  # relative decrease of the cost at which a pass ends
 TUNINGS = 3  # passes after which the noise is found anew; then it stays as it is
 
 
@@ -207,13 +208,17 @@ def _solved(
         elif not log.samples.signed:
             wave = log.with_signs(calibration, states, first=done == 0)
         graph, gaps = graph_of(log, states, calibration, wave, standing)
-        found = optimise(graph, initial_estimate(states, calibration, segments))
+        # Another pass is sure to come.
+        short = (done == 0 or tuning) and done + 1 < settings.passes
+        tolerance = ON_THE_WAY if short else CONVERGED
+        begun = initial_estimate(states, calibration, segments)
+        found = optimise(graph, begun, tolerance=tolerance)
         after = read_states(found.estimate.values, time)
         stood = _at_rest(graph, found.estimate, after, calm & ~standing, motion)
         if np.any(stood):  # at once: it costs no preintegration
             graph = replace(graph, measurements=(*graph.measurements, log.rests(stood)))
             iterations += found.iterations
-            found = optimise(graph, found.estimate)
+            found = optimise(graph, found.estimate, tolerance=tolerance)
             after = read_states(found.estimate.values, time)
         settled = (
             done > 0
