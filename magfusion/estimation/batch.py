@@ -207,10 +207,12 @@ def _solved(
             give_back_memory()
         elif not log.samples.signed:
             wave = log.with_signs(calibration, states, first=done == 0)
-        graph, gaps = graph_of(log, states, calibration, wave, standing)
         # Another pass is sure to come.
         short = (done == 0 or tuning) and done + 1 < settings.passes
         tolerance = ON_THE_WAY if short else CONVERGED
+        # The noise is found last with the sigmas as they are.
+        roughly = short and done < TUNINGS - 1
+        graph, gaps = graph_of(log, states, calibration, wave, standing, roughly=roughly)
         begun = initial_estimate(states, calibration, segments)
         found = optimise(graph, begun, tolerance=tolerance)
         after = read_states(found.estimate.values, time)

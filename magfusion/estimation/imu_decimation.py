@@ -24,6 +24,7 @@ from magfusion.units import Array, BoolArray, IntArray
 
 JOINED = (20, 10)  # steps made one: as many as leave enough
 FEWEST_LEFT = 200  # joined steps of an interval that is thinned
+ROUGHLY_JOINED, ROUGHLY_LEFT = (20, 10, 7, 5), 8  # where sigmas a tenth wrong do no harm
 MOST_TURN = 0.5  # rad; within a joined step, for the series and for the derivatives
 CHUNK = 8192  # pairs of joined steps at a time: what is computed of them stays in the cache
 STRETCH = 200_000  # samples cut at a time: what is made of them is no multiple of a long log
@@ -38,6 +39,8 @@ def preintegrate_stream(
     accel_bias: Array,
     gyro_bias: Array,
     silence: tuple[Array, Array] | None = None,
+    *,
+    roughly: bool = False,
 ) -> tuple[list[gtsam.PreintegratedCombinedMeasurementsG], BoolArray]:
     """Preintegrate a whole stream between epochs, a stretch of it at a time.
 
@@ -53,6 +56,8 @@ def preintegrate_stream(
         At which to linearise (m/s^2, rad/s).
     silence : tuple of ndarray, optional
         Where gaps begin and end in which other samples stand in for inertial ones (s).
+    roughly : bool
+        Whether the sigmas matter little, and intervals of some tens of samples are thinned too.
 
     Returns
     -------
@@ -76,14 +81,21 @@ def preintegrate_stream(
         if silence is not None:
             silent = meets(*silence, epochs[begin:end], epochs[begin + 1 : end + 1])
             increments = replace(increments, bridged=increments.bridged | silent)
-        increments = thinned(increments, accel_bias[here], gyro_bias[here])
+        ways = (ROUGHLY_JOINED, ROUGHLY_LEFT) if roughly else (JOINED, FEWEST_LEFT)
+        increments = thinned(increments, accel_bias[here], gyro_bias[here], *ways)
         measured += preintegrate(increments, model, gravity, accel_bias[here], gyro_bias[here])
         bridged.append(increments.bridged)
         begin = end
     return measured, np.concatenate(bridged)
 
 
-def thinned(increments: Increments, accel_bias: Array, gyro_bias: Array) -> Increments:
+def thinned(
+    increments: Increments,
+    accel_bias: Array,
+    gyro_bias: Array,
+    ways: tuple[int, ...] = JOINED,
+    fewest: int = FEWEST_LEFT,
+) -> Increments:
     """Join the steps of the long intervals.
 
     Parameters
@@ -91,6 +103,10 @@ def thinned(increments: Increments, accel_bias: Array, gyro_bias: Array) -> Incr
     accel_bias, gyro_bias : ndarray, shape (epochs, 3)
         At which they will be preintegrated (m/s^2, rad/s): there the result is the same to
         rounding.
+    ways : tuple of int
+        How many steps are made one: as many as leave
+    fewest : int
+        joined steps of an interval.
 
     Returns
     -------
@@ -99,12 +115,12 @@ def thinned(increments: Increments, accel_bias: Array, gyro_bias: Array) -> Incr
         fill no pair, and those of a fast turn.
     """
     steps = np.diff(increments.first)
-    if steps.max(initial=0) < FEWEST_LEFT * JOINED[-1]:
+    if steps.max(initial=0) < fewest * ways[-1]:
         return increments
-    for i, joined in enumerate(JOINED):
-        long = (steps >= FEWEST_LEFT * joined) & ~increments.bridged
+    for i, joined in enumerate(ways):
+        long = (steps >= fewest * joined) & ~increments.bridged
         if i > 0:
-            long &= steps < FEWEST_LEFT * JOINED[i - 1]
+            long &= steps < fewest * ways[i - 1]
         if np.any(long):
             increments = _with_joined(increments, joined, long, accel_bias, gyro_bias)
     return increments

@@ -148,6 +148,8 @@ def graph_of(
     calibration: Calibration,
     wave: MotionCompensated | None = None,
     standing: BoolArray | None = None,
+    *,
+    roughly: bool = False,
 ) -> tuple[Graph, int]:
     """Return the graph at an estimate, and the number of intervals bridged.
 
@@ -157,8 +159,10 @@ def graph_of(
         Phasors that an estimate has been taken off from; those of before where there are none.
     standing : bool ndarray, shape (states,), optional
         Where the platform is known to stand.
+    roughly : bool
+        Whether another graph will follow, and the sigmas of the inertial factors matter little.
     """
-    links, bridged = _links(log, states, calibration)
+    links, bridged = _links(log, states, calibration, roughly=roughly)
     measurements = [
         replace(measurement, epoch=np.searchsorted(states.time, time)[measurement.epoch])
         for time, measurement in log.others
@@ -183,7 +187,7 @@ def graph_of(
 
 
 def _links(
-    log: PreparedLog, states: Trajectory, calibration: Calibration
+    log: PreparedLog, states: Trajectory, calibration: Calibration, *, roughly: bool
 ) -> tuple[tuple[Link, ...], int]:
     """Return the inertial stream between the states, and the number of intervals bridged.
 
@@ -199,7 +203,7 @@ def _links(
         imu = applied.on_log_rate(corrected_imu(calibration, blocks, log.imu))
         offset, model, gravity = applied.time_offset, site.platform.imu, site.gravity
         found, gaps = preintegrate_stream(
-            imu, offset, states.time, model, gravity, accel, gyro, log.silence
+            imu, offset, states.time, model, gravity, accel, gyro, log.silence, roughly=roughly
         )
         bridged.append(int(np.sum(gaps)))
         return found
