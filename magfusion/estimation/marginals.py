@@ -121,7 +121,8 @@ def _of_chain(graph: Graph, estimate: Estimate, considered: tuple[Block, ...]) -
         if fields is not None:
             for piece in fields.pieces():
                 piece.added_to(normal)
-        found = solve_chain(normal.chain(), POSE, None if solved is None else solved.inverse)
+        known = None if solved is None else solved.inverse
+        found = solve_chain(normal.chain(), POSE, known, covariance=known is None)
         del normal, fields  # before the next group: of a long log they are much
         response = found.states[0, ..., 1:]
         added += response @ np.swapaxes(response, 1, 2)

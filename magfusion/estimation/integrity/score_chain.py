@@ -97,7 +97,7 @@ def responses_of_chain(
         if fields is not None:
             for piece in fields.pieces():
                 piece.added_to(normal)
-        found = solve_chain(normal.chain(), kept, inverse)
+        found = solve_chain(normal.chain(), kept, inverse, covariance=False)
         inverse = found.inverse
         by_state.append(found.states[0, ..., 1:].copy())
         by_calibration.append(found.border[0, :, 1:])

@@ -12,7 +12,7 @@ from magfusion.estimation.convergence import OPEN_ROTATION
 from magfusion.estimation.integrity.separation import Separation
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.solve.chain import ChainSolution, solve_chain
+from magfusion.estimation.solve.chain import ChainSolution, inverses, solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.units import Array, BoolArray
 
@@ -112,11 +112,11 @@ def _without_each(
     per_variant = 8.0 * 4.0 * (rest.diagonal.size + rest.border.size + rest.right.size)
     group = max(1, int(chains.AT_ONCE / per_variant))
     parts = parts_of(rows, kept, rest)
+    known = [v.inverse for v in before] if before else _inverses(rest, parts, kept)
     out, whole, alone = list(before), np.zeros((0, 6, 0)), np.zeros((0, 6, 6))
     for first in range(0, len(kept), group):
         some = slice(first, first + group)
-        known = np.array([one.inverse for one in before[some]]) if before else None
-        found = _solved(rest, parts, kept[some], known)
+        found = _solved(rest, parts, kept[some], np.array(known[some]), covariance=not before)
         for k, states in enumerate(found.states):
             response = states[..., 1:]
             if first + k == 0:
@@ -124,7 +124,7 @@ def _without_each(
                 alone = found.cov[k].copy()
             if not before:
                 own, explained = found.cov[k].copy(), float(found.explained[k])
-                inverse = found.inverse[k].copy()
+                inverse = known[first + k]
                 step = states[..., 0].copy()
                 out.append(_Variant(step, own, own - alone, explained, inverse))
             moved = response - whole
@@ -135,13 +135,28 @@ def _without_each(
     return out
 
 
+def _inverses(rest: Normal, parts: list[Part], kept: BoolArray) -> list[Array]:
+    """Return `inverses` of each variant: together, since each is many small matrices."""
+    out: list[Array] = []
+    group = max(1, int(chains.AT_ONCE / (8.0 * 4.0 * rest.diagonal.size)))
+    for first in range(0, len(kept), group):
+        some = kept[first : first + group]
+        diagonal = np.repeat(rest.diagonal[None], len(some), axis=0)
+        for own, channels in zip(diagonal, some, strict=True):
+            for part in parts:
+                if np.all(channels[part.channels]):
+                    own += part.sums.diagonal
+        out += list(inverses(diagonal, rest.following[None]))
+    return out
+
+
 def _solved(
-    rest: Normal, parts: list[Part], some: BoolArray, known: Array | None = None
+    rest: Normal, parts: list[Part], some: BoolArray, known: Array, *, covariance: bool
 ) -> ChainSolution:
-    """Solve some variants at once; ``known`` is as of `solve_chain`."""
+    """Solve some variants at once; all else is as of `solve_chain`."""
     chain, variants = rest.variants(len(some))
     for normal, channels in zip(variants, some, strict=True):
         for part in parts:
             if np.all(channels[part.channels]):
                 part.added_to(normal)
-    return solve_chain(chain, 6, known)
+    return solve_chain(chain, 6, known, covariance=covariance)

@@ -12,6 +12,8 @@ import numpy as np
 
 from magfusion.units import Array
 
+STRETCH = 256  # states that are multiplied at once
+
 
 @dataclass(frozen=True, eq=False)
 class Chain:
@@ -60,7 +62,9 @@ class ChainSolution(NamedTuple):
 
 
 @np.errstate(all="ignore")
-def solve_chain(chain: Chain, kept: int, known: Array | None = None) -> ChainSolution:
+def solve_chain(
+    chain: Chain, kept: int, known: Array | None = None, *, covariance: bool = True
+) -> ChainSolution:
     """Solve every variant.  What one leaves open comes out as not finite, or absurdly wide.
 
     Parameters
@@ -68,8 +72,9 @@ def solve_chain(chain: Chain, kept: int, known: Array | None = None) -> ChainSol
     kept : int
         Of each state: how many of its first numbers' covariance is asked for.
     known : ndarray, shape (h, n, s, s), optional
-        `ChainSolution.inverse` of the same chain with other right sides: no covariance of the
-        states is found again.
+        As `inverses` of the chain, or `ChainSolution.inverse` of it with other right sides.
+    covariance : bool
+        Whether that of the states is asked for; else there are none of it.
     """
     n, size = chain.diagonal.shape[1:3]
     # What is swept takes the place of the right sides, and what is found that of what is swept: of
@@ -80,15 +85,18 @@ def solve_chain(chain: Chain, kept: int, known: Array | None = None) -> ChainSol
         solved = np.concatenate([chain.right, chain.border], axis=-1)
     inverse = inverses(chain.diagonal, chain.following) if known is None else known
     gain = inverse[:, :-1] @ chain.following
+    back = np.swapaxes(gain, 2, 3)
     for i in range(n - 1):
-        solved[:, i + 1] -= np.swapaxes(gain[:, i], 1, 2) @ solved[:, i]
-    solved[:, -1] = inverse[:, -1] @ solved[:, -1]
+        solved[:, i + 1] -= back[:, i] @ solved[:, i]
+    for begin in range(0, n, STRETCH):
+        here = slice(begin, begin + STRETCH)
+        solved[:, here] = inverse[:, here] @ solved[:, here]
     for i in range(n - 2, -1, -1):
-        solved[:, i] = inverse[:, i] @ solved[:, i] - gain[:, i] @ solved[:, i + 1]
+        solved[:, i] -= gain[:, i] @ solved[:, i + 1]
     own = np.empty((len(inverse), 0, kept, kept))
-    if known is None:
+    if covariance:
         own = _covariances(inverse, gain, kept)
-    del gain
+    del gain, back
     count = chain.right.shape[-1]
     alone, by_border = solved[..., :count], solved[..., count:]
     explained = np.einsum("hns,hns->h", first, alone[..., 0])
@@ -105,7 +113,7 @@ def solve_chain(chain: Chain, kept: int, known: Array | None = None) -> ChainSol
     states = alone[:, :, :kept] - part @ border[:, None]
     # The border explains what the states leave of it.
     explained += np.einsum("hc,hc->h", rest[..., 0], border[..., 0])
-    if known is None:
+    if covariance:
         own += part @ corner[:, None] @ np.swapaxes(part, -1, -2)
     return ChainSolution(states, border, own, corner, explained, inverse)
 
