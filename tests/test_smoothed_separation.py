@@ -154,8 +154,7 @@ def test_piece_by_piece_a_log_is_separated_as_at_once(monkeypatch: pytest.Monkey
     known = separate_smoothed(result), _marginals(result)
     for module in (factors, native_rows):
         monkeypatch.setattr(module, "PIECE", 7)
-    monkeypatch.setattr(chain_system, "AT_ONCE", 1.0)  # one beacon at once, nothing kept
-    monkeypatch.setattr(chain_system, "KEPT", 1.0)
+    monkeypatch.setattr(chain_system, "AT_ONCE", 1.0)  # one beacon at once
     monkeypatch.setattr(considered, "AT_ONCE", 1.0)  # and one parameter that is held
     found = separate_smoothed(result), _marginals(result)
     assert known[0] is not None
@@ -172,7 +171,6 @@ def test_what_is_considered_is_taken_in_groups(monkeypatch: pytest.MonkeyPatch) 
     known = separate_smoothed(result), _marginals(result)
     monkeypatch.setattr(chain_system, "SIDES", 1.0)  # one block at once
     assert len(chain_system.column_groups(result.uncertain, result.graph.epochs)) > 3
-    monkeypatch.setattr(chain_system, "KEPT", 1.0)
     found = separate_smoothed(result), _marginals(result)
     assert known[0] is not None
     assert found[0] is not None

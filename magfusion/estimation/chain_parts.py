@@ -4,12 +4,15 @@ Most of what is considered is felt by one beacon alone, so that all parts togeth
 than their sum.
 """
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.estimation.chain_system import FieldRows, Normal
-from magfusion.units import BoolArray, IntArray
+from magfusion.estimation.chain_system import FieldRows, Normal, Piece
+from magfusion.estimation.solve.chain import Chain
+from magfusion.model.parameters import BeaconParameter
+from magfusion.units import Array, BoolArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,6 +22,7 @@ class Part:
     Parameters
     ----------
     channels : bool ndarray, shape (channels,)
+        None of what every variant has.
     sums : Normal
         With those right sides alone that they have any of.
     columns : int ndarray
@@ -43,27 +47,81 @@ class Part:
             begin = end
 
 
-def parts_of(rows: FieldRows, kept: BoolArray, like: Normal) -> list[Part]:
-    """Return the parts of a log's rows, of which each variant has all or nothing.
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """The normal equations of a chain in parts.
 
     Parameters
     ----------
+    parts : tuple of Part
+    following : ndarray
+        As of `Normal`.
+    count : int
+        Of right sides.
+    """
+
+    parts: tuple[Part, ...]
+    following: Array
+    count: int
+
+    def of(self, channels: BoolArray) -> Iterator[Part]:
+        """Yield the parts of a variant that has some of the channels."""
+        return (part for part in self.parts if np.all(channels[part.channels]))
+
+    def chain(self, some: BoolArray) -> Chain:
+        """Return some variants, shape (h, channels): solving the chain overwrites them."""
+        states, size = self.parts[0].sums.border.shape[0], len(self.parts[0].sums.corner)
+        chain, variants = Normal.blank(len(some), states, size, self.count, self.following)
+        for normal, channels in zip(variants, some, strict=True):
+            for part in self.of(channels):
+                part.added_to(normal)
+        return chain
+
+
+def parts_of(rest: Normal, rows: FieldRows, pieces: Iterable[Piece], kept: BoolArray) -> Parts:
+    """Return a chain in parts, of which each variant has all or nothing.
+
+    Parameters
+    ----------
+    rest : Normal
+        What every variant has; it is left without right sides.
+    rows : FieldRows
+        Of which the pieces are.
     kept : bool ndarray, shape (variants, channels)
         Channels that a variant has.
-    like : Normal
-        Equations to which they will be added.
     """
+    count, states, size = rest.right.shape[-1], len(rest.diagonal), len(rest.corner)
+    always = _with_felt_alone(rest, kept.shape[1])
     patterns = np.unique(kept[:, np.any(kept, axis=0)], axis=1).T
     groups = [np.all(pattern == kept.T, axis=1) for pattern in patterns]
-    felt = np.zeros((len(groups), like.right.shape[-1]), dtype=bool)
-    felt[:, 0] = True
-    for piece in rows.pieces():
-        for own, channels in zip(felt, groups, strict=True):
-            own |= np.any(piece.right[:, channels] != 0.0, axis=(0, 1, 2))
-    states, calibration = len(like.diagonal), len(like.corner)
-    columns = [np.flatnonzero(own) for own in felt]
-    sums = [Normal(states, calibration, len(own) - 1) for own in columns]
-    for piece in rows.pieces():
+    columns = [_felt(rows, channels) for channels in groups]
+    sums = [Normal(states, size, len(own) - 1) for own in columns]
+    for piece in pieces:
         for normal, channels, own in zip(sums, groups, columns, strict=True):
             piece._replace(right=piece.right[..., own]).added_to(normal, channels)
-    return [Part(*one) for one in zip(groups, sums, columns, strict=True)]
+    parts = [Part(*one) for one in zip(groups, sums, columns, strict=True)]
+    return Parts((always, *parts), rest.following, count)
+
+
+def _with_felt_alone(rest: Normal, channels: int) -> Part:
+    """Return equations as a part, without right sides of zeros."""
+    felt = np.any(rest.right, axis=(0, 1)) | np.any(rest.right_border, axis=0)
+    felt[0] = True
+    columns = np.flatnonzero(felt)
+    rest.sides = np.concatenate([rest.right[..., columns], rest.border], axis=2)
+    rest.right_border = rest.right_border[:, columns]
+    return Part(np.zeros(channels, dtype=bool), rest, columns)
+
+
+def _felt(rows: FieldRows, channels: BoolArray) -> IntArray:
+    """Return the right sides that some channels feel: the first, and of what acts on them."""
+    every = rows.estimate.calibration.site.channels
+    names = {every[k][0] for k in np.flatnonzero(channels).tolist()}
+    acting = [
+        block.columns
+        for block in rows.considered
+        if not isinstance(block.parameter, BeaconParameter) or block.owner in names
+    ]
+    spread = [rows.spread[columns] for columns in acting]
+    felt = np.any(np.concatenate([rows.spread[:0], *spread]) != 0.0, axis=0)
+    return np.concatenate([[0], 1 + np.flatnonzero(felt)])

@@ -5,8 +5,7 @@ of every state, and what else is asked of all of them, come of one sweep (`solve
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from itertools import islice
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +21,6 @@ from magfusion.model.prior import prior_sqrt_covariance, prior_sqrt_information
 from magfusion.units import Array, BoolArray, IntArray
 
 AT_ONCE = 2e8  # bytes; variants are solved in groups of so much
-KEPT = 1e8  # bytes of rows; what is more is made anew for every group
 SIDES = 6e7  # bytes of right sides at once; what is considered is taken in groups
 
 
@@ -53,19 +51,32 @@ class Normal:
         """Return the equations as a chain of one variant: solving it overwrites them."""
         return Chain.of_sides(**{name: value[None] for name, value in vars(self).items()})
 
-    def variants(self, count: int) -> tuple[Chain, list["Normal"]]:
-        """Return so many copies as one chain, and each of them to add rows of fields to."""
-        copies = {
-            name: np.repeat(value[None], 1 if name == "following" else count, axis=0)
-            for name, value in vars(self).items()
+    @staticmethod
+    def blank(
+        count: int, states: int, calibration: int, right: int, following: Array
+    ) -> tuple[Chain, list["Normal"]]:
+        """Return variants without any rows as one chain, and each of them to add to.
+
+        Parameters
+        ----------
+        right : int
+            Number of right sides.
+        following : ndarray, shape (states - 1, 15, 15)
+            The same of all.
+        """
+        made = {
+            "diagonal": np.zeros((count, states, MOTION, MOTION)),
+            "sides": np.zeros((count, states, MOTION, right + calibration)),
+            "corner": np.zeros((count, calibration, calibration)),
+            "right_border": np.zeros((count, calibration, right)),
         }
         own = []
         for k in range(count):
             one = object.__new__(Normal)
-            for name, value in copies.items():
-                setattr(one, name, value[0 if name == "following" else k])
+            vars(one).update({name: value[k] for name, value in made.items()})
+            one.following = following
             own.append(one)
-        return Chain.of_sides(**copies), own
+        return Chain.of_sides(following=following[None], **made), own
 
     def add(
         self, epoch: IntArray, own: Array, after: Array | None, border: Array, right: Array
@@ -130,19 +141,12 @@ class FieldRows:
     estimate: Estimate
     considered: tuple[Block, ...]
     spread: Array
-    known: list[Piece] = field(default_factory=list)
 
     def pieces(self) -> Iterator[Piece]:
-        """Yield all rows; the first of them are kept for the next time."""
-        yield from self.known
-        size, states = sum(_size(one) for one in self.known), states_in(self.estimate.values)
-        calibration = self.estimate.calibration
-        for factors in islice(self.factors.pieces(), len(self.known), None):
-            piece = field_piece(factors, states, calibration, self.considered, self.spread)
-            size += _size(piece)
-            if size < KEPT:
-                self.known.append(piece)
-            yield piece
+        """Yield all rows."""
+        states, calibration = states_in(self.estimate.values), self.estimate.calibration
+        for factors in self.factors.pieces():
+            yield field_piece(factors, states, calibration, self.considered, self.spread)
 
 
 def field_piece(
@@ -175,10 +179,6 @@ def _spread_over(by_other: Array, spread: Array) -> Array:
         here = slice(first, first + len(at))
         return np.asarray(by_other[..., here] * spread[at, np.arange(len(at))])
     return np.asarray(by_other[..., at] * spread[at, np.arange(len(at))])
-
-
-def _size(piece: Piece) -> int:
-    return piece.by_state.nbytes + piece.by_calibration.nbytes + piece.right.nbytes
 
 
 def column_groups(considered: tuple[Block, ...], epochs: int) -> list[slice]:

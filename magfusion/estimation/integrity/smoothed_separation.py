@@ -1,19 +1,21 @@
 """The smoothed trajectory without each beacon: alarms and protection levels by state."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from magfusion.estimation import chain_system as chains
 from magfusion.estimation.batch import Smoothed
-from magfusion.estimation.chain_parts import Part, parts_of
-from magfusion.estimation.chain_system import FieldRows, Normal, chain_system, column_groups
+from magfusion.estimation.chain_parts import Parts, parts_of
+from magfusion.estimation.chain_system import Piece, chain_system, column_groups
 from magfusion.estimation.convergence import OPEN_ROTATION
 from magfusion.estimation.integrity.separation import Separation
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.solve.chain import ChainSolution, inverses, solve_chain
+from magfusion.estimation.solve.chain import inverses, solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
+from magfusion.estimation.state import MOTION
 from magfusion.units import Array, BoolArray
 
 # A prior that keeps what is open finite: far wider than anything that is of use.
@@ -40,21 +42,20 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
     owner = site.sensor if by_magnetometer else site.owner
     every = range(len(site.platform.magnetometers if by_magnetometer else site.beacons))
     kept = np.array([owner >= 0, *(owner != j for j in every)])
-    heard, square, count = np.zeros(len(owner), dtype=bool), np.zeros(len(owner)), 0
+    tally = _Tally(len(owner))
     solved: list[_Variant] = []
     for columns in column_groups(result.uncertain, graph.epochs):
         rest, rows = chain_system(graph, result.estimate, result.uncertain, columns)
         assert rows is not None
         rest.diagonal += np.diag(1.0 / OPEN**2)
-        if not solved:
-            for piece in rows.pieces():
-                heard |= np.any(piece.by_state != 0.0, axis=(0, 2, 3))
-                square += np.sum(piece.right[..., 0] ** 2, axis=(0, 2))
-                count += len(piece.epoch)
-        solved = _without_each(rest, rows, kept, solved)
-        del rest, rows  # before the next group: of a long log they are much
+        pieces = rows.pieces() if solved else tally.over(rows.pieces())
+        parts = parts_of(rest, rows, pieces, kept)
+        del rest, rows
+        solved = _without_each(parts, kept, solved)
+        del parts  # before the next group: of a long log they are much
         give_back_memory()
-    cost = kept @ square - np.array([one.explained for one in solved])
+    heard, count = tally.heard, tally.count
+    cost = kept @ tally.square - np.array([one.explained for one in solved])
     numbers = np.array([6 * np.sum(heard & (owner == j)) * count for j in every])
     others = np.array([np.any(heard & (owner != j)) for j in every])
     step, cov = np.array([v.step for v in solved]), np.array([v.cov for v in solved])
@@ -75,6 +76,22 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
         np.broadcast_to(cost[1:], shape),
         np.broadcast_to(numbers, shape),
     )
+
+
+class _Tally:
+    """Which channels are heard in any epoch, and the sum of squares of each."""
+
+    def __init__(self, channels: int) -> None:
+        self.heard, self.count = np.zeros(channels, dtype=bool), 0
+        self.square = np.zeros(channels)
+
+    def over(self, pieces: Iterator[Piece]) -> Iterator[Piece]:
+        """Count pieces as they pass."""
+        for piece in pieces:
+            self.heard |= np.any(piece.by_state != 0.0, axis=(0, 2, 3))
+            self.square += np.sum(piece.right[..., 0] ** 2, axis=(0, 2))
+            self.count += len(piece.epoch)
+            yield piece
 
 
 @dataclass(eq=False)
@@ -99,9 +116,7 @@ class _Variant:
     inverse: Array
 
 
-def _without_each(
-    rest: Normal, rows: FieldRows, kept: BoolArray, before: list[_Variant]
-) -> list[_Variant]:
+def _without_each(parts: Parts, kept: BoolArray, before: list[_Variant]) -> list[_Variant]:
     """Solve variants with some of the channels, shape (h, channels).
 
     Parameters
@@ -109,14 +124,16 @@ def _without_each(
     before : list of _Variant
         Solved with other columns of what is considered.
     """
-    per_variant = 8.0 * 4.0 * (rest.diagonal.size + rest.border.size + rest.right.size)
-    group = max(1, int(chains.AT_ONCE / per_variant))
-    parts = parts_of(rows, kept, rest)
-    known = [v.inverse for v in before] if before else _inverses(rest, parts, kept)
+    always = parts.parts[0].sums
+    sides = always.diagonal.size // MOTION * (parts.count + len(always.corner))
+    group = max(1, int(chains.AT_ONCE / (8.0 * 4.0 * (always.diagonal.size + sides))))
+    known = [one.inverse for one in before] if before else _inverses(parts, kept)
     out, whole, alone = list(before), np.zeros((0, 6, 0)), np.zeros((0, 6, 6))
     for first in range(0, len(kept), group):
         some = slice(first, first + group)
-        found = _solved(rest, parts, kept[some], np.array(known[some]), covariance=not before)
+        found = solve_chain(
+            parts.chain(kept[some]), 6, np.array(known[some]), covariance=not before
+        )
         for k, states in enumerate(found.states):
             response = states[..., 1:]
             if first + k == 0:
@@ -124,9 +141,8 @@ def _without_each(
                 alone = found.cov[k].copy()
             if not before:
                 own, explained = found.cov[k].copy(), float(found.explained[k])
-                inverse = known[first + k]
                 step = states[..., 0].copy()
-                out.append(_Variant(step, own, own - alone, explained, inverse))
+                out.append(_Variant(step, own, own - alone, explained, known[first + k]))
             moved = response - whole
             out[first + k].cov += response @ np.swapaxes(response, -1, -2)
             out[first + k].apart += moved @ np.swapaxes(moved, -1, -2)
@@ -135,28 +151,16 @@ def _without_each(
     return out
 
 
-def _inverses(rest: Normal, parts: list[Part], kept: BoolArray) -> list[Array]:
+def _inverses(parts: Parts, kept: BoolArray) -> list[Array]:
     """Return `inverses` of each variant: together, since each is many small matrices."""
     out: list[Array] = []
-    group = max(1, int(chains.AT_ONCE / (8.0 * 4.0 * rest.diagonal.size)))
+    always = parts.parts[0].sums.diagonal
+    group = max(1, int(chains.AT_ONCE / (8.0 * 4.0 * always.size)))
     for first in range(0, len(kept), group):
         some = kept[first : first + group]
-        diagonal = np.repeat(rest.diagonal[None], len(some), axis=0)
+        diagonal = np.zeros((len(some), *always.shape))
         for own, channels in zip(diagonal, some, strict=True):
-            for part in parts:
-                if np.all(channels[part.channels]):
-                    own += part.sums.diagonal
-        out += list(inverses(diagonal, rest.following[None]))
+            for part in parts.of(channels):
+                own += part.sums.diagonal
+        out += list(inverses(diagonal, parts.following[None]))
     return out
-
-
-def _solved(
-    rest: Normal, parts: list[Part], some: BoolArray, known: Array, *, covariance: bool
-) -> ChainSolution:
-    """Solve some variants at once; all else is as of `solve_chain`."""
-    chain, variants = rest.variants(len(some))
-    for normal, channels in zip(variants, some, strict=True):
-        for part in parts:
-            if np.all(channels[part.channels]):
-                part.added_to(normal)
-    return solve_chain(chain, 6, known, covariance=covariance)

@@ -5,9 +5,9 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
-RESIDENT = 640e6  # bytes; what a smaller program has freed nobody misses
+RESIDENT = 512e6  # bytes; what a smaller program has freed nobody misses
 KEPT_ARRAY = 2**25  # bytes; larger ones glibc always maps anew
-KEPT_TOP = 2**28  # bytes
+KEPT_TOP = 2**27  # bytes
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 PAGES = Path("/proc/self/statm")
 
