@@ -34,9 +34,8 @@ class Part:
     columns: IntArray
 
     def added_to(self, normal: Normal) -> None:
-        """Add them to equations that have all right sides."""
+        """Add them to equations that have all right sides, but for the diagonal."""
         own = self.sums
-        normal.diagonal += own.diagonal
         normal.border[...] += own.border
         normal.corner += own.corner
         normal.right_border[:, self.columns] += own.right_border
@@ -68,8 +67,24 @@ class Parts:
         """Yield the parts of a variant that has some of the channels."""
         return (part for part in self.parts if np.all(channels[part.channels]))
 
+    def diagonals(self, some: BoolArray) -> Array:
+        """Return the diagonal of some variants, shape (h, states, 15, 15)."""
+        found = np.zeros((len(some), *self.parts[0].sums.diagonal.shape))
+        for own, channels in zip(found, some, strict=True):
+            for part in self.of(channels):
+                own += part.sums.diagonal
+        return found
+
+    def forget_diagonals(self) -> None:
+        """Make room, once they were asked for."""
+        for part in self.parts:
+            part.sums.diagonal = part.sums.diagonal[:0].copy()
+
     def chain(self, some: BoolArray) -> Chain:
-        """Return some variants, shape (h, channels): solving the chain overwrites them."""
+        """Return some variants, shape (h, channels), with diagonals of zeros.
+
+        Solving the chain overwrites them.
+        """
         states, size = self.parts[0].sums.border.shape[0], len(self.parts[0].sums.corner)
         chain, variants = Normal.blank(len(some), states, size, self.count, self.following)
         for normal, channels in zip(variants, some, strict=True):

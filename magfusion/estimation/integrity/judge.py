@@ -24,6 +24,7 @@ from magfusion.estimation.integrity.signal import detected_in
 from magfusion.estimation.integrity.smoothed_compass import compass
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
 from magfusion.estimation.integrity.tuned_noise import tuned_noise
+from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.model.samples import Log
 from magfusion.model.trust import Trust, Verdict
 from magfusion.model.without_imu import logged
@@ -49,6 +50,7 @@ def judged(result: Smoothed, log: Log) -> tuple[Smoothed, Trust]:
     freed = detected_in(result.fields, result.declared.site)
     heard = recorded(*streams, estimated=states, beacons=alone, freed=freed)
     trust = Trust((*tuned_noise(result.noise), *heard))
+    give_back_memory()
     pose_cov = result.states.pose_cov
     if pose_cov is None:
         return result, trust

@@ -13,7 +13,7 @@ from magfusion.estimation.convergence import OPEN_ROTATION
 from magfusion.estimation.integrity.separation import Separation
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.solve.chain import inverses, solve_chain
+from magfusion.estimation.solve.chain import STRETCH, inverses, solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.estimation.state import MOTION
 from magfusion.units import Array, BoolArray
@@ -124,10 +124,11 @@ def _without_each(parts: Parts, kept: BoolArray, before: list[_Variant]) -> list
     before : list of _Variant
         Solved with other columns of what is considered.
     """
-    always = parts.parts[0].sums
-    sides = always.diagonal.size // MOTION * (parts.count + len(always.corner))
-    group = max(1, int(chains.AT_ONCE / (8.0 * 4.0 * (always.diagonal.size + sides))))
+    count, _, size = parts.parts[0].sums.border.shape
+    per_variant = 8.0 * 4.0 * count * MOTION * (MOTION + parts.count + size)
+    group = max(1, int(chains.AT_ONCE / per_variant))
     known = [one.inverse for one in before] if before else _inverses(parts, kept)
+    parts.forget_diagonals()
     out, whole, alone = list(before), np.zeros((0, 6, 0)), np.zeros((0, 6, 6))
     for first in range(0, len(kept), group):
         some = slice(first, first + group)
@@ -143,10 +144,11 @@ def _without_each(parts: Parts, kept: BoolArray, before: list[_Variant]) -> list
                 own, explained = found.cov[k].copy(), float(found.explained[k])
                 step = states[..., 0].copy()
                 out.append(_Variant(step, own, own - alone, explained, known[first + k]))
-            moved = response - whole
-            out[first + k].cov += response @ np.swapaxes(response, -1, -2)
-            out[first + k].apart += moved @ np.swapaxes(moved, -1, -2)
-            del moved
+            for begin in range(0, count, STRETCH):
+                here = slice(begin, begin + STRETCH)
+                own, moved = response[here], response[here] - whole[here]
+                out[first + k].cov[here] += own @ np.swapaxes(own, -1, -2)
+                out[first + k].apart[here] += moved @ np.swapaxes(moved, -1, -2)
         del found, states, response  # before the next group, too
     return out
 
@@ -154,13 +156,8 @@ def _without_each(parts: Parts, kept: BoolArray, before: list[_Variant]) -> list
 def _inverses(parts: Parts, kept: BoolArray) -> list[Array]:
     """Return `inverses` of each variant: together, since each is many small matrices."""
     out: list[Array] = []
-    always = parts.parts[0].sums.diagonal
-    group = max(1, int(chains.AT_ONCE / (8.0 * 4.0 * always.size)))
+    group = max(1, int(chains.AT_ONCE / (8.0 * 4.0 * parts.parts[0].sums.diagonal.size)))
     for first in range(0, len(kept), group):
         some = kept[first : first + group]
-        diagonal = np.zeros((len(some), *always.shape))
-        for own, channels in zip(diagonal, some, strict=True):
-            for part in parts.of(channels):
-                own += part.sums.diagonal
-        out += list(inverses(diagonal, parts.following[None]))
+        out += list(inverses(parts.diagonals(some), parts.following[None]))
     return out
