@@ -50,7 +50,8 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
         rest.diagonal += np.diag(1.0 / OPEN**2)
         pieces = rows.pieces() if solved else tally.over(rows.pieces())
         parts = parts_of(rest, rows, pieces, kept)
-        del rest, rows
+        del rest, rows, pieces
+        give_back_memory()
         solved = _without_each(parts, kept, solved)
         del parts  # before the next group: of a long log they are much
         give_back_memory()
