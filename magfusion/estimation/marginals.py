@@ -121,7 +121,7 @@ def _of_chain(graph: Graph, estimate: Estimate, considered: tuple[Block, ...]) -
         if fields is not None:
             for piece in fields.pieces():
                 piece.added_to(normal)
-        known = None if solved is None else solved.inverse
+        known: Array | None = None if solved is None else solved.inverse
         found = solve_chain(normal.chain(), POSE, known, covariance=known is None)
         del normal, fields  # before the next group: of a long log they are much
         response = found.states[0, ..., 1:]

@@ -140,6 +140,7 @@ def taken_off(
                 earth,
                 carriers(tone_frequencies(heard.site), time),
                 Motion(*change_of),
+                through_nodes=True,
             )
             unexplained[rows] = measured_sensor[rows] - predicted
         if wanted is not None:

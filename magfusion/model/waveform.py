@@ -12,6 +12,7 @@ from magfusion.model.channel_effects import are_driven, axis_factors
 from magfusion.model.coil_field import side_by_side
 from magfusion.model.field import driven_field
 from magfusion.model.parameters import Calibration
+from magfusion.model.path_field import field_along_path
 from magfusion.model.quaternion import cross
 from magfusion.model.receive_coils import is_apart, joined_samples, points_apart
 from magfusion.model.site import Magnetometer, Site
@@ -45,6 +46,8 @@ def predicted_waveform(
     earth_field_world: Array,
     carrier: ComplexArray,
     change: Motion | None = None,
+    *,
+    through_nodes: bool = False,
 ) -> tuple[Array, Array]:
     """Return the samples that a magnetometer takes along a motion.
 
@@ -58,6 +61,8 @@ def predicted_waveform(
         As of `carriers`.
     change : Motion, optional
         Of the motion.
+    through_nodes : bool
+        Whether fields that cost much are found as by `magfusion.model.path_field`.
 
     Returns
     -------
@@ -68,10 +73,17 @@ def predicted_waveform(
     """
     factors = axis_factors(calibration.site)
     if factors is None:
-        return _read(motion, calibration, earth_field_world, carrier, change)
+        return _read(motion, calibration, earth_field_world, carrier, change, through_nodes)
     # What an axis answers is what all would, if its currents were those that it answers to.
     read = [
-        _read(motion, calibration, earth_field_world, carrier * factors[:, axis], change)
+        _read(
+            motion,
+            calibration,
+            earth_field_world,
+            carrier * factors[:, axis],
+            change,
+            through_nodes,
+        )
         for axis in range(3)
     ]
     field, by = (np.stack([read[k][i][:, k] for k in range(3)], axis=1) for i in range(2))
@@ -84,17 +96,24 @@ def _read(
     earth_field_world: Array,
     carrier: ComplexArray,
     change: Motion | None,
+    through_nodes: bool,
 ) -> tuple[Array, Array]:
     """Return the samples of axes that answer alike, as `predicted_waveform`."""
     magnetometer = calibration.site.platform.magnetometer
     currents = _currents(calibration, motion.time, carrier)
     if not is_apart(magnetometer):
         field, by = _at_point(
-            magnetometer, motion, calibration.site, earth_field_world, currents, change
+            magnetometer,
+            motion,
+            calibration.site,
+            earth_field_world,
+            currents,
+            change,
+            through_nodes,
         )
         return field + magnetometer.offset, by
     apart = [
-        _at_point(at, motion, calibration.site, earth_field_world, currents, change)
+        _at_point(at, motion, calibration.site, earth_field_world, currents, change, through_nodes)
         for at in points_apart(magnetometer)
     ]
     field, by = (joined_samples([part[k] for part in apart], magnetometer) for k in range(2))
@@ -129,6 +148,7 @@ def _at_point(
     earth_field_world: Array,
     currents: list[AnyArray],
     change: Motion | None,
+    through_nodes: bool,
 ) -> tuple[Array, Array]:
     """Return what a magnetometer reads whose axes are at one point, without its offset."""
     rotation = motion.world_from_body
@@ -138,7 +158,11 @@ def _at_point(
         along = change.position_world + cross(change.rotation_world.T, lever.T).T
     field, by = np.tile(earth_field_world, (len(rotation), 1)), np.zeros((len(rotation), 3))
     for (_, source), current in zip(side_by_side(site), currents, strict=True):
-        driven = driven_field(source, motion.position_world + lever, current, along)
+        place = motion.position_world + lever
+        # Dipoles cost less than what would save them.
+        dear = source.loops.radius is not None or source.decay is not None
+        field_at = field_along_path if dear and through_nodes else driven_field
+        driven = field_at(source, place, current, along)
         field += np.sum(driven.field.reshape(-1, *field.shape), axis=0)
         if driven.along is not None:
             by += np.sum(driven.along.reshape(-1, *field.shape), axis=0)
