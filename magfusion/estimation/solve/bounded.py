@@ -7,7 +7,7 @@ import numpy as np
 from magfusion.units import Array
 
 DECREASE = 1e-6  # of the cost; the step that lowers it by less is the last
-DECREASE_CURVED = 1e-11  # of a cost; the step of Newton that lowers it by less ends far closer
+DECREASE_CURVED = 1e-9  # of a cost; the step of Newton that lowers it by less ends far closer
 LONGEST = 2.0  # of the steps of `minimise_curved`: beyond, a curvature says nothing
 SUFFICIENT = 1e-4  # share of the decrease that the slope promises
 FLATTEST = 1e-10  # of the largest curvature
