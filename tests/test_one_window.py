@@ -1,6 +1,7 @@
 """Windows that are demodulated one by one: keeping designs of even samples changes nothing."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.model.site import Site
-from magfusion.receiver.design import ALIKE, evenly_spaced
+from magfusion.receiver.design import ALIKE, WITHIN, Designs, Maps, evenly_spaced
 from magfusion.receiver.lockin import WindowOperator, window_operator
 from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.receiver.turn import BodyTurn, body_turn_of, on_clock
@@ -91,12 +92,39 @@ def test_uneven_samples_have_designs_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("error", [0.9, 5.0])
-def test_times_are_even_within_three_steps(error: float) -> None:
-    step = 1e-9  # s
-    time = np.linspace(-0.2, 0.2, 81)
-    assert evenly_spaced(time, step) is not None
-    time[40] += 3.0 * error * step
-    found = evenly_spaced(time, step)
+def test_times_are_even_within_some_steps(error: float) -> None:
+    step, count = 1e-9, np.array([81, 80])  # s
+    time = np.stack([np.linspace(-0.2, 0.2, 81), np.linspace(-0.1, 0.3, 81)])
+    time[1, -1] = 0.0  # no sample of it
+    assert evenly_spaced(time, count, step) is not None
+    time[1, 40] += WITHIN * error * step
+    found = evenly_spaced(time, count, step)
     assert (found is None) == (error > 1.0)
     if found is not None:
-        assert np.max(np.abs(found[1] - time)) <= 3.0 * step
+        for (number, middle, half), own in zip(found.tolist(), time, strict=True):
+            even = step * (middle + half * np.linspace(-1.0, 1.0, number))
+            assert np.max(np.abs(even - own[:number])) <= WITHIN * step
+
+
+def test_windows_of_even_samples_share_their_designs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their phasors and noise are those of designs that each of them has for itself."""
+    site, wave, imu = recorded(0.0)
+    found = LockinReceiver(site, SETTINGS).whole(wave, imu)[1]
+    made = 0
+    own = Designs._made
+
+    def counted(self: Designs, *args: Any) -> Maps:
+        nonlocal made
+        made += len(args[0])
+        return own(self, *args)
+
+    monkeypatch.setattr(Designs, "_made", counted)
+    again = LockinReceiver(site, SETTINGS).whole(wave, imu)[1]
+    np.testing.assert_array_equal(again.phasor_sensor, found.phasor_sensor)
+    assert 0 < made < 0.25 * len(found)
+    monkeypatch.setattr(Designs, "_of_even", lambda *_: None)
+    alone = LockinReceiver(site, SETTINGS).whole(wave, imu)[1]
+    size = np.nanmax(np.abs(alone.phasor_sensor))
+    assert np.nanmax(np.abs(found.phasor_sensor - alone.phasor_sensor)) < 2e-6 * size
+    cov = float(np.nanmax(alone.phasor_cov))
+    np.testing.assert_allclose(found.phasor_cov, alone.phasor_cov, rtol=1e-4, atol=1e-6 * cov)

@@ -18,7 +18,9 @@ CHUNK = 64  # windows demodulated at once: what is made of them stays in the cac
 LARGEST = 2**28  # bytes of the maps of so many; of many tones in long windows fewer are at once
 KEPT = 256 * 2**20  # bytes of maps that are kept; what is more is made anew
 ALIKE = 1e-6  # rad; of the fastest tone, by which times are off that pass for evenly spaced
+WITHIN = 1.5  # small steps in which spacings are told; each of its two numbers is half of one off
 EVEN_KEPT = 64  # maps of evenly spaced samples
+FEWEST_ALIKE = 4  # windows for each of their spacings
 WORST_CONDITION = 1e8  # of a normal matrix; beyond, the samples do not tell its columns apart
 
 
@@ -65,9 +67,9 @@ class Designs:
         Tones, and lines that are fitted beside them (Hz).
     time : ndarray, shape (samples,)
         (s)
-    even : dict, optional
-        Maps of single windows by the spacing of their samples, which are evenly spaced: where
-        windows are demodulated one by one, few spacings come again and again.
+    even : dict
+        Maps of single windows by the spacing of their samples, which are evenly spaced: few
+        spacings come again and again.
     """
 
     settings: LockinSettings
@@ -75,7 +77,7 @@ class Designs:
     nuisance_hz: Array
     time: Array
     windows: Windows
-    even: dict[Spacing, Maps] | None = None
+    even: dict[Spacing, Maps] = field(default_factory=dict)
     kept: dict[int, Maps] = field(default_factory=dict)
     asked: set[int] = field(default_factory=set)
 
@@ -88,11 +90,15 @@ class Designs:
         chunk = self._at_once()
         for begin in range(0, len(self.windows), chunk):
             rows = slice(begin, begin + chunk)
-            known = self.kept.get(begin)
-            maps = self._maps(self.windows.rows(rows)) if known is None else known
-            again = begin in self.asked or len(self.windows) <= chunk
-            if known is None and again and self._size() + _size(maps) < KEPT:
-                self.kept[begin] = maps
+            maps = self.kept.get(begin)
+            if maps is None:
+                index, weight, elapsed = padded(self.windows.rows(rows), self.time)
+                maps = self._of_even(self.windows.count[rows], index, weight, elapsed)
+                if maps is None:
+                    maps = self._made(index, weight, elapsed)
+                    again = begin in self.asked or len(self.windows) <= chunk
+                    if again and self._size() + _size(maps) < KEPT:
+                        self.kept[begin] = maps
             self.asked.add(begin)
             yield rows, maps
 
@@ -111,27 +117,51 @@ class Designs:
         found *= weight[..., None]
         return found
 
-    def _maps(self, windows: Windows) -> Maps:
-        index, weight, elapsed = padded(windows, self.time)
-        found = evenly_spaced(elapsed[0], self._step) if self._may_be_even(windows) else None
-        if found is None or self.even is None:
-            return self._made(index, weight, elapsed)
-        spacing, times = found
+    def _of_even(
+        self, count: IntArray, index: IntArray, weight: BoolArray, elapsed: Array
+    ) -> Maps | None:
+        """Return the maps of windows of evenly spaced samples; None where they are not.
+
+        Or where there are so many spacings that to look for known ones does not pay.
+        """
+        spacings = evenly_spaced(elapsed, count, self._step)
+        if spacings is None:
+            return None
+        few, which = np.unique(spacings, axis=0, return_inverse=True)
+        if len(few) > EVEN_KEPT or 1 < len(count) < FEWEST_ALIKE * len(few):
+            return None
+        maps = [self._of_spacing(*own) for own in few.tolist()]
+        if len(maps) == 1:
+            shared = (np.broadcast_to(p, (len(count), *p.shape[1:])) for p in maps[0][2:])
+            return Maps(index, weight, *shared)
+        size = index.shape[1]
+        solver, probes, times = (
+            np.concatenate([_longer(part, size) for part in parts])[which]
+            for parts in zip(*((m.solver, m.probes, m.elapsed) for m in maps), strict=True)
+        )
+        variance, told = (
+            np.concatenate(parts)[which]
+            for parts in zip(*((m.variance, m.told) for m in maps), strict=True)
+        )
+        return Maps(index, weight, times, solver, variance, probes, told)
+
+    def _of_spacing(self, count: int, middle: int, half: int) -> Maps:
+        """Return the maps of one window of evenly spaced samples."""
+        spacing = count, middle, half
         known = self.even.pop(spacing, None)
         if known is None:
-            known = self._made(index, weight, times[None])
+            times = self._step * (middle + half * np.linspace(-1.0, 1.0, count))[None]
+            whole = np.ones(times.shape, dtype=bool)
+            known = self._made(np.zeros(times.shape, dtype=np.int64), whole, times)
         self.even[spacing] = known  # the newest is the last
         if len(self.even) > EVEN_KEPT:
             del self.even[next(iter(self.even))]
-        return known._replace(sample=index)
-
-    def _may_be_even(self, windows: Windows) -> bool:
-        return self.even is not None and len(windows) == 1 and windows.count[0] > 2
+        return known
 
     @property
     def _step(self) -> float:
         """The step of times (s) in which spacings are told."""
-        return ALIKE / (6.0 * np.pi * float(np.max(self.frequencies_hz)))
+        return ALIKE / (2.0 * np.pi * WITHIN * float(np.max(self.frequencies_hz)))
 
     def _made(self, index: IntArray, weight: BoolArray, elapsed: Array) -> Maps:
         design, n = self.design(elapsed, weight), len(self.frequencies_hz)
@@ -155,15 +185,34 @@ def _size(maps: Maps) -> int:
     return sum(part.nbytes for part in maps)
 
 
-def evenly_spaced(time: Array, step: float) -> tuple[Spacing, Array] | None:
-    """Return the spacing of samples, and times that have it; None where they are not even.
+def evenly_spaced(time: Array, count: IntArray, step: float) -> IntArray | None:
+    """Return the spacing of the samples of windows; None where they are not even.
 
-    Times (n,) are rounded by it to three steps (s) or less, whatever was asked before.
+    Of times (n, m) the first ``count`` (n,) of each window are asked; these it rounds to `WITHIN`
+    steps (s) or less, whatever was asked before.
+
+    Returns
+    -------
+    int ndarray, shape (n, 3)
+        Samples, their middle and half of their span, in steps.
     """
-    middle, half = 0.5 * (time[0] + time[-1]), 0.5 * (time[-1] - time[0])
-    spacing = len(time), round(middle / step), round(half / step)
-    even = step * (spacing[1] + spacing[2] * np.linspace(-1.0, 1.0, len(time)))
-    return (spacing, even) if np.max(np.abs(time - even)) <= 3.0 * step else None
+    if np.min(count) < 3:
+        return None
+    first, last = time[:, 0], time[np.arange(len(count)), count - 1]
+    middle = np.rint(0.5 * (first + last) / step)
+    half = np.rint(0.5 * (last - first) / step)
+    reach = np.arange(time.shape[1])
+    share = reach * (2.0 / (count - 1))[:, None] - 1.0
+    off = np.abs(time - step * (middle[:, None] + half[:, None] * share))
+    if np.max(off, where=reach < count[:, None], initial=0.0) > WITHIN * step:
+        return None
+    return np.stack([count, middle.astype(np.int64), half.astype(np.int64)], axis=1)
+
+
+def _longer(part: Array, size: int) -> Array:
+    """Return an array of samples, the last axis, with zeros up to a size."""
+    more = np.zeros((*part.shape[:-1], size - part.shape[-1]))
+    return np.concatenate([part, more], axis=-1)
 
 
 def nuisances_hz(settings: LockinSettings, frequencies: Array, nyquist_hz: float) -> Array:
