@@ -9,7 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.model.site import Site
-from magfusion.receiver.design import ALIKE, WITHIN, Designs, Maps, evenly_spaced
+from magfusion.receiver import design
+from magfusion.receiver.design import Designs, Maps
+from magfusion.receiver.even_samples import ALIKE, spacings_of
 from magfusion.receiver.lockin import WindowOperator, window_operator
 from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.receiver.turn import BodyTurn, body_turn_of, on_clock
@@ -70,7 +72,7 @@ def test_even_samples_share_a_few_designs_and_phasors_are_the_same() -> None:
     receiver = LockinReceiver(site, SETTINGS)
     kept, alone = one_by_one(receiver, site, wave, imu)
     assert len(kept) > 40
-    assert furthest(kept, alone, wave) < ALIKE
+    assert furthest(kept, alone, wave) < ALIKE[1]
     assert len(receiver._even) <= 14  # seven spacings, and what rounding makes of them
 
 
@@ -91,24 +93,31 @@ def test_uneven_samples_have_designs_of_their_own() -> None:
     assert not receiver._even
 
 
-@pytest.mark.parametrize("error", [0.9, 5.0])
-def test_times_are_even_within_some_steps(error: float) -> None:
-    step, count = 1e-9, np.array([81, 80])  # s
+@pytest.mark.parametrize("alike", ALIKE)
+@pytest.mark.parametrize("error", [0.9, 2000.0])
+def test_times_are_even_within_a_phase(alike: float, error: float) -> None:
+    fastest_hz, count = 40.0, np.array([81, 80])
     time = np.stack([np.linspace(-0.2, 0.2, 81), np.linspace(-0.1, 0.3, 81)])
     time[1, -1] = 0.0  # no sample of it
-    assert evenly_spaced(time, count, step) is not None
-    time[1, 40] += WITHIN * error * step
-    found = evenly_spaced(time, count, step)
-    assert (found is None) == (error > 1.0)
-    if found is not None:
-        for (number, middle, half), own in zip(found.tolist(), time, strict=True):
-            even = step * (middle + half * np.linspace(-1.0, 1.0, number))
-            assert np.max(np.abs(even - own[:number])) <= WITHIN * step
+    exact, other = spacings_of(time, count, fastest_hz)
+    time[1, 40] += error * alike / (2.0 * np.pi * fastest_hz)
+    same, moved = spacings_of(time, count, fastest_hz)
+    assert same == exact
+    if alike * error > ALIKE[1]:
+        assert moved is None
+        return
+    assert moved is not None
+    assert (moved.step == exact.step) == (alike * error < ALIKE[0])
+    assert moved != other or moved.step == exact.step
+    off = np.max(np.abs(moved.times() - time[1, :80]))
+    assert 2.0 * np.pi * fastest_hz * off <= (1.0 + 1e-9) * ALIKE[0 if alike * error < 1e-9 else 1]
 
 
 def test_windows_of_even_samples_share_their_designs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their phasors and noise are those of designs that each of them has for itself."""
     site, wave, imu = recorded(0.0)
+    missing = np.arange(len(wave)) != 1500  # a window with a gap is not even
+    wave = replace(wave, time=wave.time[missing], measured_sensor=wave.measured_sensor[missing])
     found = LockinReceiver(site, SETTINGS).whole(wave, imu)[1]
     made = 0
     own = Designs._made
@@ -122,7 +131,7 @@ def test_windows_of_even_samples_share_their_designs(monkeypatch: pytest.MonkeyP
     again = LockinReceiver(site, SETTINGS).whole(wave, imu)[1]
     np.testing.assert_array_equal(again.phasor_sensor, found.phasor_sensor)
     assert 0 < made < 0.25 * len(found)
-    monkeypatch.setattr(Designs, "_of_even", lambda *_: None)
+    monkeypatch.setattr(design, "spacings_of", lambda time, *_: [None] * len(time))
     alone = LockinReceiver(site, SETTINGS).whole(wave, imu)[1]
     size = np.nanmax(np.abs(alone.phasor_sensor))
     assert np.nanmax(np.abs(found.phasor_sensor - alone.phasor_sensor)) < 2e-6 * size

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.receiver.admission import Windows
+from magfusion.receiver.even_samples import Spacing, spacings_of
 from magfusion.receiver.noise import probes_left
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray, IntArray
@@ -17,8 +18,6 @@ from magfusion.units import Array, BoolArray, IntArray
 CHUNK = 64  # windows demodulated at once: what is made of them stays in the cache
 LARGEST = 2**28  # bytes of the maps of so many; of many tones in long windows fewer are at once
 KEPT = 256 * 2**20  # bytes of maps that are kept; what is more is made anew
-ALIKE = 1e-6  # rad; of the fastest tone, by which times are off that pass for evenly spaced
-WITHIN = 1.5  # small steps in which spacings are told; each of its two numbers is half of one off
 EVEN_KEPT = 64  # maps of evenly spaced samples
 FEWEST_ALIKE = 4  # windows for each of their spacings
 WORST_CONDITION = 1e8  # of a normal matrix; beyond, the samples do not tell its columns apart
@@ -52,9 +51,6 @@ class Maps(NamedTuple):
     variance: Array
     probes: Array
     told: IntArray
-
-
-Spacing = tuple[int, int, int]  # samples, their middle and half of their span, in small steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,13 +88,10 @@ class Designs:
             rows = slice(begin, begin + chunk)
             maps = self.kept.get(begin)
             if maps is None:
-                index, weight, elapsed = padded(self.windows.rows(rows), self.time)
-                maps = self._of_even(self.windows.count[rows], index, weight, elapsed)
-                if maps is None:
-                    maps = self._made(index, weight, elapsed)
-                    again = begin in self.asked or len(self.windows) <= chunk
-                    if again and self._size() + _size(maps) < KEPT:
-                        self.kept[begin] = maps
+                maps, own = self._maps(self.windows.rows(rows))
+                again = begin in self.asked or len(self.windows) <= chunk
+                if own and again and self._size() + _size(maps) < KEPT:
+                    self.kept[begin] = maps
             self.asked.add(begin)
             yield rows, maps
 
@@ -117,51 +110,33 @@ class Designs:
         found *= weight[..., None]
         return found
 
-    def _of_even(
-        self, count: IntArray, index: IntArray, weight: BoolArray, elapsed: Array
-    ) -> Maps | None:
-        """Return the maps of windows of evenly spaced samples; None where they are not.
-
-        Or where there are so many spacings that to look for known ones does not pay.
-        """
-        spacings = evenly_spaced(elapsed, count, self._step)
-        if spacings is None:
-            return None
-        few, which = np.unique(spacings, axis=0, return_inverse=True)
-        if len(few) > EVEN_KEPT or 1 < len(count) < FEWEST_ALIKE * len(few):
-            return None
-        maps = [self._of_spacing(*own) for own in few.tolist()]
-        if len(maps) == 1:
-            shared = (np.broadcast_to(p, (len(count), *p.shape[1:])) for p in maps[0][2:])
-            return Maps(index, weight, *shared)
-        size = index.shape[1]
-        solver, probes, times = (
-            np.concatenate([_longer(part, size) for part in parts])[which]
-            for parts in zip(*((m.solver, m.probes, m.elapsed) for m in maps), strict=True)
-        )
-        variance, told = (
-            np.concatenate(parts)[which]
-            for parts in zip(*((m.variance, m.told) for m in maps), strict=True)
-        )
-        return Maps(index, weight, times, solver, variance, probes, told)
-
-    def _of_spacing(self, count: int, middle: int, half: int) -> Maps:
-        """Return the maps of one window of evenly spaced samples."""
-        spacing = count, middle, half
-        known = self.even.pop(spacing, None)
-        if known is None:
-            times = self._step * (middle + half * np.linspace(-1.0, 1.0, count))[None]
-            whole = np.ones(times.shape, dtype=bool)
-            known = self._made(np.zeros(times.shape, dtype=np.int64), whole, times)
-        self.even[spacing] = known  # the newest is the last
-        if len(self.even) > EVEN_KEPT:
+    def _maps(self, windows: Windows) -> tuple[Maps, bool]:
+        """Return the maps of some windows, and whether most were made for them alone."""
+        index, weight, elapsed = padded(windows, self.time)
+        spacings = spacings_of(elapsed, windows.count, float(np.max(self.frequencies_hz)))
+        distinct = dict.fromkeys(own for own in spacings if own is not None)
+        known = {own: self.even.pop(own) for own in distinct if own in self.even}
+        self.even.update(known)  # the newest are the last
+        uneven = [k for k, own in enumerate(spacings) if own is None]
+        new = [own for own in distinct if own not in known]
+        rows = [*(spacings.index(own) for own in new), *uneven]
+        for k, own in zip(rows, new, strict=False):
+            elapsed[k, : own.count] = own.times()
+        parts: list[Maps] = []
+        if rows:
+            made = self._made(index[rows], weight[rows], elapsed[rows])
+            if len(uneven) == len(windows):
+                return made, True
+            for k, own in enumerate(new):
+                known[own] = self.even[own] = _rows(made, slice(k, k + 1), own.count)
+            parts = [_rows(made, slice(len(new), None), None)]
+        while len(self.even) > EVEN_KEPT:
             del self.even[next(iter(self.even))]
-        return known
-
-    @property
-    def _step(self) -> float:
-        """The step of times (s) in which spacings are told."""
-        return ALIKE / (2.0 * np.pi * WITHIN * float(np.max(self.frequencies_hz)))
+        at = {own: k for k, own in enumerate(distinct)}
+        which = np.array([len(at) if own is None else at[own] for own in spacings])
+        which[uneven] += np.arange(len(uneven))
+        parts = [known[own] for own in distinct] + parts
+        return _chosen(index, weight, parts, which), FEWEST_ALIKE * len(rows) > len(windows)
 
     def _made(self, index: IntArray, weight: BoolArray, elapsed: Array) -> Maps:
         design, n = self.design(elapsed, weight), len(self.frequencies_hz)
@@ -185,32 +160,33 @@ def _size(maps: Maps) -> int:
     return sum(part.nbytes for part in maps)
 
 
-def evenly_spaced(time: Array, count: IntArray, step: float) -> IntArray | None:
-    """Return the spacing of the samples of windows; None where they are not even.
+def _rows(maps: Maps, rows: slice, count: int | None) -> Maps:
+    """Return the maps of some windows, of so many samples as they have."""
+    own = Maps(*(part[rows] for part in maps))
+    return Maps(
+        *(part[..., :count] for part in own[:4]), own.variance, own.probes[..., :count], own.told
+    )
 
-    Of times (n, m) the first ``count`` (n,) of each window are asked; these it rounds to `WITHIN`
-    steps (s) or less, whatever was asked before.
 
-    Returns
-    -------
-    int ndarray, shape (n, 3)
-        Samples, their middle and half of their span, in steps.
-    """
-    if np.min(count) < 3:
-        return None
-    first, last = time[:, 0], time[np.arange(len(count)), count - 1]
-    middle = np.rint(0.5 * (first + last) / step)
-    half = np.rint(0.5 * (last - first) / step)
-    reach = np.arange(time.shape[1])
-    share = reach * (2.0 / (count - 1))[:, None] - 1.0
-    off = np.abs(time - step * (middle[:, None] + half[:, None] * share))
-    if np.max(off, where=reach < count[:, None], initial=0.0) > WITHIN * step:
-        return None
-    return np.stack([count, middle.astype(np.int64), half.astype(np.int64)], axis=1)
+def _chosen(index: IntArray, weight: BoolArray, parts: list[Maps], which: IntArray) -> Maps:
+    """Return the maps of windows by their place among those of all parts, padded."""
+    if len(parts) == 1 and len(parts[0].told) == 1:
+        shared = (np.broadcast_to(part, (len(which), *part.shape[1:])) for part in parts[0][2:])
+        return Maps(index, weight, *shared)
+    size = index.shape[1]
+    elapsed, solver, probes = (
+        np.concatenate([_longer(own, size) for own in each])[which]
+        for each in zip(*((p.elapsed, p.solver, p.probes) for p in parts), strict=True)
+    )
+    variance = np.concatenate([part.variance for part in parts])[which]
+    told = np.concatenate([part.told for part in parts])[which]
+    return Maps(index, weight, elapsed, solver, variance, probes, told)
 
 
 def _longer(part: Array, size: int) -> Array:
     """Return an array of samples, the last axis, with zeros up to a size."""
+    if part.shape[-1] == size:
+        return part
     more = np.zeros((*part.shape[:-1], size - part.shape[-1]))
     return np.concatenate([part, more], axis=-1)
 

@@ -1,0 +1,64 @@
+"""Windows whose samples are evenly spaced: few spacings come again and again.
+
+Whether a window is one hangs on its own samples alone, and not on what was asked before or with it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.units import Array, IntArray
+
+# Of the fastest tone (rad), by which times are off that pass for evenly spaced: of clocks that tell
+# every digit, and of those that tell nanoseconds.
+ALIKE = (1e-9, 1e-6)
+WITHIN = 1.5  # steps that times may be off by; each of the two numbers of a spacing is half of one
+
+
+class Spacing(NamedTuple):
+    """Evenly spaced samples: how many, and their middle and half their span in small steps."""
+
+    count: int
+    middle: int
+    half: int
+    step: float  # (s)
+
+    def times(self) -> Array:
+        """Return the times that it stands for, shape (count,) (s)."""
+        return self.step * (self.middle + self.half * np.linspace(-1.0, 1.0, self.count))
+
+
+def spacings_of(time: Array, count: IntArray, fastest_hz: float) -> list[Spacing | None]:
+    """Return the spacing of each window, told as finely as may be; None where it is not even.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n, m)
+        Of samples from the centre of each window (s).
+    count : int ndarray, shape (n,)
+        How many of them there are.
+    fastest_hz : float
+        Frequency of a tone.
+    """
+    found: list[Spacing | None] = [None] * len(count)
+    for alike in ALIKE:
+        step = alike / (2.0 * np.pi * WITHIN * fastest_hz)
+        middle, half, even = _rounded(time, count, step)
+        for k in np.flatnonzero(even).tolist():
+            if found[k] is None:
+                found[k] = Spacing(int(count[k]), int(middle[k]), int(half[k]), step)
+        if None not in found:
+            break
+    return found
+
+
+def _rounded(time: Array, count: IntArray, step: float) -> tuple[Array, Array, Array]:
+    """Return middles and half spans in steps (s), and which windows are even by them."""
+    known = np.maximum(count, 2)
+    first, last = time[:, 0], time[np.arange(len(count)), known - 1]
+    middle, half = np.rint(0.5 * (first + last) / step), np.rint(0.5 * (last - first) / step)
+    reach = np.arange(time.shape[1])
+    share = reach * (2.0 / (known - 1))[:, None] - 1.0
+    off = np.abs(time - step * (middle[:, None] + half[:, None] * share))
+    worst = np.max(off, axis=1, where=reach < count[:, None], initial=0.0)
+    return middle, half, (worst <= WITHIN * step) & (count > 2)
