@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -53,10 +54,10 @@ def test_only_a_large_program_gives_back_what_it_freed(monkeypatch: pytest.Monke
 
 
 def test_a_system_that_tells_nothing_is_given_everything_back(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: object
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     asked: list[str] = []
     monkeypatch.setattr(memory, "_of_glibc", lambda name: lambda _: asked.append(name))
-    monkeypatch.setattr(memory, "PAGES", memory.Path(str(tmp_path)) / "none")
+    monkeypatch.setattr(memory, "PAGES", tmp_path / "none")
     memory.give_back_memory()
     assert asked == ["malloc_trim"]

@@ -10,6 +10,11 @@ from magfusion.estimation import chain_left, chain_system
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.integrity import held_columns, midway, score
 from magfusion.estimation.integrity.score import Score, answered, scores_of
+from magfusion.estimation.integrity.suspects import held_blocks
+from magfusion.estimation.measurements import phasors
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.state import states_in
+from magfusion.model.parameters import placed
 from magfusion.model.samples import ImuSamples
 
 
@@ -53,3 +58,21 @@ def test_a_sweep_gives_the_score_of_the_tree(
         assert np.all(apart <= 1e-7 * largest)
         np.testing.assert_allclose(chain.by_calibration, tree.by_calibration, atol=1e-7)
         np.testing.assert_array_equal(chain.spread, tree.spread)
+
+
+def test_of_many_columns_each_channel_whitens_those_that_it_feels(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    small = small_log(3)
+    settings = SmootherSettings(tune=False)
+    result = smooth(small.log, replace(small.site, model_error=1e-3), settings)
+    blocks = placed((*held_blocks(result.declared.site, (), steady=False), *result.field_errors))
+    fields = next(m for m in result.graph.measurements if isinstance(m, FieldPhasors))
+    at = states_in(result.estimate.values).rows(fields.epoch), result.calibration, blocks
+    few = fields.linearize(*at).by_calibration
+    monkeypatch.setattr(phasors, "MANY_COLUMNS", 10**6)
+    every = fields.linearize(*at).by_calibration
+    assert few is not None
+    assert every is not None
+    assert few.shape[-1] >= 64
+    np.testing.assert_allclose(few, every, rtol=1e-12, atol=1e-12 * np.max(np.abs(every)))

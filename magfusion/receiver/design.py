@@ -121,14 +121,14 @@ class Designs:
         new = [own for own in distinct if own not in known]
         rows = [*(spacings.index(own) for own in new), *uneven]
         for k, own in zip(rows, new, strict=False):
-            elapsed[k, : own.count] = own.times()
+            elapsed[k, : own.number] = own.times()
         parts: list[Maps] = []
         if rows:
             made = self._made(index[rows], weight[rows], elapsed[rows])
             if len(uneven) == len(windows):
                 return made, True
             for k, own in enumerate(new):
-                known[own] = self.even[own] = _rows(made, slice(k, k + 1), own.count)
+                known[own] = self.even[own] = _rows(made, slice(k, k + 1), own.number)
             parts = [_rows(made, slice(len(new), None), None)]
         while len(self.even) > EVEN_KEPT:
             del self.even[next(iter(self.even))]
@@ -162,25 +162,39 @@ def _size(maps: Maps) -> int:
 
 def _rows(maps: Maps, rows: slice, count: int | None) -> Maps:
     """Return the maps of some windows, of so many samples as they have."""
-    own = Maps(*(part[rows] for part in maps))
     return Maps(
-        *(part[..., :count] for part in own[:4]), own.variance, own.probes[..., :count], own.told
+        sample=maps.sample[rows, :count],
+        weight=maps.weight[rows, :count],
+        elapsed=maps.elapsed[rows, :count],
+        solver=maps.solver[rows, :, :count],
+        variance=maps.variance[rows],
+        probes=maps.probes[rows, ..., :count],
+        told=maps.told[rows],
     )
 
 
 def _chosen(index: IntArray, weight: BoolArray, parts: list[Maps], which: IntArray) -> Maps:
     """Return the maps of windows by their place among those of all parts, padded."""
-    if len(parts) == 1 and len(parts[0].told) == 1:
-        shared = (np.broadcast_to(part, (len(which), *part.shape[1:])) for part in parts[0][2:])
-        return Maps(index, weight, *shared)
-    size = index.shape[1]
+    size, count = index.shape[1], len(index)
     elapsed, solver, probes = (
-        np.concatenate([_longer(own, size) for own in each])[which]
+        np.concatenate([_longer(own, size) for own in each])
         for each in zip(*((p.elapsed, p.solver, p.probes) for p in parts), strict=True)
     )
-    variance = np.concatenate([part.variance for part in parts])[which]
-    told = np.concatenate([part.told for part in parts])[which]
-    return Maps(index, weight, elapsed, solver, variance, probes, told)
+    variance = np.concatenate([part.variance for part in parts])
+    told = np.concatenate([part.told for part in parts])
+    if len(told) == 1:  # the same of all
+        return Maps(
+            index,
+            weight,
+            np.broadcast_to(elapsed, (count, *elapsed.shape[1:])),
+            np.broadcast_to(solver, (count, *solver.shape[1:])),
+            np.broadcast_to(variance, (count, *variance.shape[1:])),
+            np.broadcast_to(probes, (count, *probes.shape[1:])),
+            np.broadcast_to(told, (count, *told.shape[1:])),
+        )
+    return Maps(
+        index, weight, elapsed[which], solver[which], variance[which], probes[which], told[which]
+    )
 
 
 def _longer(part: Array, size: int) -> Array:

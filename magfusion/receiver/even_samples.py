@@ -18,14 +18,14 @@ WITHIN = 1.5  # steps that times may be off by; each of the two numbers of a spa
 class Spacing(NamedTuple):
     """Evenly spaced samples: how many, and their middle and half their span in small steps."""
 
-    count: int
+    number: int
     middle: int
     half: int
     step: float  # (s)
 
     def times(self) -> Array:
-        """Return the times that it stands for, shape (count,) (s)."""
-        return self.step * (self.middle + self.half * np.linspace(-1.0, 1.0, self.count))
+        """Return the times that it stands for, shape (number,) (s)."""
+        return self.step * (self.middle + self.half * np.linspace(-1.0, 1.0, self.number))
 
 
 def spacings_of(time: Array, count: IntArray, fastest_hz: float) -> list[Spacing | None]:

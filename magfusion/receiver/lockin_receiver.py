@@ -17,11 +17,11 @@ from magfusion.receiver.cells import owned_by
 from magfusion.receiver.design import (
     Designs,
     Maps,
-    Spacing,
     nuisances_hz,
     separable,
     variance_growth,
 )
+from magfusion.receiver.even_samples import Spacing
 from magfusion.receiver.lockin import WindowOperator, designs_of, window_operator
 from magfusion.receiver.receiver import Receiver
 from magfusion.receiver.turn import BodyTurn

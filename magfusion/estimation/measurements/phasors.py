@@ -26,6 +26,7 @@ from magfusion.model.noise import (
 from magfusion.model.parameters import (
     CLOCK_RATE,
     TIME_OFFSET,
+    BeaconParameter,
     Block,
     Calibration,
     dimension,
@@ -37,6 +38,8 @@ from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
+
+MANY_COLUMNS = 64  # of parameters, most of which are of one beacon
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +125,18 @@ class FieldPhasors(Measurement):
             error=(self.sqrt_information @ (value - self.measured)[..., None])[..., 0],
             by_pose=self.sqrt_information @ by_pose,
             by_velocity=None if by_velocity is None else self.sqrt_information @ by_velocity,
-            by_calibration=self.sqrt_information @ by_calibration,
+            by_calibration=self._whitened(by_calibration, calibration.site, blocks),
         )
+
+    def _whitened(self, by_blocks: Array, site: Site, blocks: tuple[Block, ...]) -> Array:
+        """Return whitened columns of blocks; of many, those that each channel feels alone."""
+        if by_blocks.shape[-1] < MANY_COLUMNS:
+            return np.asarray(self.sqrt_information @ by_blocks)
+        out, root = np.zeros_like(by_blocks), self.sqrt_information
+        for k, (name, _) in enumerate(site.channels):
+            for begin, end in _felt(blocks, name):
+                out[:, k, :, begin:end] = root[:, k] @ by_blocks[:, k, :, begin:end]
+        return out
 
     def unwhitened(
         self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
@@ -213,6 +226,19 @@ class FieldPhasors(Measurement):
             states.world_from_body @ turn,
             states.position_world - lag[:, None] * states.velocity_world,
         )
+
+
+def _felt(blocks: tuple[Block, ...], name: str) -> list[tuple[int, int]]:
+    """Return stretches of columns that the phasors of a beacon feel."""
+    found: list[tuple[int, int]] = []
+    for block in blocks:
+        if isinstance(block.parameter, BeaconParameter) and block.owner != name:
+            continue
+        begin, end = block.columns.start, block.columns.stop
+        if found and found[-1][1] == begin:
+            begin = found.pop()[0]
+        found.append((begin, end))
+    return found
 
 
 class Predictions:
