@@ -245,7 +245,7 @@ def system_beside(
         normal.add(*own)
     fields: FieldRows | None = None
     for factors in graph.factors:
-        rows = FieldRows(factors, estimate, *_felt(beside))
+        rows = FieldRows(factors, estimate, *felt_blocks(beside))
         if isinstance(factors.measurement, FieldPhasors):
             fields = rows
             continue
@@ -265,7 +265,7 @@ def add_prior(normal: Normal, graph: Graph, estimate: Estimate) -> None:
     normal.right_border[:, 0] -= whitening.T @ (whitening @ step)
 
 
-def _felt(beside: Columns) -> tuple[tuple[Block, ...], Array]:
+def felt_blocks(beside: Columns) -> tuple[tuple[Block, ...], Array]:
     """Return the parameters that any column is of, and what makes a step of them."""
     felt = [block for block in beside.blocks if np.any(beside.spread[block.columns])]
     if not felt:

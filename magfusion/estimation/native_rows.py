@@ -17,6 +17,9 @@ from magfusion.units import Array, IntArray
 _FIRST, _WIDTH = {"x": 0, "v": 6, "b": 9}, {"x": 6, "v": 3, "b": 6}  # in a state's tangent vector
 
 
+NativePiece = tuple[IntArray, Array, Array | None, Array, Array]
+
+
 class Columns(NamedTuple):
     """Parameters that are not estimated, and what they do.
 
@@ -87,9 +90,7 @@ class NativeRows:
             for kind, every in found.items()
         ]
 
-    def of(
-        self, columns: Columns, begin: int = 0, end: int | None = None
-    ) -> Iterator[tuple[IntArray, Array, Array | None, Array, Array]]:
+    def of(self, columns: Columns, begin: int = 0, end: int | None = None) -> Iterator[NativePiece]:
         """Yield the rows of factors whose first state is one of some, as `Normal.add` takes them.
 
         Those of which no column is felt have the first of the right sides alone.
@@ -99,16 +100,22 @@ class NativeRows:
         begin, end : int
             Of the states; all where nothing is said.
         """
+        for _, rows in self.kinds_of(columns, begin, end):
+            yield rows
+
+    def kinds_of(
+        self, columns: Columns, begin: int = 0, end: int | None = None
+    ) -> Iterator[tuple[bool, NativePiece]]:
+        """Yield the same, and whether they are of inertial factors."""
         for kind in self.kinds:
             inside = kind.epoch >= begin
             inside &= kind.epoch < (self.graph.epochs if end is None else end)
             every = np.flatnonzero(inside)
             for first in range(0, len(every), PIECE):
-                yield from self._of(kind, every[first : first + PIECE], columns)
+                for rows in self._of(kind, every[first : first + PIECE], columns):
+                    yield kind.inertial, rows
 
-    def _of(
-        self, kind: _Kind, some: IntArray, columns: Columns
-    ) -> Iterator[tuple[IntArray, Array, Array | None, Array, Array]]:
+    def _of(self, kind: _Kind, some: IntArray, columns: Columns) -> Iterator[NativePiece]:
         jacobian, epoch = kind.jacobian[some], kind.epoch[some]
         rows = jacobian.shape[:2]
         own, after = np.zeros((*rows, MOTION)), np.zeros((*rows, MOTION))

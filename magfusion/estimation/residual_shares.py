@@ -5,16 +5,16 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from magfusion.estimation.factors import CONSIDERED_KEY
 from magfusion.estimation.graph import Estimate, Graph
 from magfusion.estimation.inertial import ROWS
+from magfusion.estimation.marginals import is_chain
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.solve.bordered import eliminate, eliminate_in_sequence
+from magfusion.estimation.residual_chain import left_by_chain
+from magfusion.estimation.residual_tree import left_by_tree
 from magfusion.estimation.state import states_in
 from magfusion.model.field import model_error_cov
 from magfusion.model.noise import cholesky, sensor_positions
 from magfusion.model.parameters import Block
-from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
@@ -79,12 +79,14 @@ class Leavings:
         windows: float,
         considered: tuple[Block, ...] = (),
     ) -> None:
-        self._graph, self._samples = graph, samples
+        self._samples = samples
         self._measured = next(m for m in graph.measurements if isinstance(m, FieldPhasors))
         site = estimate.calibration.site
-        self._linear, self._ordering, fields = _system(graph, estimate, considered)
-        self._factors = _jacobians(self._linear)
-        self._inertial_system(fields)
+        first = graph.native.size() - graph.epochs + 1
+        roots = [_root(graph.native.at(i)) for i in range(first, graph.native.size())]
+        self._unwhitening = np.linalg.inv(np.array(roots).reshape(-1, ROWS, ROWS))
+        self.sigma = np.sqrt(np.sum(self._unwhitening**2, axis=2))
+        self.ordinary = np.all(self.sigma < ORDINARY * np.median(self.sigma, axis=0), axis=1)
         error = graph.residual(self._measured, estimate)
         weight = np.ones(error.shape[:2])
         if self._measured.loss is not None:
@@ -96,34 +98,25 @@ class Leavings:
         )
         self._owner, self._sensor = site.owner, site.sensor
         self._size = _sizes(site)
-        self._error = error
         rows = self._measured.linearize(
             states_in(estimate.values).rows(self._measured.epoch), estimate.calibration, ()
         )
         assert rows.by_pose is not None
         self._by_pose = rows.by_pose.reshape(len(error), -1, 6)
-        self._net = eliminate_in_sequence(self._linear, self._ordering)
-        self._error, self._inertial_error = self._left_of_all()
-        self._draw(site, sensor_positions(site, poses), windows)
+        drawn = self._drawn(site, sensor_positions(site, poses), windows)
+        fields, inertial = [self._weight * own for own, _ in drawn], [own for _, own in drawn]
+        left = None
+        if is_chain(graph, considered):
+            left = left_by_chain(graph, estimate, considered, fields, inertial)
+        if left is None:
+            left = left_by_tree(graph, estimate, considered, fields, inertial)
+        every = [field / self._weight for field in left[0]]
+        of_imu = [(self._unwhitening @ own[..., None])[..., 0] for own in left[1]]
+        self._inertial = of_imu
+        self._apart = [self._without_pose(field) for field in every]
 
-    def _inertial_system(self, first_fields: int) -> None:
-        graph, end = self._graph, self._graph.native.size()
-        first = end - graph.epochs + 1
-        self._inertial = self._factors[first:end]
-        roots = [_root(graph.native.at(i)) for i in range(first, end)]
-        self._unwhitening = np.linalg.inv(np.array(roots).reshape(-1, ROWS, ROWS))
-        self.sigma = np.sqrt(np.sum(self._unwhitening**2, axis=2))
-        self.ordinary = np.all(self.sigma < ORDINARY * np.median(self.sigma, axis=0), axis=1)
-        self._fields, self._told = [], []
-        begin = first_fields
-        for factors in graph.factors:
-            end = begin + len(factors.measurement.epoch)
-            if isinstance(factors.measurement, FieldPhasors):
-                self._fields += self._factors[begin:end]
-                self._told += factors.told
-            begin = end
-
-    def _draw(self, site: Site, sensor_world: Array, windows: float) -> None:
+    def _drawn(self, site: Site, sensor_world: Array, windows: float) -> list[tuple[Array, Array]]:
+        """Return drawn errors of fields and inertial factors: noise, model errors, the IMU's."""
         rng = np.random.default_rng(0)  # the same log, the same result
         samples, root = self._samples, self._measured.sqrt_information[..., :3, :3]
         unit = model_error_cov(np.nan_to_num(samples.phasor_sensor), 1.0)
@@ -146,48 +139,10 @@ class Leavings:
             return np.asarray(model[:, None] * _six(np.einsum("ncij,ncpj->ncpi", root, sensor)))
 
         rough = false(_matrices(rng, sensor_world / length, count, smooth=False))
-        imu = rng.standard_normal((len(self._inertial), ROWS))
+        imu = rng.standard_normal((len(self._unwhitening), ROWS))
         smooth = false(_matrices(rng, sensor_world / length, count, smooth=True))
         nothing, still = np.zeros_like(drawn), np.zeros_like(imu)
-        errors = (drawn, still), (rough, still), (smooth, still), (nothing, imu)
-        self._left = [self._of(*error) for error in errors]
-        every = (self._error, *(field for field, _ in self._left))
-        self._apart = [self._without_pose(field) for field in every]
-
-    def _of(self, field: Array, inertial: Array) -> tuple[Array, Array]:
-        """Return what the estimate leaves of errors of fields and inertial factors."""
-        for factor in self._factors:
-            factor.getb()[...] = 0.0
-        weighed = self._weight * field
-        for factor, own, told in zip(self._fields, weighed, self._told, strict=True):
-            part = own.ravel()[told]
-            factor.getb()[: part.size] = part
-        for factor, own in zip(self._inertial, inertial, strict=True):
-            factor.getb()[: own.size] = own
-        return self._left_of_all()
-
-    def _left_of_all(self) -> tuple[Array, Array]:
-        """Return what the linear system leaves of its right-hand sides."""
-        step = self._step()
-        rows = np.zeros((len(self._error), self._error[0].size))
-        for row, factor, told in zip(rows, self._fields, self._told, strict=True):
-            row[told] = factor.error_vector(step)[: row[told].size]
-        kept = rows.reshape(self._error.shape) / self._weight
-        return kept, self._rows_of([factor.error_vector(step) for factor in self._inertial])
-
-    def _step(self) -> gtsam.VectorValues:
-        """Return the solution of the linear system with the right-hand sides that it has now."""
-        if self._net is None:
-            return eliminate(self._linear, self._ordering).optimize()
-        # One elimination serves them all: its triangle and its transpose are solved with each.
-        uphill = self._linear.gradientAtZero()
-        step = self._net.backSubstitute(self._net.backSubstituteTranspose(uphill))
-        return step.scale(-1.0)
-
-    def _rows_of(self, errors: list[Array]) -> Array:
-        """Return inertial errors in their units, shape (intervals, 15)."""
-        whitened = np.array([error[:ROWS] for error in errors]).reshape(-1, ROWS)
-        return np.asarray((self._unwhitening @ whitened[..., None])[..., 0])
+        return [(drawn, still), (rough, still), (smooth, still), (nothing, imu)]
 
     def _without_pose(self, field: Array) -> Array:
         """Return errors without what any other pose of their own epoch would explain.
@@ -226,34 +181,7 @@ class Leavings:
 
         Each of shape (intervals, 15): rotation, position, velocity, biases.
         """
-        return [self._inertial_error, *(inertial for _, inertial in self._left)]
-
-
-def _system(
-    graph: Graph, estimate: Estimate, considered: tuple[Block, ...]
-) -> tuple[gtsam.GaussianFactorGraph, gtsam.Ordering, int]:
-    """Return a linear graph that estimates what is considered too, and where its fields begin."""
-    ordering = graph.ordering
-    if not considered or graph.declared is None:
-        return graph.linearized(estimate), ordering, graph.native.size()
-    spread = prior_sqrt_covariance(graph.declared.site, considered)
-    by_inertial = graph.by_considered(spread)
-    linear = graph.beside(estimate, considered, spread, by_inertial, explaining=True)
-    fields = linear.size() - sum(len(part.measurement.epoch) for part in graph.factors)
-    count = spread.shape[1]
-    unit = gtsam.noiseModel.Unit.Create(count)
-    linear.push_back(gtsam.JacobianFactor(CONSIDERED_KEY, np.eye(count), np.zeros(count), unit))
-    ordering.push_back(CONSIDERED_KEY)
-    return linear, ordering, fields
-
-
-def _jacobians(linear: gtsam.GaussianFactorGraph) -> list[gtsam.JacobianFactor]:
-    out = []
-    for i in range(linear.size()):
-        factor = linear.at(i)
-        assert isinstance(factor, gtsam.JacobianFactor)
-        out.append(factor)
-    return out
+        return self._inertial
 
 
 def _root(factor: gtsam.NonlinearFactor) -> Array:

@@ -118,6 +118,7 @@ def solve_chain(
     return ChainSolution(states, border, own, corner, explained, inverse)
 
 
+@np.errstate(all="ignore")
 def inverses(diagonal: Array, following: Array) -> Array:
     """Return the inverse of what those before leave of each state, shape (h, n, s, s).
 

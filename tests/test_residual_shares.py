@@ -1,0 +1,43 @@
+"""What is left of drawn errors: by one sweep along the chain as by GTSAM's elimination."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_problem import small_log
+
+from magfusion.estimation import residual_shares
+from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.estimation.residual_shares import Leavings
+from magfusion.model.trajectory import Trajectory
+
+
+@pytest.mark.parametrize("loss", ["cauchy", None])
+@pytest.mark.parametrize("estimated", [True, False])
+def test_a_sweep_leaves_what_the_tree_leaves(
+    monkeypatch: pytest.MonkeyPatch, *, estimated: bool, loss: str | None
+) -> None:
+    small = small_log(3)
+    settings = SmootherSettings(tune=False, loss=loss)
+    if not estimated:
+        settings = replace(settings, estimate=())
+    result = smooth(small.log, replace(small.site, model_error=1e-3), settings)
+    assert bool(result.blocks) == estimated
+    assert result.considered
+    rows = {k: v[result.epoch] for k, v in vars(result.states).items() if v is not None}
+    poses = Trajectory(**rows)
+    given = result.graph, result.estimate, result.fields, poses, 2.0, result.considered
+    chain = Leavings(*given)
+    monkeypatch.setattr(residual_shares, "is_chain", lambda *_: False)
+    tree = Leavings(*given)
+    np.testing.assert_array_equal(chain.sigma, tree.sigma)
+    for own, other in zip(chain.inertial(), tree.inertial(), strict=True):
+        scale = np.max(np.abs(other), axis=0)
+        assert np.any(own != other)  # found otherwise
+        assert np.all(np.abs(own - other) < 1e-7 * np.maximum(scale, 1e-30))
+    for beacon in range(len(small.site.beacons)):
+        pairs = zip(chain.channels_of(beacon), tree.channels_of(beacon), strict=True)
+        for one, two in pairs:
+            np.testing.assert_allclose(one.seen, two.seen, atol=1e-6)
+            for own, other in zip(one.left, two.left, strict=True):
+                np.testing.assert_allclose(own, other, atol=1e-6)
