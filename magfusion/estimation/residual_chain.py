@@ -142,6 +142,5 @@ def _with_considered(border: Array, right: Array, count: int) -> Array:
 
 def _left_of(piece: Piece, states: Array, calibration: Array) -> Array:
     """Return what is left of the rows of a piece, shape (m, channels, 6, errors)."""
-    moved = piece.by_state @ states[piece.epoch][:, None] + piece.by_calibration @ calibration
-    told = np.any(piece.by_state != 0.0, axis=-1, keepdims=True)
-    return np.where(told, moved - piece.right, 0.0)
+    moved = piece.by_state @ states[piece.epoch][:, None]
+    return np.asarray(moved + piece.by_calibration @ calibration - piece.right)
