@@ -89,8 +89,9 @@ class Designs:
             maps = self.kept.get(begin)
             if maps is None:
                 maps, own = self._maps(self.windows.rows(rows))
-                again = begin in self.asked or len(self.windows) <= chunk
-                if own and again and self._size() + _size(maps) < KEPT:
+                few = len(self.windows) <= chunk
+                worth = few or (own and begin in self.asked)
+                if worth and self._size() + _size(maps) < KEPT:
                     self.kept[begin] = maps
             self.asked.add(begin)
             yield rows, maps
@@ -114,6 +115,9 @@ class Designs:
         """Return the maps of some windows, and whether most were made for them alone."""
         index, weight, elapsed = padded(windows, self.time)
         spacings = spacings_of(elapsed, windows.count, float(np.max(self.frequencies_hz)))
+        if len(spacings) == 1 and spacings[0] in self.even:  # as nearly always, one by one
+            one = self.even[spacings[0]] = self.even.pop(spacings[0])
+            return one._replace(sample=index), False
         distinct = dict.fromkeys(own for own in spacings if own is not None)
         known = {own: self.even.pop(own) for own in distinct if own in self.even}
         self.even.update(known)  # the newest are the last
