@@ -41,7 +41,7 @@ def minimise_bounded(
     decrease : float
         Of the cost, relative; the step that lowers it by less is the last.
     """
-    from scipy.optimize import minimize  # takes long to import, and few ask
+    from scipy.optimize import minimize  # which takes long to import, and few ask
 
     aside = DIFFERENCE * np.eye(len(start))
 
@@ -90,7 +90,7 @@ def minimise_curved(
             break
         step = np.zeros_like(at)
         step[free] = _downhill(slope[free], curvature[np.ix_(free, free)])
-        step *= min(1.0, LONGEST / max(float(np.max(np.abs(step))), LONGEST))
+        step *= LONGEST / max(float(np.max(np.abs(step))), LONGEST)
         last = -0.5 * float(slope @ step) < decrease * max(abs(here), 1.0)
         # By the logarithm of a variance that comes to nothing a step is a half, again and again.
         # Before the others are found it may yet be wanted, and does not come back from there.
@@ -114,6 +114,7 @@ def minimise_curved(
 
 
 def _downhill(slope: Array, curvature: Array) -> Array:
+    """Return Newton's step with the absolute eigenvalues of a curvature."""
     size, axes = np.linalg.eigh(curvature)
     size = np.abs(size)
     floor = float(np.max(size)) * FLATTEST
