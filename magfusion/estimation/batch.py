@@ -210,8 +210,8 @@ def _solved(
         # Another pass is sure to come.
         short = (done == 0 or tuning) and done + 1 < settings.passes
         tolerance = ON_THE_WAY if short else CONVERGED
-        # The noise is found last with the sigmas as they are.
-        roughly = short and done < TUNINGS - 1
+        # Noise is told from the residuals by the sigmas, which must then be as they are.
+        roughly = short and not (tuning and (done > 0 or not by_waveform))
         graph, gaps = graph_of(log, states, calibration, wave, standing, roughly=roughly)
         begun = initial_estimate(states, calibration, segments)
         found = optimise(graph, begun, tolerance=tolerance)

@@ -104,9 +104,10 @@ def thinned(
         At which they will be preintegrated (m/s^2, rad/s): there the result is the same to
         rounding.
     ways : tuple of int
-        How many steps are made one: as many as leave
+        Numbers of steps that may be joined to one, falling.  Of each interval the first is taken
+        that leaves enough steps.
     fewest : int
-        joined steps of an interval.
+        Joined steps of an interval that are enough.
 
     Returns
     -------

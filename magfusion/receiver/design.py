@@ -129,8 +129,8 @@ class Designs:
         parts: list[Maps] = []
         if rows:
             made = self._made(index[rows], weight[rows], elapsed[rows])
-            if len(uneven) == len(windows):
-                return made, True
+            if rows == list(range(len(windows))) and (uneven or len(windows) > 1):
+                return made, True  # no two are alike, nor was any known
             for k, own in enumerate(new):
                 known[own] = self.even[own] = _rows(made, slice(k, k + 1), own.number)
             parts = [_rows(made, slice(len(new), None), None)]
@@ -165,15 +165,18 @@ def _size(maps: Maps) -> int:
 
 
 def _rows(maps: Maps, rows: slice, count: int | None) -> Maps:
-    """Return the maps of some windows, of so many samples as they have."""
+    """Return copies of the maps of some windows, of so many samples as they have.
+
+    A view that is kept would keep the maps of all of them.
+    """
     return Maps(
-        sample=maps.sample[rows, :count],
-        weight=maps.weight[rows, :count],
-        elapsed=maps.elapsed[rows, :count],
-        solver=maps.solver[rows, :, :count],
-        variance=maps.variance[rows],
-        probes=maps.probes[rows, ..., :count],
-        told=maps.told[rows],
+        sample=maps.sample[rows, :count].copy(),
+        weight=maps.weight[rows, :count].copy(),
+        elapsed=maps.elapsed[rows, :count].copy(),
+        solver=maps.solver[rows, :, :count].copy(),
+        variance=maps.variance[rows].copy(),
+        probes=maps.probes[rows, ..., :count].copy(),
+        told=maps.told[rows].copy(),
     )
 
 

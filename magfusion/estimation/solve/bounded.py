@@ -7,7 +7,8 @@ import numpy as np
 from magfusion.units import Array
 
 DECREASE = 1e-6  # of the cost; the step that lowers it by less is the last
-DECREASE_CURVED = 1e-9  # of a cost; the step of Newton that lowers it by less ends far closer
+DECREASE_CURVED = 1e-9  # relative; the step of Newton that lowers a cost by less is the last
+MOST_STEPS = 100
 LONGEST = 2.0  # of the steps of `minimise_curved`: beyond, a curvature says nothing
 SUFFICIENT = 1e-4  # share of the decrease that the slope promises
 FLATTEST = 1e-10  # of the largest curvature
@@ -59,8 +60,6 @@ def minimise_curved(
     curved: Callable[[Array], tuple[Array, Array]],
     start: Array,
     limits: Array,
-    steps: int = 100,
-    decrease: float = DECREASE_CURVED,
 ) -> Array:
     """Return where a cost of logarithms of sigmas is least, by a projected Newton method.
 
@@ -75,15 +74,11 @@ def minimise_curved(
     start : ndarray, shape (n,)
     limits : ndarray, shape (n, 2)
         Least and greatest value of each unknown.
-    steps : int
-        At most.
-    decrease : float
-        Of the cost, relative; the step that is to lower it by less is the last.
     """
     low, high = limits.T
     at = np.clip(start, low, high)
     here = cost(at)
-    for _ in range(steps):
+    for _ in range(MOST_STEPS):
         slope, curvature = curved(at)
         free = ~((at <= low) & (slope > 0.0) | (at >= high) & (slope < 0.0))
         if not np.any(free):
@@ -91,7 +86,7 @@ def minimise_curved(
         step = np.zeros_like(at)
         step[free] = _downhill(slope[free], curvature[np.ix_(free, free)])
         step *= LONGEST / max(float(np.max(np.abs(step))), LONGEST)
-        last = -0.5 * float(slope @ step) < decrease * max(abs(here), 1.0)
+        last = -0.5 * float(slope @ step) < DECREASE_CURVED * max(abs(here), 1.0)
         # By the logarithm of a variance that comes to nothing a step is a half, again and again.
         # Before the others are found it may yet be wanted, and does not come back from there.
         falling = free & (slope > 0.0)
