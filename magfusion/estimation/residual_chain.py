@@ -19,6 +19,8 @@ from magfusion.model.parameters import Block, dimension
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.units import Array, IntArray
 
+LARGER = 1e-6  # share by which rounding may make a sum of squares larger
+
 
 class _Rows(NamedTuple):
     """Rows of two states, shape (m, rows, ...)."""
@@ -75,7 +77,18 @@ def left_by_chain(
         moved = rows.own @ states[rows.epoch] + rows.after @ states[rows.epoch + 1]
         of_motion[rows.epoch] = moved + rows.border @ calibration - rows.right
     of_fields = np.concatenate([_left_of(piece, states, calibration) for piece in pieces])
+    if not _explains(of_fields, of_motion, fields, inertial):
+        return None
     return np.moveaxis(of_fields, -1, 0), np.moveaxis(of_motion, -1, 0)
+
+
+def _explains(
+    of_fields: Array, of_motion: Array, fields: Sequence[Array], inertial: Sequence[Array]
+) -> bool:
+    """Tell whether no drawn error has become larger: least squares never make it so."""
+    left = np.sum(of_fields[..., 1:] ** 2, axis=(0, 1, 2)) + np.sum(of_motion[..., 1:] ** 2, (0, 1))
+    given = [np.sum(one**2) + np.sum(two**2) for one, two in zip(fields, inertial, strict=True)]
+    return bool(np.all(left <= (1.0 + LARGER) * np.array(given)))
 
 
 def _beside(graph: Graph, considered: tuple[Block, ...]) -> Columns:
