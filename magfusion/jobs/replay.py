@@ -125,7 +125,7 @@ class Replay:
 def feed(navigator: Navigator, piece: Piece) -> None:
     """Give a piece to a navigator."""
     if len(piece.imu) and navigator.site.platform.inertial:
-        navigator.add_imu(piece.imu.time, piece.imu.gyro_body, piece.imu.accel_body)
+        navigator.hear_imu(piece.imu.time, piece.imu.gyro_body, piece.imu.accel_body)
     for name, wave in piece.waves:
         if wave.marks:
             navigator.add_marks(wave.marks)
@@ -133,6 +133,7 @@ def feed(navigator: Navigator, piece: Piece) -> None:
             navigator.add_magnetometer(wave.time, wave.measured_sensor, name)
     for samples in piece.fields:
         navigator.add_fields(samples)
+    navigator.advance()
 
 
 def paced(pieces: Iterable[tuple[int, Piece]], realtime: bool) -> Iterator[tuple[int, Piece]]:

@@ -18,7 +18,7 @@ from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors, leaves_out
 from magfusion.estimation.propagation import Propagated
 from magfusion.estimation.state import MOTION, State, between
-from magfusion.model.parameters import Block
+from magfusion.model.parameters import Block, dimension
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Risk, Verdict
 from magfusion.units import DEGREE, Array, IntArray
@@ -50,6 +50,8 @@ class SubsetBank:
         self, site: Site, blocks: tuple[Block, ...], considered: int, risk: Risk | None = None
     ) -> None:
         self.blocks, self.considered = blocks, considered
+        last = dimension(blocks) - considered
+        self._estimated = tuple(block for block in blocks if block.columns.stop <= last)
         self.risk = Risk() if risk is None else risk
         self.names = [beacon.name for beacon in site.beacons]
         self.groups = min(len(self.names), MOST)
@@ -109,18 +111,26 @@ class SubsetBank:
         if leaves_out(measurements):
             kept = np.any(jacobian, axis=1)
             error, jacobian, taken = error[kept], jacobian[kept], taken[:, kept]
-        crossed = taken @ cov
-        gain = self._gains(taken, crossed)
-        back = np.swapaxes(gain, 1, 2)
+        # What is considered has no gain: only rows and columns of all else are updated.
+        count = cov.shape[1] - self.considered
+        own, considered = slice(0, count), slice(count, None)
+        crossed, back = taken @ cov, np.swapaxes(taken, 1, 2)
+        gain = self._gains(crossed[:, :, own], crossed @ back)
+        turned = np.swapaxes(gain, 1, 2)
         innovation = error + step @ jacobian.T
-        step = step - (gain[1:] @ innovation[..., None])[..., 0]
-        step -= between(predicted.state, after, self.blocks)
+        step[:, own] -= (gain[1:] @ innovation[..., None])[..., 0]
+        step[:, own] -= between(predicted.state, after, self._estimated)
         # Joseph's form: what is considered is not updated as would be best.
-        half = cov - gain @ crossed
-        whole = half + (gain - half @ np.swapaxes(taken, 1, 2)) @ back
-        half = joint - gain[1:] @ (taken[1:] @ joint)
-        self._joint = half + (gain[1:] - half @ taken[0].T) @ back[0]
-        self._step, self._cov = step, 0.5 * (whole + np.swapaxes(whole, 1, 2))
+        half = cov[:, own] - gain @ crossed
+        whole = half[:, :, own] + (gain - half @ back) @ turned
+        cov[:, own, own] = 0.5 * (whole + np.swapaxes(whole, 1, 2))
+        cov[:, own, considered] = half[:, :, considered]
+        cov[:, considered, own] = np.swapaxes(half[:, :, considered], 1, 2)
+        joint[:, own] -= gain[1:] @ (taken[1:] @ joint)
+        across = joint @ back[0]
+        joint[:, own, own] += gain[1:] @ turned[0]
+        joint[:, :, own] -= across @ turned[0]
+        self._step, self._cov, self._joint = step, cov, joint
 
     def _begin(self, state: State) -> None:
         size = len(state.cov)
@@ -164,13 +174,10 @@ class SubsetBank:
                     basis = measurement.spanned((self._owner == group)[None])[0]
                     taken[1 + group, rows] -= basis @ (basis.T @ jacobian[rows])
 
-    def _gains(self, taken: Array, crossed: Array) -> Array:
-        """Return the gain of every filter, shape (1 + groups, n, rows)."""
-        innovation = crossed @ np.swapaxes(taken, 1, 2) + np.eye(taken.shape[1])
-        gain = np.swapaxes(np.linalg.solve(innovation, crossed), 1, 2)
-        if self.considered:
-            gain[:, -self.considered :] = 0.0
-        return np.asarray(gain)
+    def _gains(self, crossed: Array, spread: Array) -> Array:
+        """Return the gain of every filter, shape (1 + groups, estimated, rows)."""
+        innovation = spread + np.eye(spread.shape[1])
+        return np.asarray(np.swapaxes(np.linalg.solve(innovation, crossed), 1, 2))
 
     def heard(self, judgement: Judgement, state: State) -> Judgement:
         """Return what is said of a state with what the bank says of it, and its levels."""
