@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.score_online import MEMORY, OnlineScore
+from magfusion.estimation.integrity.score_epochs import MEMORY
+from magfusion.estimation.integrity.score_online import OnlineScore
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.estimation.navigator import Navigator

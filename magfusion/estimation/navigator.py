@@ -337,6 +337,7 @@ class Navigator:
         """Return everything needed to go on as plain data: `restored` makes a navigator of it."""
         rules = navigator_rules(self.site, self.blocks)
         self._arrived.settle()
+        self._update.score.settle()
         return {"parts": to_plain(self, rules), "estimator": to_plain(self._estimator, rules)}
 
     def go_on_from(self, data: Any, rules: Rules) -> None:

@@ -17,7 +17,7 @@ from magfusion.estimation.inertial import ROWS, Link, Steps
 from magfusion.estimation.integrity.bank import SubsetBank
 from magfusion.estimation.integrity.judgement import JudgedState, Judgement
 from magfusion.estimation.integrity.running import Running
-from magfusion.estimation.integrity.score_online import Sums
+from magfusion.estimation.integrity.score_epochs import Sums
 from magfusion.estimation.measurements.earth import EarthField
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.measurement import Measurement

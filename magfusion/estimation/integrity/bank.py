@@ -184,10 +184,11 @@ class SubsetBank:
         found = self.separation(state)
         if found is None or judgement.verdict is Verdict.FAILED:
             return judgement
-        excess = found.excess(self.risk, SLACK)[0]
+        limit = found.thresholds(self.risk, SLACK)
+        excess = found.excess(self.risk, SLACK, limit)[0]
         if np.max(excess) <= 1.0:
             # What the witnesses allow for is beyond what separation knows of.
-            position_m, degrees = self.levels(found)
+            position_m, degrees = self.levels(found, limit)
             wide, more = np.sqrt(judgement.inflation), SLACK * np.sqrt(3.0)
             return replace(
                 judgement,
@@ -266,11 +267,17 @@ class SubsetBank:
         ]
         return np.asarray(np.maximum(np.max(shares, axis=(0, 2)), 1.0))
 
-    def levels(self, found: Separation) -> tuple[float | None, float | None]:
-        """Return the protection levels of position (m) and attitude (deg), if there are any."""
+    def levels(self, found: Separation, limit: Array) -> tuple[float | None, float | None]:
+        """Return the protection levels of position (m) and attitude (deg), if there are any.
+
+        Parameters
+        ----------
+        limit : ndarray, shape (1, groups, 2)
+            The thresholds.
+        """
         members = np.bincount(np.arange(len(self.names)) % self.groups)
         prior = np.array(self.risk.fault * members[None], dtype=np.float64)
-        position_m, degrees = protection_levels(found, self.risk, SLACK, prior)
+        position_m, degrees = protection_levels(found, self.risk, SLACK, prior, limit)
         return _known(position_m[0]), _known(degrees[0])
 
 

@@ -4,11 +4,10 @@ What a parameter that is held may be wrong by goes into the state through the ga
 epoch, and shows in each innovation in a way of its own (the generalised likelihood ratio of Willsky
 and Jones 1976, doi 10.1109/TAC.1976.1101146).  With that response carried on beside the state, the
 innovations make the same information and gradient that `magfusion.estimation.integrity.score` has
-of a whole log, at the cost of one more product of matrices.
+of a whole log, at the cost of one more product of matrices.  Epochs wait until they are asked of.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,8 +15,8 @@ from magfusion.estimation.integrity.asked import Asked, heard_in, of_beacons_nam
 from magfusion.estimation.integrity.held import COVERED, Freed, finding_of, freed_by
 from magfusion.estimation.integrity.judgement import Judgement
 from magfusion.estimation.integrity.score import Score
+from magfusion.estimation.integrity.score_epochs import MEMORY, Epoch, Sums, heard, passed
 from magfusion.estimation.integrity.statistics import SURE
-from magfusion.estimation.integrity.suspects import Inertial, Stream
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.state import MOTION, State, states_of
@@ -27,28 +26,8 @@ from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.units import Array
 
-MEMORY = 60.0  # s; older innovations count less, for what is wrong may have changed
 ASKED_EVERY = 2.0  # s
-
-
-@dataclass(frozen=True, eq=False)
-class Sums:
-    """Of the innovations up to now, in typical errors of what is held.
-
-    Parameters
-    ----------
-    information : ndarray, shape (h, h)
-    gradient : ndarray, shape (h,)
-    response : ndarray, shape (15 + estimated, h)
-        What a unit of an error in them has done to the state.
-    time : float
-        (s)
-    """
-
-    information: Array
-    gradient: Array
-    response: Array
-    time: float
+MOST_WAITING = 32  # epochs
 
 
 class OnlineScore:
@@ -77,6 +56,7 @@ class OnlineScore:
     ) -> None:
         self.site, self._tangent, self._steady = site, (estimated, considered), steady
         self._sums, self._asked_at, self._said = None, -np.inf, Judgement()
+        self._waiting: list[Epoch] = []
         self._heard_at = {}
         self._made = self._asked_of(() if are_many(site) else [b.name for b in site.beacons])
 
@@ -104,18 +84,21 @@ class OnlineScore:
         if not alike or not asked.held:
             return
         response = -np.concatenate([score.by_state[-1], score.by_calibration])
-        self._sums = Sums(score.information, score.gradient, response, time)
+        self._sums, self._waiting = Sums(score.information, score.gradient, response, time), []
 
     def end(self) -> None:
         """Hear no more: the state has come from elsewhere, and its response is not known.
 
         What was said of the site stays said.
         """
-        self._sums = None
+        self._sums, self._waiting = None, []
 
     def foresee(self, measurement: Measurement, predicted: State) -> None:
-        """Predict a measurement for all that is asked: who asks for less of it finds it there."""
-        if self._sums is None:
+        """Predict of many beacons all that is asked: who asks for less of it finds it there.
+
+        Of few, epochs wait to be heard together.
+        """
+        if self._sums is None or not are_many(self.site):
             return
         self._hear([measurement], predicted.time)
         at = states_of([predicted]), predicted.calibration, self.asked.asked
@@ -126,13 +109,15 @@ class OnlineScore:
 
     def _hear(self, measurements: Sequence[Measurement], time: float) -> None:
         """Ask of those among many beacons that are heard, and no more of those long unheard."""
-        sums, before = self._sums, self.asked
-        if sums is None or not are_many(self.site):
+        if self._sums is None or not are_many(self.site):
             return
         known = self._heard_at | dict.fromkeys(heard_in(measurements, self.site), time)
         kept = {name: known[name] for name in known if known[name] > time - MEMORY}
         if kept.keys() <= self._heard_at.keys():  # nobody came: as cheap to go on asking
             self._heard_at = {name: known[name] for name in self._heard_at}
+            return
+        sums, before = self.settle(), self.asked
+        if sums is None:
             return
         self._heard_at = {b.name: kept[b.name] for b in self.site.beacons if b.name in kept}
         asked = self.asked
@@ -153,71 +138,34 @@ class OnlineScore:
         imu : ImuSamples
             Of the interval.
         """
-        sums = self._sums
-        if sums is None:
-            return
-        asked = self.asked
-        own = slice(0, asked.size)
-        response = transition[own, own] @ sums.response
-        if len(imu):
-            time, gyro, accel = np.zeros(1), imu.gyro_body, imu.accel_body
-            mean = ImuSamples(time, np.mean(gyro, axis=0)[None], np.mean(accel, axis=0)[None])
-            stream = Stream(mean, np.stack([before.world_from_body, after.world_from_body]))
-            by_bias = transition[:9, 9:MOTION]
-            for block in asked.held:
-                if isinstance(block.parameter, Inertial):
-                    unit = asked.unit[block.columns]
-                    bias = block.parameter.as_bias(stream)[0] * unit
-                    response[:9, block.columns] -= by_bias @ bias
-        kept = float(np.exp(-max(0.0, after.time - sums.time) / MEMORY))
-        self._sums = Sums(
-            kept * sums.information, kept * sums.gradient, response, max(after.time, sums.time)
-        )
+        if self._sums is not None:
+            self._waiting.append(Epoch(after, passed(before, after, transition, imu)))
 
     def measured(self, measurements: Sequence[Measurement], predicted: State) -> None:
         """Take in the innovations of an epoch, as the gate has left them."""
         self._hear(measurements, predicted.time)
-        sums, asked = self._sums, self.asked
-        if sums is None or not measurements:
+        if self._sums is None or not measurements:
             return
-        errors, jacobians = [], []
-        blocks, width = asked.asked, asked.whole - MOTION + len(asked.unit)
-        for measurement in measurements:
-            rows = measurement.linearize(states_of([predicted]), predicted.calibration, blocks)
-            rows, _ = rows.weighed(measurement.loss)
-            jacobian = rows.jacobian(width).reshape(-1, MOTION + width)
-            told = np.any(jacobian[:, : asked.whole] != 0.0, axis=1)
-            errors.append(rows.error.reshape(-1)[told])
-            jacobians.append(jacobian[told])
-        error, jacobian = np.concatenate(errors), np.concatenate(jacobians)
-        if not len(error):
-            return
-        own, cov = slice(0, asked.size), predicted.cov
-        by_state, by_held = jacobian[:, : asked.whole], jacobian[:, asked.whole :] * asked.unit
-        across = by_state @ cov
-        innovation = across @ by_state.T + np.eye(len(error))
-        known = across[:, own] @ by_state[:, own].T
-        if len(asked.rest):
-            learnt = np.linalg.solve(cov[np.ix_(asked.rest, asked.rest)], cov[asked.rest, own])
-            alone = cov[own, own] - cov[own, asked.rest] @ learnt
-            known = by_state[:, own] @ alone @ by_state[:, own].T
-        known = known + np.eye(len(error))
-        shown = by_state[:, own] @ sums.response - by_held
-        solved = np.linalg.solve(0.5 * (known + known.T), np.column_stack([shown, error]))
-        gain = np.linalg.solve(innovation, across[:, own]).T
-        found = replace(
-            sums,
-            information=sums.information + shown.T @ solved[:, :-1],
-            gradient=sums.gradient + shown.T @ solved[:, -1],
-            response=sums.response - gain @ shown,
-        )
-        finite = all(np.all(np.isfinite(v)) for v in (found.information, found.response))
-        self._sums = found if finite else None
+        led = None
+        if self._waiting and self._waiting[-1].predicted is predicted:
+            led = self._waiting.pop().passed
+        self._waiting.append(Epoch(predicted, led, tuple(measurements)))
+        if are_many(self.site) or len(self._waiting) >= MOST_WAITING:
+            self.settle()
+
+    def settle(self) -> Sums | None:
+        """Hear the epochs that wait, and return the sums: what a checkpoint holds."""
+        waiting, self._waiting = self._waiting, []
+        if self._sums is not None and waiting:
+            found = heard(self._sums, waiting, self.asked)
+            finite = all(np.all(np.isfinite(v)) for v in (found.information, found.response))
+            self._sums = found if finite else None
+        return self._sums
 
     def said_of(self, state: State) -> Judgement:
         """Return what the score says of a state; asked now and then."""
-        if self._sums is not None and state.time >= self._asked_at + ASKED_EVERY:
-            self._asked_at, self._said = state.time, self._ask(self._sums, state)
+        if state.time >= self._asked_at + ASKED_EVERY and (sums := self.settle()) is not None:
+            self._asked_at, self._said = state.time, self._ask(sums, state)
         return self._said
 
     def _ask(self, sums: Sums, state: State) -> Judgement:

@@ -25,7 +25,7 @@ from magfusion.units import DEGREE, Array, BoolArray, IntArray
 
 ROOT_2, ROOT_2_PI = float(np.sqrt(2.0)), float(np.sqrt(2.0 / np.pi))
 POSE = 6  # axes: rotation, then position
-PRECISE, MOST_STEPS = 1e-7, 60  # of a level
+PRECISE, MOST_STEPS = 1e-4, 60  # of a level
 MOST_DEG = 180.0  # an attitude level beyond it says nothing
 SINGLE_HOLDS = 0.215  # probability of a tail below which a single number bounds it
 LEAST = 1e-30  # rad, m; a deviation below it is none
@@ -163,12 +163,17 @@ class Separation:
         limit = self.separation_sigma.beyond(risk.false_alarm / tests)
         return np.maximum(limit, slack * self.sigma.whole[:, None])
 
-    def excess(self, risk: Risk, slack: float = 0.0) -> Array:
+    def excess(self, risk: Risk, slack: float = 0.0, limit: Array | None = None) -> Array:
         """Return the step of each beacon, of its threshold, shape (n, beacons); above one: alarm.
 
         That of rotation or position, whichever is larger.
+
+        Parameters
+        ----------
+        limit : ndarray, shape (n, beacons, 2), optional
+            The thresholds, where they are known.
         """
-        limit = self.thresholds(risk, slack)
+        limit = self.thresholds(risk, slack) if limit is None else limit
         known = (self.determined & (self.rows > 0))[..., None]
         return np.max(np.where(known, self.shift / np.maximum(limit, LEAST), 0.0), axis=2)
 
@@ -254,7 +259,11 @@ def unmonitored(prior: Array) -> Array:
 
 
 def protection_levels(
-    separation: Separation, risk: Risk, slack: float = 0.0, prior: Array | None = None
+    separation: Separation,
+    risk: Risk,
+    slack: float = 0.0,
+    prior: Array | None = None,
+    limit: Array | None = None,
 ) -> tuple[Array, Array]:
     """Return the radii that position (m) and attitude (deg) stay within, each of shape (n,).
 
@@ -267,6 +276,8 @@ def protection_levels(
         As of `Separation.thresholds`.
     prior : ndarray, shape (n, beacons), optional
         Probability that each beacon is false, where more is known than `Risk.fault`.
+    limit : ndarray, shape (n, beacons, 2), optional
+        The thresholds, where they are known.
     """
     prior = separation.prior(risk) if prior is None else prior
     share = (1.0 - risk.mirrors) * risk.total - unmonitored(np.minimum(prior, risk.fault))
@@ -274,7 +285,7 @@ def protection_levels(
     level = _levels(
         separation.sigma,
         separation.subset_sigma,
-        separation.thresholds(risk, slack),
+        separation.thresholds(risk, slack) if limit is None else limit,
         prior[..., None],
         np.where(covered, share, 1.0)[:, None] / len(PARTS),
     )
@@ -295,11 +306,10 @@ def _levels(sigma: Radius, without: Radius, threshold: Array, prior: Array, risk
     )
     threshold = np.concatenate([np.zeros_like(threshold[:, :1]), threshold], axis=1)
     prior = np.concatenate([np.ones_like(prior[:, :1]), prior], axis=1)
-    goal, own = np.log(risk), risk[:, None] / np.where(prior > 0.0, prior, 1.0)
+    goal, own = _sigmas_of(risk), risk[:, None] / np.where(prior > 0.0, prior, 1.0)
 
     def more(level: Array) -> Array:
-        total = (prior * each.tail(level[:, None] - threshold)).sum(axis=1)
-        return np.asarray(np.log(np.maximum(total, LEAST)) - goal)
+        return goal - _sigmas_of((prior * each.tail(level[:, None] - threshold)).sum(axis=1))
 
     # One alone has all of the risk at the lower end, and none more than its part at the upper.
     reach, part = threshold + each.beyond(np.minimum(own, 1.0)), own / prior.shape[1]
@@ -307,6 +317,11 @@ def _levels(sigma: Radius, without: Radius, threshold: Array, prior: Array, risk
     reach = threshold + each.beyond(np.minimum(part, 1.0))
     high = np.max(np.where(prior > 0.0, reach, 0.0), axis=1)
     return _crossing(more, np.maximum(low - PRECISE * high, 0.0), high)
+
+
+def _sigmas_of(probability: Array) -> Array:
+    """Return what grows with the radius of a Gaussian tail almost as a straight line does."""
+    return np.sqrt(np.maximum(-np.log(np.maximum(probability, LEAST)), 0.0))
 
 
 def _crossing(falling: Callable[[Array], Array], low: Array, high: Array) -> Array:

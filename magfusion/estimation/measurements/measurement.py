@@ -173,7 +173,7 @@ def joined(parts: Iterable[Measurement], epochs: Iterable[int] | None = None) ->
     kinds: dict[str, list[tuple[Measurement, IntArray]]] = {}
     for part, epoch in zip(parts, repeat(None) if epochs is None else epochs, strict=False):
         own = part.epoch if epoch is None else np.full(len(part.epoch), epoch)
-        kinds.setdefault(_kind(part), []).append((part, own))
+        kinds.setdefault(kind_of(part), []).append((part, own))
     out = []
     for alike in kinds.values():
         first = alike[0][0]
@@ -187,8 +187,8 @@ def joined(parts: Iterable[Measurement], epochs: Iterable[int] | None = None) ->
 _KINDS: WeakKeyDictionary[Measurement, str] = WeakKeyDictionary()
 
 
-def _kind(part: Measurement) -> str:
-    """Return what is the same of all that are joined; a window asks it of each at every epoch."""
+def kind_of(part: Measurement) -> str:
+    """Return what is the same of all that are `joined`; a window asks it of each at every epoch."""
     known = _KINDS.get(part)
     if known is None:
         values = ((name, getattr(part, name)) for name in _compared(type(part)))
