@@ -14,7 +14,7 @@ from magfusion.estimation.sending import Sending
 from magfusion.estimation.state import State, as_trajectory
 from magfusion.model.audibility import Owned, only_owned, owned_at
 from magfusion.model.channel_effects import tone_frequencies
-from magfusion.model.field import observe_earth
+from magfusion.model.field import predict_earth
 from magfusion.model.noise import calibration_error, model_error, sensor_positions
 from magfusion.model.parameters import Calibration, linearize_channels, predict_channels
 from magfusion.model.quaternion import unit
@@ -183,16 +183,16 @@ def demodulate_about(
     offset = calibration.time_offset
     off = taken_off(samples, known, imu, calibration, offset, window, wanted, motion)
     earth, sending, unexplained = off.earth_world, off.sending, off.unexplained_sensor
-    rest, left = operator.demodulate(unexplained)
+    rest, left, by_time_offset = operator.demodulate_both(unexplained, off.change_sensor)
     at_centre = predict_channels(
         calibration, states.time, states.world_from_body, states.position_world
     )
-    steady = observe_earth(site.platform.magnetometer, states.world_from_body, earth)
+    steady = predict_earth(site.platform.magnetometer, states.world_from_body, earth)
     fields = replace(rest, phasor_sensor=rest.phasor_sensor + at_centre)
     return MotionCompensated(
         fields=fields if operator.tone_of_channel is None else _of_loudest(fields, sending, states),
-        by_time_offset=operator.apply(off.change_sensor),
-        steady=replace(left, measured_sensor=left.measured_sensor + steady.measured_sensor),
+        by_time_offset=by_time_offset,
+        steady=replace(left, measured_sensor=left.measured_sensor + steady),
         unexplained_sensor=None if wanted is None else unexplained,
         wanted=off.wanted,
     )
@@ -273,8 +273,9 @@ def demodulate_predicted(
     centre, path = as_trajectory([predicted]), as_trajectory([before, predicted])
     assert receiver.admission is not None
     shape = MotionShape.of(path, imu, offset, site.gravity, usual=receiver.admission.imu_step)
-    turned = shape.turned_at(samples.time)
-    turn = BodyTurn(unit(turned), unit(shape.turned_at(window.centre)))
+    turned = shape.turned_at(np.concatenate([samples.time, window.centre]))
+    whole, turned = unit(turned), turned[:, :-1]
+    turn = BodyTurn(whole[:, :-1], whole[:, -1:])
     operator = receiver.operator_of_one(samples, known, alone, site, turn)
     if operator.unseen[0]:
         return _without_motion(operator, samples.measured_sensor, site.platform.magnetometer.offset)

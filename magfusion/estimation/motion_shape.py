@@ -39,15 +39,12 @@ class _ByOffset(NamedTuple):
         (rad/s), world axes
     position, velocity : ndarray
         (m/s) and (m/s^2)
-    at_states : tuple of ndarray
-        Both, which the states hold back.
     """
 
     rate: Array
     rate_at_states: Array
     position: Array
     velocity: Array
-    at_states: tuple[Array, Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +63,8 @@ class MotionShape:
         ``body(0)_from_body(k)``, quaternions, scalar first.
     world_from_start : ndarray, shape (4, states)
         At the states.
+    spread : ndarray, shape (3, states - 1)
+        The turn that is spread between each state and the next (rad).
     world_from_body : ndarray, shape (4, n)
         At the inertial samples.
     accel_world, velocity_world, position_world : ndarray, shape (n, 3)
@@ -81,6 +80,7 @@ class MotionShape:
     gyro_body: Array
     chain: Array
     world_from_start: Array
+    spread: Array
     world_from_body: Array
     accel_world: Array
     velocity_world: Array
@@ -137,6 +137,7 @@ class MotionShape:
             gyro_body=gyro,
             chain=chain,
             world_from_start=world_from_start,
+            spread=spread,
             world_from_body=world_from_body,
             accel_world=world_accel,
             velocity_world=velocity,
@@ -147,8 +148,8 @@ class MotionShape:
         )
 
     def turned_at(self, wanted: Array) -> Array:
-        """Return ``body(0)_from_body`` at any times (m,), quaternions (4, m), scalar first."""
-        near = self._near(wanted)
+        """Return ``body(0)_from_body`` at times (m,) in any order, quaternions (4, m)."""
+        near = self._near(np.array([np.min(wanted), np.max(wanted)]))
         return turn_at(self.chain[:, near], self.time[near], self.gyro_body[near], wanted)
 
     def at(self, wanted: Array, turned: Array | None = None) -> Trajectory:
@@ -196,16 +197,10 @@ class MotionShape:
             Rotation (rad/s) and position (m/s), world axes.
         """
         near, known, late = self._near(wanted), self.states.time, self._by_offset
-        own = self.time[near]
-        place = np.concatenate([self.position_world[near], late.position[near]], axis=1)
-        speed = np.concatenate([self.velocity_world[near], late.velocity[near]], axis=1)
-        position, velocity = hermite(own, place, speed, wanted)
+        own, (place, speed) = self.time[near], self._with_change
+        position, velocity = hermite(own, place[near], speed[near], wanted)
         inside = np.minimum(np.maximum(wanted, known[0]), known[-1])
-        value, change = (
-            np.concatenate([lack, -held], axis=1)
-            for lack, held in zip(self._lack, late.at_states, strict=True)
-        )
-        lack, slope = hermite(known, value, change, inside)
+        lack, slope = hermite(known, *self._lack_with_change, inside)
         position += lack + slope * (wanted - inside)[:, None]
         motion = Trajectory(
             time=wanted,
@@ -219,7 +214,7 @@ class MotionShape:
 
     def _attitude(self, wanted: Array, turned: Array | None) -> Array:
         turned = self.turned_at(wanted) if turned is None else turned
-        start = _turn_at(self.states.time, self.world_from_start, self._spread, wanted)
+        start = _turn_at(self.states.time, self.world_from_start, self.spread, wanted)
         return matrices(unit(product(start, turned)))
 
     def _near(self, wanted: Array) -> slice:
@@ -237,9 +232,24 @@ class MotionShape:
         return states.position_world - position, states.velocity_world - velocity
 
     @cached_property
-    def _spread(self) -> Array:
-        """The turn that is spread between each state and the next, shape (3, states - 1) (rad)."""
-        return _between(self.world_from_start)
+    def _with_change(self) -> tuple[Array, Array]:
+        """Position and velocity, and what the time offset changes of them, shape (n, 6)."""
+        late = self._by_offset
+        return (
+            np.concatenate([self.position_world, late.position], axis=1),
+            np.concatenate([self.velocity_world, late.velocity], axis=1),
+        )
+
+    @cached_property
+    def _lack_with_change(self) -> tuple[Array, Array]:
+        """As `_lack`, and the changes that the states hold back, shape (states, 6)."""
+        states = self.states
+        assert states.velocity_world is not None
+        place, speed = hermite(self.time, *self._with_change, states.time)
+        place, speed = -place, -speed
+        place[:, :3] += states.position_world
+        speed[:, :3] += states.velocity_world
+        return place, speed
 
     @cached_property
     def _by_offset(self) -> "_ByOffset":
@@ -267,8 +277,7 @@ class MotionShape:
         position[uneven] -= late[uneven, None] * speed[uneven]
         velocity = self._averaged(speed)
         del speed
-        held_back = hermite(self.time, position, velocity, known)
-        return _ByOffset(rate, at_states, position, velocity, held_back)
+        return _ByOffset(rate, at_states, position, velocity)
 
     def _averaged(self, values: Array) -> Array:
         return uniform_filter1d(values, 2 * self.reach + 1, axis=0, mode="nearest")

@@ -10,6 +10,7 @@ from scipy.ndimage import uniform_filter1d
 from magfusion.model.platform_motion import HeldModel
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel
+from magfusion.model.trajectory import interpolated
 from magfusion.units import Array, BoolArray, IntArray
 
 # What may happen while the IMU is silent: the motion of a person or a vehicle.
@@ -60,40 +61,52 @@ def cut_at_epochs(
     """
     time = imu.time + time_offset
     known = float(np.median(np.diff(time))) if usual is None else usual
+    edges, gap = _gaps(time, epochs, known)
     # One long step would tie the position to the velocity: its noise would be singular.
-    stamps = np.concatenate([time, _between_samples(time, epochs, known)])
+    stamps = _filled(time, edges, np.flatnonzero(gap), epochs, known)
     inside = (stamps > epochs[0]) & (stamps < epochs[-1])
     grid = np.sort(np.concatenate([stamps[inside], epochs]))
-    grid = grid[np.concatenate([[True], grid[1:] != grid[:-1]])]
-    samples = [
-        np.stack([np.interp(grid, time, axis) for axis in stream.T], axis=1)
-        for stream in (imu.gyro_body, imu.accel_body)
-    ]
-    gyro, accel = (0.5 * (s[:-1] + s[1:]) for s in samples)
+    new = np.empty(len(grid), dtype=bool)
+    new[0] = True
+    np.not_equal(grid[1:], grid[:-1], out=new[1:])
+    grid = grid[new]
+    gyro, accel = (interpolated(grid, time, stream) for stream in (imu.gyro_body, imu.accel_body))
     first = np.searchsorted(grid, epochs)
-    silent = np.flatnonzero(in_gap(time, grid, known))
     bridged = np.zeros(len(epochs) - 1, dtype=bool)
-    bridged[np.searchsorted(first, silent, side="right") - 1] = True
-    return Increments(gyro, accel, grid[1:] - grid[:-1], first, bridged)
+    if gap.any():
+        silent = np.flatnonzero(in_gap(time, grid, known))
+        bridged[np.searchsorted(first, silent, side="right") - 1] = True
+    return Increments(
+        0.5 * (gyro[:-1] + gyro[1:]),
+        0.5 * (accel[:-1] + accel[1:]),
+        grid[1:] - grid[:-1],
+        first,
+        bridged,
+    )
 
 
-def _between_samples(time: Array, epochs: Array, usual: float) -> Array:
-    """Return stamps that fill the gaps of a stream, as far as the epochs reach."""
-    edges = np.concatenate([[min(time[0], epochs[0])], time, [max(time[-1], epochs[-1])]])
-    filled = [np.empty(0)]
-    for k in np.flatnonzero(edges[1:] - edges[:-1] > GAP_SAMPLES * usual):
-        begin, end = max(edges[k], epochs[0]), min(edges[k + 1], epochs[-1])
-        if end > begin:
-            filled.append(np.linspace(begin, end, int((end - begin) / usual) + 2)[1:-1])
-    return np.concatenate(filled)
+def _gaps(time: Array, reach: Array, usual: float) -> tuple[Array, BoolArray]:
+    """Return the stamps with the ends that are reached, and which steps between them are gaps."""
+    edges = np.concatenate([[min(time[0], reach[0])], time, [max(time[-1], reach[-1])]])
+    return edges, edges[1:] - edges[:-1] > GAP_SAMPLES * usual
 
 
 def in_gap(time: Array, grid: Array, usual: float) -> BoolArray:
     """Tell which steps of the grid lie in a gap of the stream, however short the step itself is."""
-    edges = np.concatenate([[min(time[0], grid[0])], time, [max(time[-1], grid[-1])]])
-    spacing = edges[1:] - edges[:-1]
-    holding = np.searchsorted(edges[1:-1], grid[:-1], side="right")
-    return np.asarray(spacing[holding] > GAP_SAMPLES * usual)
+    edges, gap = _gaps(time, grid, usual)
+    return np.asarray(gap[np.searchsorted(edges[1:-1], grid[:-1], side="right")])
+
+
+def _filled(time: Array, edges: Array, gaps: IntArray, epochs: Array, usual: float) -> Array:
+    """Return stamps with others that fill the gaps of a stream, as far as the epochs reach."""
+    if not len(gaps):
+        return time
+    filled = [time]
+    for k in gaps:
+        begin, end = max(edges[k], epochs[0]), min(edges[k + 1], epochs[-1])
+        if end > begin:
+            filled.append(np.linspace(begin, end, int((end - begin) / usual) + 2)[1:-1])
+    return np.concatenate(filled)
 
 
 def across_held(cov: Array, imu: ImuModel) -> Array:

@@ -34,6 +34,8 @@ class ProcessNoise:
         elapsed : float
             (s)
         """
+        if not self.variance.any():
+            return np.zeros((len(self.variance),) * 2)
         gained = np.diag(self.variance * elapsed)
         columns = {block.key: block.columns for block in self.blocks}
         for block in self.blocks:

@@ -119,6 +119,9 @@ def propagate(
     noise[:MOTION, :MOTION] = root @ root.T
     if process_noise is not None:
         noise[MOTION:, MOTION:] = process_noise.cov(state.calibration, time, time - state.time)
-    cov = transition @ state.cov @ transition.T + noise
+    cov, motion = state.cov.copy(), transition[:MOTION]
+    cov[:MOTION] = motion @ state.cov
+    cov[:, :MOTION] = cov @ motion.T
+    cov += noise
     bridged = bool(own.increments.bridged[0])
     return Propagated(replace(later, cov=cov), replace(link, steps=own), bridged, transition, noise)

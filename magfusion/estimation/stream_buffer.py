@@ -26,9 +26,9 @@ def check_clock(name: str, time: Array, newest: float) -> None:
     ------
     InputError
     """
-    if len(time) == 0 or not np.isfinite(newest):
+    if len(time) == 0 or newest == -np.inf:
         return
-    if np.min(time) >= newest - LARGEST_JUMP and np.max(time) <= newest + LARGEST_JUMP:
+    if time.min() >= newest - LARGEST_JUMP and time.max() <= newest + LARGEST_JUMP:
         return  # as nearly always
     later = np.sort(np.append(time[time > newest], newest))
     ahead = float(np.max(np.diff(later), initial=0.0))
@@ -94,7 +94,7 @@ class Buffer:
         else:
             self.late += int(np.sum(~fresh))
             self._waiting.append((time[fresh], rows[fresh]))
-        self.newest = max(self.newest, float(np.max(time)))
+        self.newest = max(self.newest, float(time.max()))
 
     def leave_out(self, after: float, until: float) -> int:
         """Drop what was heard after a time and up to another (s); return how many samples."""

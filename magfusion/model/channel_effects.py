@@ -6,6 +6,7 @@ phasor.
 
 import numpy as np
 
+from magfusion.model.once import once_a_site
 from magfusion.model.response import AxisResponses, FrequencyResponse
 from magfusion.model.site import Site
 from magfusion.units import Array, ComplexArray
@@ -76,6 +77,7 @@ def axis_factors(site: Site) -> ComplexArray | None:
     )
 
 
+@once_a_site
 def tone_frequencies(site: Site) -> Array:
     """Return the frequency of each channel of a magnetometer (Hz)."""
     return np.concatenate([beacon.tone_frequencies_hz for beacon in site.beacons])

@@ -22,7 +22,11 @@ from magfusion.model.physics.conduction import (
     conducted_gradient,
     decay,
 )
-from magfusion.model.physics.dipole import dipole_field, dipole_field_along, dipole_gradient
+from magfusion.model.physics.dipole import (
+    dipole_field,
+    dipole_field_along,
+    dipole_field_and_gradient,
+)
 from magfusion.model.physics.loop import loop_field, loop_field_and_gradient
 from magfusion.model.site import Beacon, Coil, Site
 from magfusion.units import AnyArray, Array, ComplexArray
@@ -248,7 +252,7 @@ def coil_fields_and_gradients(source: Sources, offset_beacon: Array) -> tuple[An
     field: AnyArray
     gradient: AnyArray
     if loops.radius is None:
-        field, gradient = dipole_field(offset, loops.moment), dipole_gradient(offset, loops.moment)
+        field, gradient = dipole_field_and_gradient(offset, loops.moment)
     else:
         field, gradient = loop_field_and_gradient(offset, loops.moment, loops.radius)
     if source.decay is not None:

@@ -366,6 +366,14 @@ def observe_earth(
     )
 
 
+def predict_earth(
+    magnetometer: Magnetometer, world_from_body: Array, earth_field_world: Array
+) -> Array:
+    """Return the steady field that `observe_earth` returns, shape (..., 3) (T)."""
+    in_sensor = earth_field_world @ world_from_body @ magnetometer.body_from_sensor
+    return np.asarray(in_sensor @ magnetometer.matrix.T + magnetometer.offset)
+
+
 def model_error_cov(phasor_sensor: ComplexArray, model_error: float | Array) -> Array:
     """Return the variance that an inexact field model adds to each component of a phasor.
 

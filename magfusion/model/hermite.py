@@ -25,7 +25,7 @@ def hermite(known: Array, value: Array, slope: Array, wanted: Array) -> tuple[Ar
     -------
     tuple of ndarray, shape (m, k)
     """
-    index = np.searchsorted(known, wanted, side="right") - 1
+    index = known.searchsorted(wanted, side="right") - 1
     index = np.minimum(np.maximum(index, 0), len(known) - 2)  # as clip, which costs more of few
     later, from_time, from_value = index + 1, known[index], value[index]
     step = (known[later] - from_time)[:, None]

@@ -8,6 +8,7 @@ from magfusion.model.channel_effects import tone_frequencies
 from magfusion.model.field import power_error_cov, predict
 from magfusion.model.field_map import block_diagonal
 from magfusion.model.ground import conductivity_of, ground_error
+from magfusion.model.once import once_a_site
 from magfusion.model.parameters import BeaconParameter, MagnetometerParameter, candidates
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
@@ -109,6 +110,9 @@ def model_error(site: Site, sensor_world: Array | None = None) -> Array:
         alone = replace(site, platform=replace(site.platform, further=()))
         seen = [model_error(alone, None if at is None else at[:, None]) for at in places]
         return np.concatenate(seen * (len(site.platform.magnetometers) // len(seen)), axis=-1)
+    known = _model_error_anywhere(site)
+    if known is not None:
+        return known
     at = None if sensor_world is None else sensor_world[:, 0]
     parts = [
         np.asarray((site.model_error if beacon.model_error is None else beacon.model_error) ** 2)
@@ -119,6 +123,21 @@ def model_error(site: Site, sensor_world: Array | None = None) -> Array:
     return np.sqrt(np.stack(np.broadcast_arrays(*parts), axis=-1))[..., site.owner]
 
 
+@once_a_site
+def _model_error_anywhere(site: Site) -> Array | None:
+    """Return the relative error of each channel, (channels,); None where a map tells of places."""
+    if any(beacon.field_map is not None for beacon in site.beacons):
+        return None
+    own = [site.model_error if b.model_error is None else b.model_error for b in site.beacons]
+    return np.array(own)[site.owner]
+
+
+@once_a_site
+def _noise_share(site: Site) -> Array:
+    """Return by how much the noise of each channel is larger than is measured, (channels,)."""
+    return np.array([b.noise_factor for b in site.beacons])[site.owner] ** 2
+
+
 def sensor_positions(site: Site, poses: Trajectory) -> Array:
     """Return where the magnetometers are at each pose, (n, magnetometers, 3), world (m)."""
     return sensors_at(site, poses.world_from_body, poses.position_world)
@@ -127,6 +146,8 @@ def sensor_positions(site: Site, poses: Trajectory) -> Array:
 def sensors_at(site: Site, world_from_body: Array, position_world: Array) -> Array:
     """Return the same at poses of any number (n, ...)."""
     sensors = site.platform.magnetometers
+    if len(sensors) == 1:
+        return (position_world + world_from_body @ sensors[0].position_body)[:, None]
     return np.stack([position_world + world_from_body @ s.position_body for s in sensors], axis=1)
 
 
@@ -225,7 +246,7 @@ def _covs(
     share = None
     if beside and site.platform.further:
         share = np.sqrt(alike_beside(site, samples.valid))
-    noise = np.array([b.noise_factor for b in site.beacons])[site.owner] ** 2
+    noise = _noise_share(site)
     square = squares(site, samples, sensor_world)
     power = 0.5 * np.sum(square, axis=-1)
     found = []

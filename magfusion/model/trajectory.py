@@ -7,6 +7,18 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from magfusion.units import Array, BoolArray
 
+# Of one pose, by the name of each part.
+_SHAPES: tuple[tuple[str, tuple[int, ...]], ...] = (
+    ("time", ()),
+    ("world_from_body", (3, 3)),
+    ("position_world", (3,)),
+    ("velocity_world", (3,)),
+    ("gyro_bias_body", (3,)),
+    ("accel_bias_body", (3,)),
+    ("pose_cov", (6, 6)),
+)
+FEW = 1024  # times at which columns are interpolated at once
+
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
@@ -40,14 +52,11 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         n = len(self.time)
-        shapes = {"time": (n,), "world_from_body": (n, 3, 3), "position_world": (n, 3)}
-        shapes |= {k: (n, 3) for k in ("velocity_world", "gyro_bias_body", "accel_bias_body")}
-        shapes["pose_cov"] = (n, 6, 6)
-        for name, shape in shapes.items():
+        for name, own in _SHAPES:
             value = getattr(self, name)
-            if value is not None and value.shape != shape:
-                raise ValueError(f"{name} must have shape {shape}; got {value.shape}")
-        if n > 1 and np.any(np.diff(self.time) <= 0):
+            if value is not None and value.shape != (n, *own):
+                raise ValueError(f"{name} must have shape {(n, *own)}; got {value.shape}")
+        if n > 1 and (self.time[1:] <= self.time[:-1]).any():
             raise ValueError("time must be strictly increasing")
 
     def __len__(self) -> int:
@@ -94,8 +103,19 @@ def interpolate(
 
 
 def interpolated(wanted: Array, time: Array, values: Array) -> Array:
-    """Return columns, shape (n, k), on straight lines between their values at times (n,) (s)."""
-    return np.stack([np.interp(wanted, time, column) for column in values.T], axis=1)
+    """Return columns, shape (m, k), on straight lines between their values at times (n,) (s).
+
+    Before the first time and after the last one the values there.
+    """
+    if len(wanted) > FEW or len(time) == 1:
+        return np.stack([np.interp(wanted, time, column) for column in values.T], axis=1)
+    before = np.minimum(time.searchsorted(wanted, side="right") - 1, len(time) - 2)
+    before = np.maximum(before, 0)
+    after, begin = before + 1, time[before]
+    share = (wanted - begin) / (time[after] - begin)
+    share = np.minimum(np.maximum(share, 0.0), 1.0)[:, None]
+    first = values[before]
+    return np.asarray(first + share * (values[after] - first))
 
 
 def _slerp(known: Array, world_from_body: Array, wanted: Array) -> Array:

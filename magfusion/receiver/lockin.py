@@ -125,14 +125,30 @@ class WindowOperator:
             have been taken off: the gyro turns with the samples what does not turn with the
             platform.
         """
+        samples, steady, _ = self.demodulate_both(measured_sensor)
+        return samples, steady
+
+    def demodulate_both(
+        self, measured_sensor: Array, beside: Array | None = None
+    ) -> tuple[FieldSamples, SteadyFields, ComplexArray]:
+        """Return `demodulate` of a waveform, and `apply` of another at the same sample times.
+
+        Parameters
+        ----------
+        beside : ndarray, shape (samples, 3), optional
+            The other; what is returned of it is empty where it is not given.
+        """
         still, parts = self._still(measured_sensor), []
-        n = len(self.designs.frequencies_hz)
+        other = None if beside is None else self._still(beside)
+        n, none = len(self.designs.frequencies_hz), np.zeros((0, 0, 3), dtype=np.complex128)
         for rows, maps in self.designs.pieces():
             turn, field = self.measured_from_still[rows], _of_windows(still, maps)
             fitted = maps.solver @ field
             noise = noise_beside_tones(maps.probes @ field[:, None], maps.told)
             found = self._phasor(rows, fitted[:, 1:])
-            own = maps.variance
+            own, by = maps.variance, none
+            if other is not None:
+                by = self._phasor(rows, maps.solver[:, 1:] @ _of_windows(other, maps))
             parts.append(
                 (
                     found,
@@ -141,10 +157,11 @@ class WindowOperator:
                     turn[:, None] @ noise @ np.swapaxes(turn, 1, 2)[:, None],
                     (turn @ fitted[:, 0, :, None])[..., 0],
                     own[:, 0],
+                    by,
                 )
             )
-        phasor, bent, unit, noise, constant, constant_unit = (
-            np.concatenate(part) for part in zip(*parts, strict=True)
+        phasor, bent, unit, noise, constant, constant_unit, by = (
+            part[0] if len(part) == 1 else np.concatenate(part) for part in zip(*parts, strict=True)
         )
         centre, settings = self.designs.windows.centre, self.designs.settings
         smooth = smoothed_over_windows(
@@ -161,9 +178,9 @@ class WindowOperator:
             ),
             axes="".join(axis for k, axis in enumerate("xyz") if k not in self.lacking),
         )
-        beside = constant_unit[:, None, None] * np.mean(smooth, axis=1)
+        spread = constant_unit[:, None, None] * np.mean(smooth, axis=1)
         constant[:, self.lacking] = np.nan
-        return samples, SteadyFields(centre, constant, beside)
+        return samples, SteadyFields(centre, constant, spread), self._by_channel(by)
 
     def unexplained(self, measured_sensor: Array) -> Array:
         """Return the power that the design leaves of each window, shape (n,) (T^2)."""
@@ -203,7 +220,7 @@ class WindowOperator:
     def _phasor(self, rows: slice, fitted: Array) -> ComplexArray:
         """Return phasors of the cosines and sines, shape (n, 2 tones, 3), of some windows."""
         frequencies, centre = self.designs.frequencies_hz, self.designs.windows.centre[rows]
-        cosine, sine = np.split(fitted, 2, axis=1)
+        cosine, sine = fitted[:, : len(frequencies)], fitted[:, len(frequencies) :]
         reference = np.exp(-2j * np.pi * frequencies * centre[:, None])
         still = (cosine - 1j * sine) * reference[..., None]
         found = still @ np.swapaxes(self.measured_from_still[rows], 1, 2)

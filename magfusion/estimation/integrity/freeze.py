@@ -39,7 +39,7 @@ class Freeze:
         if len(time) == 0:
             return []
         same = np.empty(len(time), dtype=bool)
-        same[0] = np.array_equal(samples[0], self._sample)
+        same[0] = (samples[0] == self._sample).all()
         np.logical_and.reduce(samples[1:] == samples[:-1], axis=1, out=same[1:])
         self._sample = samples[-1].copy()
         if self._passed(time, same):

@@ -48,8 +48,8 @@ class Gate:
     ) -> None:
         self.blocks, self.watch = tuple(blocks), watch
         self.owner = np.array([name for name, _ in channels], dtype=object)
-        names = dict.fromkeys(self.owner.tolist())
-        self._mine = {str(name): np.asarray(self.owner == name) for name in names}
+        self._names = tuple(dict.fromkeys(name for name, _ in channels))
+        self._number = np.array([self._names.index(name) for name, _ in channels], dtype=np.int64)
         self.counts = Counter()
         self.distortion = {}
         self.refused_in_a_row = 0
@@ -89,10 +89,11 @@ class Gate:
         self.taken, self.refused = {}, {}
 
     def _by_beacon(self, distance: Array, chosen: BoolArray) -> dict[str, float]:
-        return {
-            name: float(np.mean(distance[chosen & self._mine[name]])) / 6.0
-            for name in dict.fromkeys(self.owner[chosen].tolist())
-        }
+        own = self._number[chosen]
+        count = np.bincount(own, minlength=len(self._names)).tolist()
+        total = np.bincount(own, distance[chosen], len(self._names)).tolist()
+        each = zip(self._names, total, count, strict=True)
+        return {name: whole / number / 6.0 for name, whole, number in each if number}
 
     def _note(self, distance: Array, valid: BoolArray) -> None:
         for name, level in self._by_beacon(distance, valid).items():

@@ -334,7 +334,7 @@ def _crossing(falling: Callable[[Array], Array], low: Array, high: Array) -> Arr
     rose = np.full(high.shape, 2)
     with np.errstate(invalid="ignore"):  # of what has no end
         for _ in range(MOST_STEPS):
-            if not np.any(high - low > width):
+            if not (high - low > width).any():
                 break
             middle = low + (high - low) * (at_low / np.maximum(at_low - at_high, LEAST))
             # Not nearer to an end than is asked for: a step beyond the crossing closes in on it.

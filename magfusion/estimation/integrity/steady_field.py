@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.estimation.measurements.earth import AMBIENT_SHARE
+from magfusion.model.once import once_a_site
+from magfusion.model.perturbation import skew
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding
 from magfusion.units import DEGREE, Array
@@ -62,16 +64,12 @@ def off_earth(site: Site, left_world: Array, rotation_cov_world: Array) -> OffEa
     earth = site.earth_field_world
     if earth is None:
         return None
-    size, horizontal = float(np.linalg.norm(earth)), float(np.hypot(earth[0], earth[1]))
-    cov = _usual(site, size) * np.eye(3)
-    east = np.array([-earth[1], earth[0], 0.0]) / max(horizontal, 1e-12)
-    cov += (site.earth.declination_sigma * horizontal) ** 2 * np.outer(east, east)
-    by_turn = np.cross(earth, np.eye(3))  # rows: what a turn about each axis changes
-    cov += by_turn.T @ rotation_cov_world @ by_turn
+    by_turn = skew(earth)
+    cov = _declared_cov(site) + by_turn @ rotation_cov_world @ by_turn.T
     score = float(np.sqrt(left_world @ np.linalg.solve(cov, left_world)))
     if score < DOUBT:
         return None
-    off = float(np.linalg.norm(left_world))
+    off, size = float(np.linalg.norm(left_world)), float(np.linalg.norm(earth))
     heading, rest = _heading(earth, earth + left_world)
     said = (
         f"The steady field differs from the declared Earth field by {1e6 * off:.2g} uT of"
@@ -91,6 +89,17 @@ def off_earth(site: Site, left_world: Array, rotation_cov_world: Array) -> OffEa
         )
     turn = abs(heading) if of_survey else off / size
     return OffEarth(Finding("earth_field", text, weight=score / DOUBT), score, turn, of_survey)
+
+
+@once_a_site
+def _declared_cov(site: Site) -> Array:
+    """Return the covariance of the steady field that the site declares, world axes (T^2)."""
+    earth = site.earth_field_world
+    assert earth is not None
+    size, horizontal = float(np.linalg.norm(earth)), float(np.hypot(earth[0], earth[1]))
+    east = np.array([-earth[1], earth[0], 0.0]) / max(horizontal, 1e-12)
+    across = (site.earth.declination_sigma * horizontal) ** 2 * np.outer(east, east)
+    return np.asarray(_usual(site, size) * np.eye(3) + across)
 
 
 def _usual(site: Site, size: float) -> float:

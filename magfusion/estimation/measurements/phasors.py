@@ -157,7 +157,7 @@ class FieldPhasors(Measurement):
                 calibration, blocks, self.time, *place, self.heard
             )
         value += lag[:, None, None] * self.by_time_offset
-        if np.any(calibration.clock_offsets):
+        if calibration.others and np.any(calibration.clock_offsets):
             later = calibration.clock_offsets[calibration.site.sensor]
             value += later[:, None] * (by_pose @ twist_body[:, None, :, None])[..., 0]
         by_lag = np.where(self.moving[:, None, None], self.by_time_offset, 0.0)

@@ -54,6 +54,11 @@ def _side_by_side(site: Site) -> list[_Group]:
     return _groups(site)
 
 
+@once_a_site
+def _each_alone(site: Site) -> list[_Group]:
+    return _groups(site, beside=False)
+
+
 def _groups(site: Site, *, beside: bool = True) -> list[_Group]:
     """Return the beacons of a site in as few groups as their forms allow, or each alone."""
     end = np.cumsum([len(beacon.tones) for beacon in site.beacons]).tolist()
@@ -80,7 +85,7 @@ def predict_channels(
     )
     out = np.empty((*shape, len(site.channels), 3), dtype=np.complex128)
     beside = world_from_body.ndim == 3 and position_world.ndim == 2
-    groups = _groups(site, beside=beside)
+    groups = _side_by_side(site) if beside else _each_alone(site)
     for sensor, magnetometer in enumerate(site.platform.magnetometers):
         mine = site.of_sensor(sensor)
         for group in groups:
@@ -133,7 +138,7 @@ def linearize_channels(
     by_calibration = np.zeros((n, channels, 6, dimension(blocks)))
     whole = any(not block.parameter.factor_of_phasor for block in blocks)
     elapsed = time - calibration.reference_time
-    acting = {beacon.name: _acting(blocks, beacon) for beacon in site.beacons}
+    acting = _acting(blocks, site)
     groups, factors = _side_by_side(site), axis_factors(site)
     sensors = enumerate(site.platform.magnetometers)
     for (sensor, magnetometer), group in product(sensors, groups):
@@ -167,10 +172,16 @@ def linearize_channels(
     return gain * value, gain[..., None] * by_pose, gain[..., None] * by_calibration
 
 
-def _acting(blocks: tuple[Block, ...], beacon: Beacon) -> list[Block]:
-    """Return the blocks that have a bearing on a beacon's phasors."""
-    own = (b.owner == beacon.name or not isinstance(b.parameter, BeaconParameter) for b in blocks)
-    return [block for block, acts in zip(blocks, own, strict=True) if acts]
+def _acting(blocks: tuple[Block, ...], site: Site) -> dict[str, list[Block]]:
+    """Return the blocks that have a bearing on each beacon's phasors, by its name."""
+    found: dict[str, list[Block]] = {beacon.name: [] for beacon in site.beacons}
+    for block in blocks:
+        if not isinstance(block.parameter, BeaconParameter):
+            for own in found.values():
+                own.append(block)
+        elif block.owner in found:
+            found[block.owner].append(block)
+    return found
 
 
 def _answered(stacked: Array, factors: ComplexArray) -> Array:

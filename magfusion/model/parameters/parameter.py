@@ -104,8 +104,8 @@ class Calibration:
         phase = self.phase + (time[..., None] - self.reference_time) * rate
         current, response = driven(self.site, time), responded(self.site)
         phase = phase if response is None else phase + response[1]
-        late = self.clock_offsets
-        if np.any(late):
+        late = self.clock_offsets if self.others else None
+        if late is not None and late.any():
             phase = phase + 2.0 * np.pi * frequencies * late[self.site.sensor]
         return phase if current is None else phase + current[1]
 

@@ -4,6 +4,8 @@ import numpy as np
 
 from magfusion.units import MU0_OVER_4PI, Array
 
+_UNIT = np.eye(3)
+
 
 def dipole_field(offset: Array, moment: Array) -> Array:
     """Return the flux density of a dipole, in the axes of its arguments.
@@ -27,7 +29,12 @@ def dipole_field(offset: Array, moment: Array) -> Array:
 
 
 def dipole_gradient(offset: Array, moment: Array) -> Array:
-    """Return the gradient of the dipole field: ``[i, j] = d field_i / d offset_j``.
+    """Return the gradient of `dipole_field_and_gradient` alone."""
+    return dipole_field_and_gradient(offset, moment)[1]
+
+
+def dipole_field_and_gradient(offset: Array, moment: Array) -> tuple[Array, Array]:
+    """Return the dipole field with its gradient: ``[i, j] = d field_i / d offset_j``.
 
     Parameters
     ----------
@@ -36,15 +43,21 @@ def dipole_gradient(offset: Array, moment: Array) -> Array:
 
     Returns
     -------
-    ndarray, shape (..., 3, 3)
+    field : ndarray, shape (..., 3)
+        (T)
+    gradient : ndarray, shape (..., 3, 3)
         (T/m); symmetric and without trace, as the field has neither curl nor divergence.
     """
-    square = np.einsum("...i,...i", offset, offset)[..., None, None]
-    along = np.einsum("...i,...i", offset, moment)[..., None, None]
+    square = np.einsum("...i,...i", offset, offset)[..., None]
+    along = np.einsum("...i,...i", offset, moment)[..., None]
+    cube = square**1.5
+    field = MU0_OVER_4PI * (3.0 * offset * along / square - moment) / cube
     outer = offset[..., :, None] * moment[..., None, :]
     radial = offset[..., :, None] * offset[..., None, :]
-    bracket = outer + np.swapaxes(outer, -1, -2) + along * (np.eye(3) - 5.0 * radial / square)
-    return 3.0 * MU0_OVER_4PI * bracket / square**2.5
+    fifth, along = (square * cube)[..., None], along[..., None]
+    bracket = outer + np.swapaxes(outer, -1, -2)
+    bracket += along * (_UNIT - 5.0 * radial / square[..., None])
+    return field, 3.0 * MU0_OVER_4PI * bracket / fifth
 
 
 def dipole_field_along(offset: Array, moment: Array, along: Array) -> Array:
