@@ -345,6 +345,9 @@ def _turn_at(known: Array, turn: Array, between: Array, wanted: Array) -> Array:
     if len(known) == 1:
         return np.repeat(turn, len(wanted), axis=1)
     inside = np.minimum(np.maximum(wanted, known[0]), known[-1])
+    if len(known) == 2:
+        share = (inside - known[0]) / (known[1] - known[0])
+        return product(turn[:, :1], of_vectors(share * between))
     index = np.searchsorted(known, inside, side="right") - 1
     index = np.minimum(np.maximum(index, 0), len(known) - 2)
     share = (inside - known[index]) / (known[1:] - known[:-1])[index]

@@ -8,6 +8,7 @@ from magfusion.model.site import MotionModel
 from magfusion.units import Array, BoolArray, IntArray
 
 CHUNK = 65_536  # samples at a time: what is computed of them stays in the cache
+FEW = 256  # rotations
 LONG = 1 << 18  # samples whose turns are multiplied at once
 
 
@@ -39,11 +40,16 @@ def _increments(time: Array, gyro_body: Array) -> Array:
 def _prefix_products(quaternion: Array) -> Array:
     """Products of the first 1, 2, ... rotations: those of neighbouring pairs, then the odd ones.
 
+    Of few rotations it is the number of operations that costs: of 1, 2, 4, ... before each at once.
     Of and to shape (4, n), scalar first.
     """
     n = quaternion.shape[1]
-    if n == 1:
-        return quaternion
+    if n <= FEW:
+        out, reach = quaternion.copy(), 1
+        while reach < n:
+            out[:, reach:] = product(out[:, :-reach], out[:, reach:])
+            reach *= 2
+        return out
     out = quaternion.copy()
     out[:, 1::2] = _prefix_products(product(quaternion[:, : n - 1 : 2], quaternion[:, 1::2]))
     if n > 2:

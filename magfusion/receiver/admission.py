@@ -209,12 +209,12 @@ class Admission:
             found[(found < 0) & spoilt] = REASONS.index(reason)
 
         time, step = waveform.time, self.magnetometer_step
-        gap = np.flatnonzero(np.diff(time) > 1.5 * step)
+        gap = (time[1:] - time[:-1] > 1.5 * step).nonzero()[0]
         # From just before the first missing sample to just after the last.
         lacking = meets(time[gap] + 0.75 * step, time[gap + 1] - 0.75 * step, begin, end)
         few = (windows.count + self.slack) * step < self.least_share * windows.length
         asked = lacking & ~few
-        if np.any(asked):
+        if asked.any():
             lacking[asked] = growth(windows.rows(asked), time) > MOST_GROWTH
         drop(MAGNETOMETER_GAP, lacking)
         drop(TOO_FEW, few)
@@ -227,6 +227,9 @@ class Admission:
             silence = silences(imu_time, self.imu_step, self.imu_margin)
             drop(INERTIAL_GAP, meets(*silence, begin, end - LATEST_USE * step))
         return found
+
+
+_NEVER = np.array([np.inf])
 
 
 def longest_step(step: float) -> float:
@@ -242,9 +245,9 @@ def silences(imu_time: Array, step: float, margin: float) -> tuple[Array, Array]
     step, margin : float
         As of `Admission` (s).
     """
-    gap = np.flatnonzero(np.diff(imu_time) > longest_step(step))
-    begin = np.append(imu_time[gap], imu_time[-1:] + margin)
-    return begin, np.append(imu_time[gap + 1], np.inf)
+    gap = (imu_time[1:] - imu_time[:-1] > longest_step(step)).nonzero()[0]
+    begin = np.concatenate([imu_time[gap], imu_time[-1:] + margin])
+    return begin, np.concatenate([imu_time[gap + 1], _NEVER])
 
 
 def meets_silence(
@@ -265,4 +268,4 @@ def meets_silence(
 
 def meets(begin: Array, end: Array, span_begin: Array, span_end: Array) -> BoolArray:
     """Return which spans meet at least one of some stretches, which are sorted and apart (s)."""
-    return np.searchsorted(begin, span_end) > np.searchsorted(end, span_begin)
+    return np.asarray(begin.searchsorted(span_end) > end.searchsorted(span_begin))

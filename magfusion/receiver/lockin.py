@@ -29,6 +29,7 @@ from magfusion.receiver.noise import (
 )
 from magfusion.receiver.turn import (
     BodyTurn,
+    body_from_measured,
     body_turn_of,
     measured_from_body,
     on_clock,
@@ -152,7 +153,7 @@ class WindowOperator:
             parts.append(
                 (
                     found,
-                    self._bent(rows, maps) * np.nansum(np.abs(found) ** 2, axis=-1),
+                    self._bent(rows, maps, found),
                     0.5 * (own[:, 1 : 1 + n] + own[:, 1 + n :]),
                     turn[:, None] @ noise @ np.swapaxes(turn, 1, 2)[:, None],
                     (turn @ fitted[:, 0, :, None])[..., 0],
@@ -202,20 +203,20 @@ class WindowOperator:
             out[rows] = turned(self.still_from_body[:, rows], in_body).T
         return out
 
-    def _bent(self, rows: slice, maps: Maps) -> Array:
-        """Return the relative variance of phasors by the square of a turn that is not seen.
+    def _bent(self, rows: slice, maps: Maps, found: ComplexArray) -> Array:
+        """Return the variance of phasors (n, tones, 3) by the square of a turn that is not seen.
 
-        Shape (n, channels): what the design makes of a tone that falls with the square of time.
+        Shape (n, tones) (T^2): what the design makes of a tone that falls with the square of time.
         """
         n = len(self.designs.frequencies_hz)
         out, unseen = np.zeros((len(maps.elapsed), n)), self.unseen[rows] | bool(self.lacking)
-        if not np.any(unseen):
+        if not unseen.any():
             return out
         elapsed = maps.elapsed[unseen]
         cosine = self.designs.design(elapsed, maps.weight[unseen])[..., 2 : 2 + n]
         square = (UNSEEN_TURN * elapsed[..., None]) ** 2  # half of it for each axis across
         out[unseen] = np.einsum("ntm,nmt->nt", maps.solver[unseen, 1 : 1 + n], square * cosine) ** 2
-        return out
+        return out * np.nansum(np.abs(found) ** 2, axis=-1)
 
     def _phasor(self, rows: slice, fitted: Array) -> ComplexArray:
         """Return phasors of the cosines and sines, shape (n, 2 tones, 3), of some windows."""
@@ -282,7 +283,7 @@ def window_operator(
     return WindowOperator(
         designs=designs_of(waveform, site, settings, windows) if designs is None else designs,
         channels=site.channels,
-        body_from_measured=np.asarray(np.linalg.inv(from_body)),
+        body_from_measured=np.eye(3) if lacking else body_from_measured(site),
         still_from_body=still,
         measured_from_still=from_body @ at_centre,
         declared_noise=site.platform.magnetometer.noise_density * float(np.sqrt(nyquist_hz)),

@@ -43,7 +43,8 @@ class LockinReceiver(Receiver):
         self._given, self.beside = settings, None
         self._designs: Designs | None = None
         self._even: dict[Spacing, Maps] = {}
-        self._even_by: tuple[LockinSettings, bytes] | None = None
+        self._even_by: tuple[LockinSettings, bytes, float] | None = None
+        self._lines_hz = np.zeros(0)
 
     @property
     def settings(self) -> LockinSettings:
@@ -122,8 +123,7 @@ class LockinReceiver(Receiver):
         assert self.admission is not None
         nyquist_hz = 0.5 / self.admission.magnetometer_step
         tones_hz = tones_of(site).frequencies_hz
-        lines_hz = nuisances_hz(self.settings, tones_hz, nyquist_hz)
-        even = self._even_maps(tones_hz)
+        even, lines_hz = self._even_maps(tones_hz, nyquist_hz)
         designs = Designs(self.settings, tones_hz, lines_hz, waveform.time, window, even)
         return window_operator(
             waveform,
@@ -137,12 +137,16 @@ class LockinReceiver(Receiver):
             turn,
         )
 
-    def _even_maps(self, tones_hz: Array) -> dict[Spacing, Maps]:
-        """Return the maps that are kept of evenly spaced samples: none by other settings."""
-        by = (self.settings, tones_hz.tobytes())
+    def _even_maps(self, tones_hz: Array, nyquist_hz: float) -> tuple[dict[Spacing, Maps], Array]:
+        """Return the maps that are kept of evenly spaced samples, and the lines in their designs.
+
+        None of another setting are kept.
+        """
+        by = (self.settings, tones_hz.tobytes(), nyquist_hz)
         if self._even_by != by:
             self._even, self._even_by = {}, by
-        return self._even
+            self._lines_hz = nuisances_hz(self.settings, tones_hz, nyquist_hz)
+        return self._even, self._lines_hz
 
     def _driven(self, windows: Windows) -> BoolArray:
         return np.ones(len(windows), dtype=bool)

@@ -94,6 +94,10 @@ def not_below(noise_cov: Array, sigma: float) -> Array:
     Held and coarsely quantised samples may be the same all through a window.
     """
     least = max(LEAST_SHARE * sigma, LEAST_NOISE) ** 2
+    # The two larger eigenvalues multiply to no more than the square of half their sum.
+    half = 0.5 * np.einsum("...ii->...", noise_cov)
+    if (np.linalg.det(noise_cov) > least * half**2).all():
+        return noise_cov
     value, vector = np.linalg.eigh(noise_cov)
     low = value[..., 0] < least
     if not np.any(low):

@@ -80,6 +80,9 @@ def saturated(
     fresh, begin, end = fresh[known_until:], begin - known_until, end - known_until
     value, time = measured[fresh], waveform.time[fresh]
     known = np.array([(one.low, one.high, one.finest, one.kept) for one in ends]).T
+    if known[3].min() >= 1 and (value[1:] != value[:-1]).all():
+        _heard(ends, value, time)  # no axis keeps a value, as nearly always
+        return spoilt
     low = np.minimum(np.minimum.accumulate(value), known[0])
     high = np.maximum(np.maximum.accumulate(value), known[1])
     change = np.zeros_like(value)
@@ -102,6 +105,16 @@ def saturated(
         one.finest, one.kept = float(finest[-1, axis]), int(kept[-1, axis])
         one.until = max(one.until, newest)
     return spoilt
+
+
+def _heard(ends: tuple[RangeEnds, ...], value: Array, time: Array) -> None:
+    """Bring ends up to date with samples (n, 3) of which each differs from the one before."""
+    low, high = value.min(axis=0).tolist(), value.max(axis=0).tolist()
+    finest = np.min(np.abs(value[1:] - value[:-1]), axis=0, initial=np.inf).tolist()
+    for axis, one in enumerate(ends):
+        one.low, one.high = min(one.low, low[axis]), max(one.high, high[axis])
+        one.finest = min(one.finest, finest[axis])
+        one.until = max(one.until, float(time[-1]))
 
 
 class _Runs(NamedTuple):

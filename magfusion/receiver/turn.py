@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.model.once import once_a_site
 from magfusion.model.quaternion import inverse, matrices, unit
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
@@ -131,7 +132,14 @@ def body_turn_of(imu: ImuSamples) -> Callable[[Array], Array]:
     return lambda time: unit(turn_at(turn, imu.time, imu.gyro_body, time))
 
 
+@once_a_site
 def measured_from_body(site: Site) -> Array:
     """Return what takes a field in the body's axes to those of the magnetometer, (3, 3)."""
     sensor = site.platform.magnetometer
     return np.asarray(sensor.matrix @ sensor.body_from_sensor.T)
+
+
+@once_a_site
+def body_from_measured(site: Site) -> Array:
+    """Return the inverse of `measured_from_body`."""
+    return np.asarray(np.linalg.inv(measured_from_body(site)))
