@@ -10,6 +10,7 @@ from online_log import online_log
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.judgement import JudgedState, Judgement
+from magfusion.estimation.integrity.levels import Levels
 from magfusion.estimation.navigator import NavigatorSettings
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
@@ -23,7 +24,7 @@ from magfusion.simulation.demo_site import demo_site
 
 EPOCH_NS = 1_700_000_000_000_000_000
 LOST = Judgement((Finding("lost", "The platform is lost.", Verdict.FAILED),))
-DOUBTFUL = Judgement((Finding("diverged", "It diverged."),), protection_level_m=1.0)
+DOUBTFUL = Judgement((Finding("diverged", "It diverged."),), levels=Levels((1.0, None)))
 
 
 def example_state(seed: int, judgement: Judgement | None = None) -> JudgedState:
@@ -39,7 +40,7 @@ def example_state(seed: int, judgement: Judgement | None = None) -> JudgedState:
         gyro_bias_body=np.zeros(3),
         calibration=initial_calibration(demo_site(), np.empty(0)),
         cov=root @ root.T,
-        judgement=Judgement(protection_level_m=0.25) if judgement is None else judgement,
+        judgement=Judgement(levels=Levels((0.25, None))) if judgement is None else judgement,
     )
 
 

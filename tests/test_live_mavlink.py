@@ -17,6 +17,7 @@ from live_states import DOUBTFUL, EPOCH_NS, LOST, example_state, piped, told_of,
 from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.integrity.judgement import Judgement
+from magfusion.estimation.integrity.levels import Levels
 from magfusion.estimation.state import moved_to
 from magfusion.jobs.live import LiveSettings
 from magfusion.results.odometry import odometry_of
@@ -227,12 +228,12 @@ def test_the_covariance_is_that_of_what_the_message_says(seed: int) -> None:
 
 def test_quality_falls_with_the_protection_level_and_halves_with_doubt() -> None:
     tight, wide = (
-        quality_percent(example_state(0, Judgement(protection_level_m=level)))
+        quality_percent(example_state(0, Judgement(levels=Levels((level, None)))))
         for level in (0.0, 3.0)
     )
     assert (tight, wide) == (100, 25)
     assert quality_percent(example_state(0, DOUBTFUL)) == 25
-    assert quality_percent(example_state(0, Judgement(protection_level_m=1e6))) == 1
+    assert quality_percent(example_state(0, Judgement(levels=Levels((1e6, None))))) == 1
     assert quality_percent(example_state(0, Judgement())) == 0  # MAVLink's word for unknown
 
 

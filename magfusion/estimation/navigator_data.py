@@ -16,6 +16,7 @@ from magfusion.estimation.fixed_lag import Node, Prior, SlidingWindow
 from magfusion.estimation.inertial import ROWS, Link, Steps
 from magfusion.estimation.integrity.bank import SubsetBank
 from magfusion.estimation.integrity.judgement import JudgedState, Judgement
+from magfusion.estimation.integrity.levels import Levels
 from magfusion.estimation.integrity.running import Running
 from magfusion.estimation.integrity.score_epochs import Sums
 from magfusion.estimation.measurements.earth import EarthField
@@ -75,12 +76,14 @@ def navigator_rules(
             Link: lambda link: _link_data(link, of_calibration),
             Measurement: _measurement_data,
             Verdict: str,
+            Levels: lambda levels: list(levels.found),
         },
         readers={
             **of_calibration.readers,
             Link: lambda data: _link(data, site, size - MOTION, of_calibration),
             Measurement: lambda data: _measurement(data, kinds),
             Verdict: Verdict,
+            Levels: _levels,
         },
         checks={
             State: lambda state: _check_state(state, size),
@@ -97,6 +100,12 @@ def navigator_rules(
             SlidingWindow: lambda window: _check_window(window),
         },
     )
+
+
+def _levels(data: Any) -> Levels:
+    right = isinstance(data, list) and len(data) == 2
+    _check(right and all(x is None or type(x) is float for x in data), "are no levels")
+    return Levels((data[0], data[1]))
 
 
 def _check(right: bool | np.bool_, wrong: str) -> None:

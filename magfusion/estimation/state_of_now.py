@@ -18,6 +18,7 @@ from magfusion.estimation.held_motion import HeldMotion
 from magfusion.estimation.input_queue import Arrivals
 from magfusion.estimation.integrity.bank import SubsetBank
 from magfusion.estimation.integrity.judgement import JudgedState, Judgement, told_cov
+from magfusion.estimation.integrity.levels import Levels
 from magfusion.estimation.navigator_settings import NavigatorSettings
 from magfusion.estimation.prior_ahead import ahead_by_prior
 from magfusion.estimation.state import State
@@ -187,6 +188,10 @@ def _wider(judgement: Judgement, grown: list[float], step: Array) -> Judgement:
     turn, shift = (float(np.linalg.norm(part)) for part in (step[:3], step[3:6]))
     return replace(
         judgement,
-        protection_level_m=None if metres is None else metres * grown[1] + shift,
-        protection_level_deg=None if degrees is None else degrees * grown[0] + turn / DEGREE,
+        levels=Levels(
+            (
+                None if metres is None else metres * grown[1] + shift,
+                None if degrees is None else degrees * grown[0] + turn / DEGREE,
+            )
+        ),
     )

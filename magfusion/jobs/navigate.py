@@ -31,11 +31,11 @@ from magfusion.model.site import Site
 if TYPE_CHECKING:
     from magfusion.estimation.integrity.judgement import JudgedState
     from magfusion.estimation.navigator import Navigator, NavigatorSettings
-    from magfusion.files.row_file import RowFile
     from magfusion.jobs.inputs import Job
     from magfusion.jobs.live import StateSink
     from magfusion.jobs.navigate_results import NavigateResults
     from magfusion.jobs.replay import Replay
+    from magfusion.jobs.state_rows import StateRows
     from magfusion.model.samples import Log
     from magfusion.model.trust import Trust
     from magfusion.results.figures import Figures
@@ -284,7 +284,7 @@ class NavigateRun:
     replay: Replay
     site: Site
     navigator: Navigator
-    rows: RowFile
+    rows: StateRows
     place: Path
     key: str
     position: int
@@ -330,8 +330,8 @@ def _open_run(
     from magfusion.files.checkpoint import run_key
     from magfusion.files.row_file import RowFile
     from magfusion.jobs.checkpoint import Kept, begin
-    from magfusion.jobs.navigate_results import row_columns
     from magfusion.jobs.replay import PIECE, Replay
+    from magfusion.jobs.state_rows import StateRows, row_columns
 
     known = (log.imu, log.waveform, log.fields, *log.waveforms.values())
     streams = [stream for stream in known if stream is not None]
@@ -341,7 +341,7 @@ def _open_run(
         replay=Replay(log),
         site=site,
         navigator=begun.navigator,
-        rows=RowFile(_rows_path(place), row_columns(site), begun.beside.rows),
+        rows=StateRows(RowFile(_rows_path(place), row_columns(site), begun.beside.rows)),
         place=place,
         key=key,
         position=begun.position,
@@ -352,8 +352,8 @@ def _open_run(
 
 def _advance(run: NavigateRun, settings: NavigateSettings, report: Report) -> None:
     """Take in the pieces that are left, and leave a checkpoint from time to time."""
-    from magfusion.jobs.navigate_results import CARRIED, CURRENT, LAGGED, state_row
     from magfusion.jobs.replay import PIECE, feed, paced
+    from magfusion.jobs.state_rows import CARRIED, CURRENT, LAGGED
 
     began = time.perf_counter() - run.elapsed
     every, told = max(1, round(settings.every / PIECE)), -np.inf
@@ -366,21 +366,21 @@ def _advance(run: NavigateRun, settings: NavigateSettings, report: Report) -> No
         states = run.navigator.take()
         spent = (time.perf_counter() - before) / max(len(states), 1)
         for carried in run.navigator.take_carried():
-            run.rows.append(state_row(run.navigator, carried, np.nan, CARRIED))
+            run.rows.add(run.navigator, carried, np.nan, CARRIED)
             _tell(run, carried)
             told = carried.time
         for state in states:
             # The first state is the result of a whole smoother.
             latency = spent if running else np.nan
-            run.rows.append(state_row(run.navigator, state, latency, CURRENT))
+            run.rows.add(run.navigator, state, latency, CURRENT)
             if settings.rate == "field":
                 _tell(run, state)
             elif state.time > told:  # the inertial stream is silent
-                run.rows.append(state_row(run.navigator, state, np.nan, CARRIED))
+                run.rows.add(run.navigator, state, np.nan, CARRIED)
                 _tell(run, state)
                 told = state.time
         for state in run.navigator.take_lagged():
-            run.rows.append(state_row(run.navigator, state, np.nan, LAGGED))
+            run.rows.add(run.navigator, state, np.nan, LAGGED)
         if k % every == 0:
             report("navigating", k, len(run.replay))
     run.elapsed = time.perf_counter() - began
@@ -406,5 +406,11 @@ COMMAND = Command(
     NavigateSettings,
     run,
     example="magfusion navigate log --estimator ekf -o navigated",
-    imports=("jobs.without_beacons", "jobs.navigate_results", "jobs.replay", "results.screen"),
+    imports=(
+        "jobs.without_beacons",
+        "jobs.navigate_results",
+        "jobs.replay",
+        "jobs.state_rows",
+        "results.screen",
+    ),
 )

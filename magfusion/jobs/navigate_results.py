@@ -8,7 +8,6 @@ import numpy as np
 
 from magfusion.estimation.initialization.online import NoStart
 from magfusion.estimation.integrity.diagnosis import with_cause
-from magfusion.estimation.integrity.judgement import JudgedState
 from magfusion.estimation.integrity.open_roll import comparable
 from magfusion.estimation.integrity.recording import BRIDGED, recorded
 from magfusion.estimation.integrity.signal import Detected
@@ -17,6 +16,7 @@ from magfusion.estimation.state import MOTION
 from magfusion.files.site import save_site
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum
+from magfusion.jobs.state_rows import CARRIED, CURRENT, LAGGED, STATE
 from magfusion.model.parameters import dimension, initial_calibration
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
@@ -45,53 +45,7 @@ from magfusion.results.report import (
 from magfusion.results.verdict import level_figures, trust_figures
 from magfusion.units import Array, BoolArray
 
-# What a row is: an epoch's state as it was made, as it left the smoother's window, or carried.
-CURRENT, LAGGED, CARRIED = 0.0, 1.0, 2.0
-_STATE = {
-    "time": 1,
-    "world_from_body": 9,
-    "position_world": 3,
-    "velocity_world": 3,
-    "accel_bias_body": 3,
-    "gyro_bias_body": 3,
-}
 _VERDICTS = tuple(Verdict)
-
-
-def row_columns(site: Site) -> dict[str, int]:
-    """Return what is kept of each state as it is made, with the number of values."""
-    beacons = len(site.beacons)
-    told = {
-        "lagged": 1,
-        "reset_counter": 1,
-        "latency": 1,
-        "verdict": 1,
-        "levels": 2,
-        "pose_cov": 36,
-    }
-    return told | _STATE | {"distortion": beacons, "excluded": beacons, "heard": beacons}
-
-
-def state_row(
-    navigator: Navigator, state: JudgedState, latency: float, kind: float
-) -> dict[str, Array | float]:
-    """Return a state as a row of `row_columns`; the latency (s) is NaN where it is none."""
-    level, names = navigator.distortion, [b.name for b in navigator.site.beacons]
-    return {name: getattr(state, name) for name in _STATE} | {
-        "lagged": kind,
-        "reset_counter": float(state.reset_counter),
-        "latency": latency,
-        "verdict": float(state.verdict.rank),
-        "levels": np.array([np.nan if x is None else x for x in _levels(state)]),
-        "pose_cov": state.cov[:6, :6],
-        "distortion": np.array([level.get(name, np.nan) for name in names]),
-        "excluded": np.array([float(name in state.judgement.excluded) for name in names]),
-        "heard": np.array([float(name in state.judgement.heard) for name in names]),
-    }
-
-
-def _levels(state: JudgedState) -> tuple[float | None, float | None]:
-    return state.judgement.protection_level_m, state.judgement.protection_level_deg
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +120,7 @@ def _part(rows: dict[str, Array], own: BoolArray, site: Site) -> Part | None:
         time=rows["time"][own, 0],
         world_from_body=rows["world_from_body"][own].reshape(-1, 3, 3),
         pose_cov=rows["pose_cov"][own].reshape(-1, 6, 6),
-        **{name: rows[name][own] for name in tuple(_STATE)[2:]},
+        **{name: rows[name][own] for name in tuple(STATE)[2:]},
     )
     if not site.platform.inertial:  # the prior's bias is the rate, and no bias
         states = replace(states, gyro_bias_body=None, accel_bias_body=None)

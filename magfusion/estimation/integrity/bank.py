@@ -12,7 +12,8 @@ import numpy as np
 
 from magfusion.estimation.ekf import measured_rows
 from magfusion.estimation.integrity.judgement import Judgement
-from magfusion.estimation.integrity.separation import LEAST, Separation, protection_levels, radii
+from magfusion.estimation.integrity.levels import Asked, Levels
+from magfusion.estimation.integrity.separation import LEAST, Separation, radii
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors, leaves_out
@@ -55,6 +56,8 @@ class SubsetBank:
         self.risk = Risk() if risk is None else risk
         self.names = [beacon.name for beacon in site.beacons]
         self.groups = min(len(self.names), MOST)
+        members = np.bincount(np.arange(len(self.names)) % self.groups)
+        self._prior = np.array(self.risk.fault * members[None], dtype=np.float64)
         self._step = self._cov = self._joint = None
         names = [name for name, _ in site.channels]
         self._owner = np.array([self.names.index(name) % self.groups for name in names])
@@ -184,17 +187,13 @@ class SubsetBank:
         found = self.separation(state)
         if found is None or judgement.verdict is Verdict.FAILED:
             return judgement
-        limit = found.thresholds(self.risk, SLACK)
-        excess = found.excess(self.risk, SLACK, limit)[0]
+        excess = self._excess(found)
         if np.max(excess) <= 1.0:
             # What the witnesses allow for is beyond what separation knows of.
-            position_m, degrees = self.levels(found, limit)
-            wide, more = np.sqrt(judgement.inflation), SLACK * np.sqrt(3.0)
-            return replace(
-                judgement,
-                protection_level_m=_wider(position_m, wide, more * judgement.shift),
-                protection_level_deg=_wider(degrees, wide, more * judgement.turn / DEGREE),
-            )
+            wide, more = float(np.sqrt(judgement.inflation)), SLACK * float(np.sqrt(3.0))
+            beyond = (more * judgement.shift, more * judgement.turn / DEGREE)
+            asked = Asked(found, SLACK, self.risk, self._prior, wide, beyond)
+            return replace(judgement, levels=Levels(asked=asked))
         worst = int(np.argmax(excess))
         turn, shift = np.max(np.where(found.determined[0, :, None], found.shift[0], 0.0), axis=0)
         text = (
@@ -212,6 +211,14 @@ class SubsetBank:
             shift=max(judgement.shift, float(shift)),
         )
 
+    def _excess(self, found: Separation) -> Array:
+        """Return the step of each filter, of its threshold; zeros where all are clearly below."""
+        step = np.add.reduceat(found.step[0] ** 2, (0, 3), axis=1)
+        own = np.add.reduceat(found.cov[0].diagonal(), (0, 3))
+        if (step <= SLACK**2 * own).all():
+            return np.zeros(self.groups)
+        return found.excess(self.risk, SLACK)[0]
+
     def _called(self, group: int) -> str:
         names = self.names[group :: self.groups]
         return f"beacon {names[0]}" if len(names) == 1 else f"beacons {', '.join(names)}"
@@ -221,7 +228,8 @@ class SubsetBank:
         if self._step is None or self._cov is None or self._joint is None:
             return None
         pose = np.s_[:, :6, :6]
-        subset, joint = self._cov[1:][pose], self._joint[pose]
+        # A copy: a state whose levels nobody has asked for yet must not keep the whole filters.
+        subset, joint = self._cov[1:][pose].copy(), self._joint[pose]
         apart = subset + self._cov[:1][pose] - joint - np.swapaxes(joint, 1, 2)
         variance = np.einsum("gii->gi", subset)
         determined = (np.sum(variance[:, :3], axis=1) < OPEN_ROTATION**2) & (
@@ -229,8 +237,8 @@ class SubsetBank:
         )
         count = (1, self.groups)
         return Separation(
-            self._step[None, :, :6],
-            state.cov[None, :6, :6],
+            self._step[None, :, :6].copy(),
+            state.cov[None, :6, :6].copy(),
             subset[None],
             apart[None],
             determined[None],
@@ -266,24 +274,3 @@ class SubsetBank:
             after[i] / np.where(before[i] > LEAST, before[i], np.inf) for i in range(len(before))
         ]
         return np.asarray(np.maximum(np.max(shares, axis=(0, 2)), 1.0))
-
-    def levels(self, found: Separation, limit: Array) -> tuple[float | None, float | None]:
-        """Return the protection levels of position (m) and attitude (deg), if there are any.
-
-        Parameters
-        ----------
-        limit : ndarray, shape (1, groups, 2)
-            The thresholds.
-        """
-        members = np.bincount(np.arange(len(self.names)) % self.groups)
-        prior = np.array(self.risk.fault * members[None], dtype=np.float64)
-        position_m, degrees = protection_levels(found, self.risk, SLACK, prior, limit)
-        return _known(position_m[0]), _known(degrees[0])
-
-
-def _wider(level: float | None, factor: float, more: float) -> float | None:
-    return None if level is None else float(factor * level + more)
-
-
-def _known(level: float) -> float | None:
-    return float(level) if np.isfinite(level) else None

@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from magfusion.estimation.integrity.levels import Levels
 from magfusion.estimation.state import POSITION, ROTATION, State
 from magfusion.model.one_axis import opened_state, roll_is_open
 from magfusion.model.trust import Finding, Trust, Verdict, worst
@@ -24,8 +25,8 @@ class Judgement:
         Of the whole covariance, at least one.
     turn, shift : float
         What the attitude (rad) and the position (m) may be off by beyond that, one sigma an axis.
-    protection_level_m, protection_level_deg : float, optional
-        None where there is none.
+    levels : Levels, optional
+        None where there are none.
     heard : tuple of str
         Beacons that were told from noise there, the motion inside the window taken off.
     """
@@ -35,9 +36,18 @@ class Judgement:
     inflation: float = 1.0
     turn: float = 0.0
     shift: float = 0.0
-    protection_level_m: float | None = None
-    protection_level_deg: float | None = None
+    levels: Levels | None = None
     heard: tuple[str, ...] = ()
+
+    @property
+    def protection_level_m(self) -> float | None:
+        """Radius that the position stays within (m), if there is one."""
+        return None if self.levels is None else self.levels.found[0]
+
+    @property
+    def protection_level_deg(self) -> float | None:
+        """Angle that the attitude stays within (deg), if there is one."""
+        return None if self.levels is None else self.levels.found[1]
 
     @property
     def verdict(self) -> Verdict:

@@ -163,17 +163,12 @@ class Separation:
         limit = self.separation_sigma.beyond(risk.false_alarm / tests)
         return np.maximum(limit, slack * self.sigma.whole[:, None])
 
-    def excess(self, risk: Risk, slack: float = 0.0, limit: Array | None = None) -> Array:
+    def excess(self, risk: Risk, slack: float = 0.0) -> Array:
         """Return the step of each beacon, of its threshold, shape (n, beacons); above one: alarm.
 
         That of rotation or position, whichever is larger.
-
-        Parameters
-        ----------
-        limit : ndarray, shape (n, beacons, 2), optional
-            The thresholds, where they are known.
         """
-        limit = self.thresholds(risk, slack) if limit is None else limit
+        limit = self.thresholds(risk, slack)
         known = (self.determined & (self.rows > 0))[..., None]
         return np.max(np.where(known, self.shift / np.maximum(limit, LEAST), 0.0), axis=2)
 
@@ -259,11 +254,7 @@ def unmonitored(prior: Array) -> Array:
 
 
 def protection_levels(
-    separation: Separation,
-    risk: Risk,
-    slack: float = 0.0,
-    prior: Array | None = None,
-    limit: Array | None = None,
+    separation: Separation, risk: Risk, slack: float = 0.0, prior: Array | None = None
 ) -> tuple[Array, Array]:
     """Return the radii that position (m) and attitude (deg) stay within, each of shape (n,).
 
@@ -276,8 +267,6 @@ def protection_levels(
         As of `Separation.thresholds`.
     prior : ndarray, shape (n, beacons), optional
         Probability that each beacon is false, where more is known than `Risk.fault`.
-    limit : ndarray, shape (n, beacons, 2), optional
-        The thresholds, where they are known.
     """
     prior = separation.prior(risk) if prior is None else prior
     share = (1.0 - risk.mirrors) * risk.total - unmonitored(np.minimum(prior, risk.fault))
@@ -285,7 +274,7 @@ def protection_levels(
     level = _levels(
         separation.sigma,
         separation.subset_sigma,
-        separation.thresholds(risk, slack) if limit is None else limit,
+        separation.thresholds(risk, slack),
         prior[..., None],
         np.where(covered, share, 1.0)[:, None] / len(PARTS),
     )
@@ -328,13 +317,15 @@ def _crossing(falling: Callable[[Array], Array], low: Array, high: Array) -> Arr
     """Return where functions fall below zero between two ends, from above.
 
     By chords between the ends; of an end that stays the value counts half from step to step, so
-    that the other moves, too (the Illinois algorithm).
+    that the other moves, too (the Illinois algorithm).  One that is found stays, however long the
+    others take.
     """
     at_low, at_high, width = falling(low), np.minimum(falling(high), 0.0), PRECISE * high
     rose = np.full(high.shape, 2)
     with np.errstate(invalid="ignore"):  # of what has no end
         for _ in range(MOST_STEPS):
-            if not (high - low > width).any():
+            wide = high - low > width
+            if not wide.any():
                 break
             middle = low + (high - low) * (at_low / np.maximum(at_low - at_high, LEAST))
             # Not nearer to an end than is asked for: a step beyond the crossing closes in on it.
@@ -342,7 +333,8 @@ def _crossing(falling: Callable[[Array], Array], low: Array, high: Array) -> Arr
             found = falling(middle)
             rises = found > 0.0
             half = np.where(rises == rose, 0.5, 1.0)
-            low, high = np.where(rises, middle, low), np.where(rises, high, middle)
+            low = np.where(rises & wide, middle, low)
+            high = np.where(rises | ~wide, high, middle)
             at_low, at_high = (
                 np.where(rises, found, half * at_low),
                 np.where(rises, half * at_high, found),
