@@ -26,7 +26,8 @@ from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.units import Array
 
-ASKED_EVERY = 2.0  # s
+ASKED_EVERY, ASKED_AFTER = 2.0, 20.0  # s; at the soonest, and at the latest
+ENOUGH = 5  # epochs to be asked of sooner
 MOST_WAITING = 32  # epochs
 
 
@@ -44,6 +45,7 @@ class OnlineScore:
     _sums: Sums | None
     _heard_at: dict[str, float]
     _asked_at: float
+    _unasked: int  # epochs since then
     _said: Judgement
 
     def __init__(
@@ -57,6 +59,7 @@ class OnlineScore:
         self.site, self._tangent, self._steady = site, (estimated, considered), steady
         self._sums, self._asked_at, self._said = None, -np.inf, Judgement()
         self._waiting: list[Epoch] = []
+        self._unasked = 0
         self._heard_at = {}
         self._made = self._asked_of(() if are_many(site) else [b.name for b in site.beacons])
 
@@ -150,6 +153,7 @@ class OnlineScore:
         if self._waiting and self._waiting[-1].predicted is predicted:
             led = self._waiting.pop().passed
         self._waiting.append(Epoch(predicted, led, tuple(measurements)))
+        self._unasked += 1
         if are_many(self.site) or len(self._waiting) >= MOST_WAITING:
             self.settle()
 
@@ -164,8 +168,9 @@ class OnlineScore:
 
     def said_of(self, state: State) -> Judgement:
         """Return what the score says of a state; asked now and then."""
-        if state.time >= self._asked_at + ASKED_EVERY and (sums := self.settle()) is not None:
-            self._asked_at, self._said = state.time, self._ask(sums, state)
+        wait = ASKED_EVERY if self._unasked >= ENOUGH else ASKED_AFTER
+        if state.time >= self._asked_at + wait and (sums := self.settle()) is not None:
+            self._asked_at, self._unasked, self._said = state.time, 0, self._ask(sums, state)
         return self._said
 
     def _ask(self, sums: Sums, state: State) -> Judgement:
