@@ -1,0 +1,145 @@
+"""Two days of raw samples through the online filter: memory and pace, hour by hour.
+
+Walks among the demo's beacons and rests between them, both instruments at one rate, a field epoch a
+second; samples are made a minute at a time and forgotten, so that what grows is the navigator's.
+A checkpoint is written every hour, and the run goes on from it with ``--resume``.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from magfusion.estimation.navigator import NavigatorSettings
+from magfusion.files.checkpoint import run_key
+from magfusion.jobs.checkpoint import begin, save
+from magfusion.jobs.drift_world import bare_loop, memory_mib
+from magfusion.model.trust import Risk
+from magfusion.receiver.windows import default_settings
+from magfusion.simulation.demo_site import demo_site
+from magfusion.simulation.disturbance import Ambient
+from magfusion.simulation.endurance import Biases, EnduranceConfig, World, draw_endurance
+from magfusion.simulation.log import draw_drives
+from magfusion.simulation.waveform import beacons_world
+from magfusion.units import Array
+
+HOUR, BLOCK, PIECE = 60, 60.0, 1.0  # blocks; s
+GOAL_MIB = 4096.0
+
+
+@dataclass(frozen=True, eq=False)
+class Hour:
+    """What a run keeps beside its navigator."""
+
+    biases: Biases
+    seconds: float = 0.0
+    bare: float = 0.0
+    largest_mib: float = 0.0
+    states: int = 0
+    first_mib: float = 0.0
+    errors: list[float] = field(default_factory=list)
+
+
+def waveform(world: World, first: float, rate_hz: float, rng: np.random.Generator) -> Array:
+    """Return the samples of a magnetometer in a minute from a time on (s), shape (n, 3) (T)."""
+    site, stamps = world.true_site, first + np.arange(round(BLOCK * rate_hz)) / rate_hz
+    sensor, drives = (
+        site.platform.magnetometer,
+        draw_drives(site, np.random.default_rng(world.seed)),
+    )
+    turn = world.motion.world_from_body(stamps)
+    place = world.motion.position_world(stamps) + turn.apply(sensor.position_body)
+    field_world = beacons_world(site, drives, stamps, place, Ambient())
+    if site.earth_field_world is not None:
+        field_world += site.earth_field_world
+    found = turn.inv().apply(field_world) @ sensor.body_from_sensor @ sensor.matrix.T
+    noise = sensor.noise_density * np.sqrt(rate_hz / 2.0) * rng.standard_normal(found.shape)
+    return np.asarray(found + sensor.offset + noise)
+
+
+def pieces(time_s: Array, first: float) -> Iterator[slice]:
+    """Yield the samples of a minute, a second at a time."""
+    edges = np.searchsorted(time_s, first + PIECE * np.arange(round(BLOCK / PIECE) + 1))
+    yield from (slice(*pair) for pair in pairwise(edges.tolist()))
+
+
+def run(options: argparse.Namespace, place: Path) -> Hour:
+    """Navigate through the hours that are left; return what came of all."""
+    config = EnduranceConfig(options.hours, imu_rate_hz=options.rate_hz)
+    seed = (options.seed, 0)
+    world = draw_endurance(demo_site(synchronised=True), config, seed)
+    lockin = replace(default_settings(world.site), step=1.0)
+    settings = NavigatorSettings(estimator=options.estimator, lockin=lockin, risk=Risk())
+    key = run_key("bench_days", options.hours, options.rate_hz, options.seed, options.estimator)
+    begun = begin(place, key, world.site, settings, Hour(world.start()), resume=options.resume)
+    navigator, kept = begun.navigator, begun.beside
+    print("  hour  states  ms a state   loops      MiB  error/mm  (rms, of that hour)")
+    for block in range(begun.position, config.blocks):
+        made = world.stretch(block, 1, kept.biases)
+        imu, began = made.imu, block * BLOCK
+        measured = waveform(world, began, options.rate_hz, np.random.default_rng((*seed, block)))
+        bare = bare_loop(imu, world.site.platform.imu, world.site.gravity) * len(imu)
+        stamps = began + np.arange(len(measured)) / options.rate_hz
+        states, spent = [], time.process_time()
+        for own in pieces(stamps, began):
+            navigator.hear_imu(imu.time[own], imu.gyro_body[own], imu.accel_body[own])
+            navigator.add_magnetometer(stamps[own], measured[own])
+            states += navigator.take()
+            navigator.take_lagged()
+        spent = time.process_time() - spent
+        true = world.motion.position_world(np.array([s.time for s in states]))
+        off = [
+            float(np.sum((s.position_world - p) ** 2)) for s, p in zip(states, true, strict=True)
+        ]
+        kept = replace(
+            kept,
+            biases=made.after,
+            seconds=kept.seconds + spent,
+            bare=kept.bare + bare,
+            states=kept.states + len(states),
+            largest_mib=max(kept.largest_mib, memory_mib()),
+            errors=[*kept.errors, *off],
+        )
+        if (block + 1) % HOUR == 0:
+            first_mib = kept.first_mib or memory_mib()
+            rms = 1e3 * float(np.sqrt(np.mean(kept.errors)))
+            each, loops = 1e3 * kept.seconds / max(kept.states, 1), kept.seconds / kept.bare
+            line = f"{(block + 1) // HOUR:6d}{kept.states:8d}{each:12.2f}{loops:8.1f}"
+            print(f"{line}{memory_mib():9.0f}{rms:10.2f}", flush=True)
+            kept = replace(kept, first_mib=first_mib, errors=[])
+            save(navigator, block + 1, kept, place, key)
+    return kept
+
+
+def main() -> None:
+    """Print a line an hour and one of JSON; exit with 1 where the goal is missed."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--hours", type=float, default=48.0, help="of raw samples")
+    parser.add_argument("--rate-hz", type=float, default=100.0, help="of both instruments")
+    parser.add_argument("--estimator", choices=("ekf", "smoother"), default="ekf")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--checkpoint", type=Path, help="file to go on from; else a new one")
+    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as directory:
+        kept = run(options, options.checkpoint or Path(directory) / "checkpoint.bin")
+    found = {
+        "states": kept.states,
+        "largest_mib": kept.largest_mib,
+        "grown_mib": memory_mib() - kept.first_mib if kept.first_mib else None,
+        "seconds": kept.seconds,
+        "loops": kept.seconds / kept.bare,
+    }
+    print(json.dumps(found))
+    sys.exit(int(kept.largest_mib > GOAL_MIB))
+
+
+if __name__ == "__main__":
+    main()
