@@ -32,6 +32,7 @@ from magfusion.results.figures import Figures
 from magfusion.results.provenance import Run, recorded_as
 
 DEBUG = "--debug"
+NO_PLUGINS = "PYDANTIC_DISABLE_PLUGINS"  # otherwise looked for in every package installed
 LONGEST_REASON = 200  # characters, of an error that was not foreseen
 _NAMED_BY_LOG = "; default: the log's name and the job's"
 _NOT_WRITTEN = "; default: nothing is written"
@@ -53,6 +54,8 @@ def main(arguments: list[str] | None = None) -> None:
         gc.disable()  # until what the command needs is imported; see `_import_uncollected`
     occupy_closed()
     try:
+        if arguments is None:
+            os.environ.setdefault(NO_PLUGINS, "__all__")
         alone = without_pandas() if arguments is None else nullcontext()
         with _terminated_as_interrupted(), until_closed(), alone:
             status = application()(

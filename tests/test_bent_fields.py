@@ -9,7 +9,7 @@ from magfusion.estimation.batch import smooth
 from magfusion.estimation.measurements.field_error import FieldError
 from magfusion.estimation.measurements.model_error import alike_in_batch
 from magfusion.estimation.residual_shares import ChannelErrors, _matrices
-from magfusion.estimation.variance_components import parts_of
+from magfusion.estimation.variance_components import BeaconErrors, parts_of
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.parameters.parameter import PhasorView
 from magfusion.results.errors import trajectory_errors
@@ -52,7 +52,8 @@ def test_its_size_is_found_whether_it_is_rough_or_smooth(smooth: bool, true: flo
         )
         variance = np.full(400, 6 * NOISE**2), np.full(400, 6.0 / DECLARED**2)
         own = ChannelErrors(np.arange(400), seen, left, variance, (1.0, DECLARED))
-        parts = parts_of([own], alike_in_batch(place, LENGTH), 1, (1.0, DECLARED), bent=True)
+        given = BeaconErrors([own], (1.0, DECLARED), bent=True)
+        parts = parts_of([given], alike_in_batch(place, LENGTH), 1)[0]
         assert parts is not None
         assert parts.model is not None
         found.append(parts.model / min(parts.taken, 1.0))

@@ -14,8 +14,17 @@ from magfusion.estimation import variance_components
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.integrity.tuned_noise import tuned_noise
 from magfusion.estimation.noise_tuning import Tuned, tuned_site
+from magfusion.estimation.residual_shares import ChannelErrors
 from magfusion.estimation.solve.bounded import minimise_curved
-from magfusion.estimation.variance_components import KINDS, NORMAL, STUDENT, likeliest
+from magfusion.estimation.variance_components import (
+    KINDS,
+    NORMAL,
+    STUDENT,
+    BeaconErrors,
+    BeaconParts,
+    likeliest,
+    parts_of,
+)
 from magfusion.files.site import load_site, save_site
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
@@ -40,7 +49,7 @@ def declared(imu: float = 1.0, model: float = 1.0) -> Site:
     return replace(site, model_error=model * site.model_error, platform=platform)
 
 
-Cost = Callable[[np.ndarray], float]
+Cost = Callable[[np.ndarray], np.ndarray]
 Curved = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
@@ -153,7 +162,8 @@ def test_of_a_strong_beacon_nothing_is_found_that_was_not_declared() -> None:
     parts = np.stack([np.ones(400), over_scales, smoother, np.full(400, 1e6)])
     variance = np.array([1.0, 0.25, 0.0, 0.0]) @ parts
     square = variance * rng.chisquare(6, 400)
-    log = likeliest(square, parts, np.zeros(400), np.full(400, 0.5), 6, KINDS)
+    fixed, weight = np.zeros((1, 400)), np.full((1, 400), 0.5)
+    log = likeliest(square[None], parts[None], fixed, weight, 6, KINDS)[0]
     noise, _, _, white = np.exp(2.0 * log)[:, None] * parts
     assert np.mean(noise + white) == pytest.approx(1.0, abs=0.2)
 
@@ -164,17 +174,17 @@ def test_slope_and_curvature_of_the_likelihood_are_its_derivatives(
     asked: list[tuple[np.ndarray, np.ndarray]] = []
 
     def compare(cost: Cost, curved: Curved, start: np.ndarray, *_: object) -> np.ndarray:
-        at, step = start + 0.3, 1e-6 * np.eye(len(start))
+        at, step = start + 0.3, 1e-6 * np.eye(start.shape[1])
         slope = [(cost(at + one) - cost(at - one)) / 2e-6 for one in step]
         curvature = [(curved(at + one)[0] - curved(at - one)[0]) / 2e-6 for one in step]
-        asked.append((curved(at)[0], np.array(slope)))
-        asked.append((curved(at)[1], np.array(curvature)))
+        asked.append((curved(at)[0], np.stack(slope, axis=1)))
+        asked.append((curved(at)[1], np.stack(curvature, axis=1)))
         return start
 
     monkeypatch.setattr(variance_components, "minimise_curved", compare)
     rng = np.random.default_rng(0)
-    parts, square = rng.uniform(0.1, 2.0, (4, 50)), rng.chisquare(6, 50)
-    likeliest(square, parts, np.full(50, 0.1), np.full(50, 0.5), 6, KINDS)
+    parts, square = rng.uniform(0.1, 2.0, (2, 4, 50)), rng.chisquare(6, (2, 50))
+    likeliest(square, parts, np.full((2, 50), 0.1), np.full((2, 50), 0.5), 6, KINDS)
     assert len(asked) == 2
     for given, expected in asked:
         assert given == pytest.approx(expected, rel=1e-6)
@@ -185,23 +195,97 @@ def test_no_quasi_newton_search_finds_a_likelier_noise(monkeypatch: pytest.Monke
     behind: list[float] = []
 
     def compare(cost: Cost, curved: Curved, start: np.ndarray, limits: np.ndarray) -> np.ndarray:
-        options = {"maxiter": 500, "ftol": 1e-15, "gtol": 1e-9}
-        other = minimize(cost, start, method="L-BFGS-B", bounds=limits, options=options)
         found = minimise_curved(cost, curved, start, limits)
         assert np.all((found >= limits[:, 0]) & (found <= limits[:, 1]))
-        behind.append(cost(found) - float(other.fun))
+        options = {"maxiter": 500, "ftol": 1e-15, "gtol": 1e-9}
+        for k in range(len(start)):
+
+            def own(at: np.ndarray, k: int = k) -> float:
+                return float(cost(np.tile(at, (len(start), 1)))[k])
+
+            other = minimize(own, start[k], method="L-BFGS-B", bounds=limits, options=options)
+            behind.append(float(cost(found)[k]) - float(other.fun))
         return found
 
     monkeypatch.setattr(variance_components, "minimise_curved", compare)
-    rng = np.random.default_rng(0)
-    time = np.tile(np.arange(1, 9), 60)
-    for _ in range(20):
-        parts = np.stack([np.ones(480), 4.0 / time, 4.0 / time**2, rng.uniform(0.1, 3.0, 480)])
-        sizes = rng.permutation([1.0, 0.5, 0.0, 0.0]) * rng.uniform(0.3, 3.0, 4)
-        square = (sizes**2 @ parts + 0.1) * rng.chisquare(6, 480)
-        likeliest(square, parts, np.full(480, 0.1), np.full(480, 0.5), 6, KINDS)
+    square, parts = _many_sizes(20)
+    likeliest(square, parts, np.full((20, 480), 0.1), np.full((20, 480), 0.5), 6, KINDS)
     assert len(behind) == 20
     assert max(behind) < 1e-3  # of a log-likelihood
+
+
+def _many_sizes(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return squares of residuals, and parts of which some are there and some are not."""
+    rng = np.random.default_rng(0)
+    time = np.tile(np.arange(1, 9), 60)
+    squares, every = [], []
+    for _ in range(count):
+        parts = np.stack([np.ones(480), 4.0 / time, 4.0 / time**2, rng.uniform(0.1, 3.0, 480)])
+        sizes = rng.permutation([1.0, 0.5, 0.0, 0.0]) * rng.uniform(0.3, 3.0, 4)
+        squares.append((sizes**2 @ parts + 0.1) * rng.chisquare(6, 480))
+        every.append(parts)
+    return np.stack(squares), np.stack(every)
+
+
+def test_no_noise_found_from_the_start_is_likelier_than_from_what_was_found_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Before, that is, with other weights, by which some parts came to nothing."""
+    costs: list[np.ndarray] = []
+
+    def kept(cost: Cost, curved: Curved, start: np.ndarray, limits: np.ndarray) -> np.ndarray:
+        found = minimise_curved(cost, curved, start, limits)
+        costs.append(cost(found))
+        return found
+
+    monkeypatch.setattr(variance_components, "minimise_curved", kept)
+    square, parts = _many_sizes(40)
+    fixed, weight = np.full((40, 480), 0.1), np.full((40, 480), 0.5)
+    weight[:, ::2] = 0.1
+    before = likeliest(square, parts, fixed, weight, 6, KINDS)
+    assert np.any(before[:, 2] < -9.0)
+    weight[:, ::2] = 0.5
+    likeliest(square, parts, fixed, weight, 6, KINDS)
+    likeliest(square, parts, fixed, weight, 6, KINDS, before)
+    assert np.max(costs[2] - costs[1]) < 1e-3  # of a log-likelihood
+
+
+def test_searches_side_by_side_know_nothing_of_each_other() -> None:
+    square, parts = _many_sizes(6)
+    fixed, weight = np.full((6, 480), 0.1), np.full((6, 480), 0.5)
+    together = likeliest(square, parts, fixed, weight, 6, KINDS)
+    for k in range(6):
+        one = slice(k, k + 1)
+        alone = likeliest(square[one], parts[one], fixed[one], weight[one], 6, KINDS)
+        assert together[one] == pytest.approx(alone, abs=1e-9)
+
+
+def test_rows_that_a_beacon_has_more_than_another_change_nothing() -> None:
+    rng = np.random.default_rng(0)
+
+    def errors(count: int) -> BeaconErrors:
+        noise, rough, smooth, inertial = rng.normal(size=(4, count, 6))
+        left = noise, 0.3 * rough, 0.3 * smooth, 0.1 * inertial
+        variance = np.full(count, 6.0), rng.uniform(1.0, 50.0, count)
+        seen = rng.normal(size=(count, 6)) * 1.5
+        channel = ChannelErrors(np.arange(count), seen, left, variance, (1.0, 0.01))
+        return BeaconErrors([channel], (1.0, 0.01), bent=True)
+
+    several = [errors(160), errors(80), replace(errors(120), bent=False), errors(4)]
+    alike = np.full(160, 10.0)
+    together = parts_of(several, alike, 1)
+    assert together[3] is None
+    assert together[2] is not None
+    assert together[2].model is None
+    for one, beside in zip(several, together, strict=True):
+        alone = parts_of([one], alike, 1)[0]
+        assert (alone is None) == (beside is None)
+        if alone is not None and beside is not None:
+            assert _numbers(beside) == pytest.approx(_numbers(alone), rel=1e-9)
+
+
+def _numbers(part: BeaconParts) -> list[float]:
+    return [part.white, part.model or 0.0, part.smooth, part.taken]
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from magfusion.estimation.log_graph import PreparedLog, overlap
 from magfusion.estimation.measurements.model_error import alike_in_batch
 from magfusion.estimation.motion_compensation import MotionCompensated
 from magfusion.estimation.residual_shares import ChannelErrors, Leavings
-from magfusion.estimation.variance_components import BeaconParts, likeliest, parts_of
+from magfusion.estimation.variance_components import BeaconErrors, likeliest, parts_of
 from magfusion.model.parameters import Block, Calibration
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
@@ -151,18 +151,18 @@ def tune(
     now = estimate.calibration.site
     lag = max(1, round(windows))
     prior = declared.beacons
-    parts: dict[int, BeaconParts] = {}
-    self_made: dict[int, bool] = {}
+    errors: list[BeaconErrors] = []
+    self_made: list[bool] = []
     for i in range(len(now.beacons)):
         channels = [_without(channel, blind) for channel in system.channels_of(i)]
         own = prior[i].model_error
         usual = declared.model_error if own is None else own
-        sizes = prior[i].noise_factor, usual
         mapped = now.beacons[i].field_map is not None
-        found = parts_of(channels, alike, lag, sizes, bent=not mapped and usual > 0.0)
-        if found is not None:
-            parts[i] = found
-            self_made[i] = not declared.platform.inertial and _left_of_noise(channels) < SELF_MADE
+        sizes = prior[i].noise_factor, usual
+        errors.append(BeaconErrors(channels, sizes, bent=not mapped and usual > 0.0))
+        self_made.append(not declared.platform.inertial and _left_of_noise(channels) < SELF_MADE)
+    found = parts_of(errors, alike, lag)
+    parts = {i: part for i, part in enumerate(found) if part is not None}
     # Rare large errors say little, which makes those of a whole log seem smaller than they are.
     taken = [part.taken for part in parts.values() if part.model is not None]
     less = float(np.exp(np.mean(np.log(taken)))) if taken else 1.0
@@ -220,11 +220,11 @@ def _tuned_imu(system: Leavings, now: Site, declared: Site, smooth: float) -> li
         if not np.any(here) or every[2] < LEFT:
             continue
         count = int(np.sum(here))
-        known = np.full((1, count), every[2] * (before / usual) ** 2)
-        fixed = np.full(count, every[0] + every[1])
+        known = np.full((1, 1, count), every[2] * (before / usual) ** 2)
+        fixed = np.full((1, count), every[0] + every[1])
         # Neighbours in time share what is left of them.
-        weight = np.full(count, min(1.0, (every[2] + fixed[0]) ** 2 / every[2]))
-        log = likeliest(square[here], known, fixed, weight, 3)
+        weight = np.full((1, count), min(1.0, (every[2] + fixed[0, 0]) ** 2 / every[2]))
+        log = likeliest(square[here][None], known, fixed, weight, 3)[0]
         # What is declared below these holds scale and vibration too, which are not white.
         found.append(Tuned(owner, name, before, float(before * np.exp(max(log[0], 0.0)))))
     return found

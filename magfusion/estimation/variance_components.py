@@ -52,37 +52,47 @@ class BeaconParts:
     taken: float = 1.0
 
 
-def parts_of(
-    channels: list[ChannelErrors],
-    alike: Array,
-    lag: int,
-    sizes: tuple[float, float],
-    *,
-    bent: bool,
-) -> BeaconParts | None:
-    """Return what a beacon's residuals are made of; None where there are too few.
+@dataclass(frozen=True, eq=False)
+class BeaconErrors:
+    """Errors of all channels of one beacon.
 
     Parameters
     ----------
     channels : list of ChannelErrors
-        Of the beacon.
-    alike : ndarray, shape (n,)
-        How many epochs have the same model error.
-    lag : int
-        Epochs that share samples.
     sizes : tuple of float
         Noise factor and model error as declared.
     bent : bool
         Whether a model error is looked for.
     """
-    log, white = _fitted(channels, alike, lag, sizes, bent)
-    if not len(log) or not bent:
-        return BeaconParts(sizes, white) if len(log) else None
-    model, smooth = _total(log), float(np.exp(2.0 * (log[2] - _logarithm(log[1:3]))))
-    factors = [white * sizes[0], *(np.exp(log[1:3]) * sizes[1])]
-    drawn = [_drawn(own, factors) for own in channels]
-    again, _ = _fitted(drawn, alike, lag, sizes, bent)
-    return BeaconParts(sizes, white, model, smooth, _total(again) / model)
+
+    channels: list[ChannelErrors]
+    sizes: tuple[float, float]
+    bent: bool
+
+
+def parts_of(beacons: Sequence[BeaconErrors], alike: Array, lag: int) -> list[BeaconParts | None]:
+    """Return what the residuals of each beacon are made of; None where there are too few.
+
+    Parameters
+    ----------
+    alike : ndarray, shape (n,)
+        How many epochs have the same model error.
+    lag : int
+        Epochs that share samples.
+    """
+    fitted = _fitted(beacons, alike, lag)
+    bent = [k for k, (log, _) in enumerate(fitted) if len(log) and beacons[k].bent]
+    drawn = [_drawn(beacons[k], *fitted[k]) for k in bent]
+    again = dict(zip(bent, _fitted(drawn, alike, lag), strict=True))
+    found: list[BeaconParts | None] = []
+    for k, (log, white) in enumerate(fitted):
+        if k in again:
+            model, smooth = _total(log), float(np.exp(2.0 * (log[2] - _logarithm(log[1:3]))))
+            taken = _total(again[k][0]) / model
+            found.append(BeaconParts(beacons[k].sizes, white, model, smooth, taken))
+        else:
+            found.append(BeaconParts(beacons[k].sizes, white) if len(log) else None)
+    return found
 
 
 def _total(log: Array) -> float:
@@ -94,40 +104,74 @@ def _logarithm(log: Array) -> float:
     return float(0.5 * np.logaddexp.reduce(2.0 * log))
 
 
-def _drawn(own: ChannelErrors, factors: Sequence[float]) -> ChannelErrors:
+def _drawn(beacon: BeaconErrors, log: Array, white: float) -> BeaconErrors:
     """Return errors that were drawn, of these sizes, in the place of those seen."""
-    noise, rough, smooth, inertial = own.left
-    of_noise, of_rough, of_smooth = factors
-    size, model = own.size
-    bent = (of_rough * rough + of_smooth * smooth) / model
-    return replace(own, seen=of_noise / size * noise + bent + inertial)
+    of_noise, usual = white * beacon.sizes[0], beacon.sizes[1]
+    of_rough, of_smooth = np.exp(log[1:3]) * usual
+    drawn = []
+    for own in beacon.channels:
+        noise, rough, smooth, inertial = own.left
+        size, model = own.size
+        bent = (of_rough * rough + of_smooth * smooth) / model
+        drawn.append(replace(own, seen=of_noise / size * noise + bent + inertial))
+    return replace(beacon, channels=drawn)
 
 
-def _fitted(
-    channels: list[ChannelErrors], alike: Array, lag: int, sizes: tuple[float, float], bent: bool
-) -> tuple[Array, float]:
+def _fitted(beacons: Sequence[BeaconErrors], alike: Array, lag: int) -> list[tuple[Array, float]]:
     """Return logarithms of the factors of all parts, and the factor of all that is white."""
-    square, expected, near = by_scale(channels, alike, lag)
-    if not len(square):
-        return np.zeros(0), 1.0
-    noise, usual = sizes
-    known = np.array([noise, usual, usual, usual])[:, None] ** 2 * expected[:4]
-    fixed, weight = expected[4], np.full(len(square), 1.0 / lag)
+    scaled = [by_scale(beacon.channels, alike, lag) for beacon in beacons]
+    found = [(np.zeros(0), 1.0)] * len(beacons)
+    for bent in (False, True):
+        chosen = [k for k, b in enumerate(beacons) if b.bent == bent and len(scaled[k][0])]
+        if chosen:
+            sizes = np.array([beacons[k].sizes for k in chosen])
+            several = _fitted_alike([scaled[k] for k in chosen], sizes, lag, bent)
+            for k, one in zip(chosen, several, strict=True):
+                found[k] = one
+    return found
+
+
+def _fitted_alike(
+    scaled: list[tuple[Array, Array, Array]], sizes: Array, lag: int, bent: bool
+) -> list[tuple[Array, float]]:
+    """Return what `_fitted` does, of beacons that have the same parts.
+
+    Parameters
+    ----------
+    scaled : list of tuple
+        By `by_scale`, of each beacon.
+    sizes : ndarray, shape (k, 2)
+    """
+    most = max(len(square) for square, _, _ in scaled)
+    square, near = np.zeros((len(scaled), most)), np.ones((len(scaled), most))
+    expected, weighed = np.zeros((len(scaled), 5, most)), np.zeros((len(scaled), most))
+    expected[:, 4] = 1.0  # of rows that a beacon does not have, whose weight is none
+    for k, (seen, parts, close) in enumerate(scaled):
+        rows = slice(0, len(seen))
+        square[k, rows], expected[k, :, rows], near[k, rows] = seen, parts, close
+        weighed[k, rows] = 1.0 / lag
+    known, fixed, weight = (
+        sizes[:, [0, 1, 1, 1], None] ** 2 * expected[:, :4],
+        expected[:, 4],
+        weighed,
+    )
     if not bent:
-        known, fixed = known[:1], fixed + known[1]
+        known, fixed = known[:, :1], fixed + known[:, 1]
     log: Array | None = None
     for _ in range(WEIGHINGS):
         log = likeliest(square, known, fixed, weight, 6, KINDS if bent else KINDS[:1], log)
-        parts = np.exp(2.0 * log)[:, None] * known
-        of_model = np.sum(parts[1:3], axis=0) if bent else fixed
-        of_model = of_model / (np.sum(parts, axis=0) + fixed)
-        weight = (1.0 - of_model + of_model * near) / lag
+        parts = np.exp(2.0 * log)[:, :, None] * known
+        of_model = np.sum(parts[:, 1:3], axis=1) if bent else fixed
+        of_model = of_model / (np.sum(parts, axis=1) + fixed)
+        weight = (1.0 - of_model + of_model * near) * weighed
     # What is white but goes with the field, as of a jitter among gradients, is noise all told.
-    white = float(np.sum(parts[::3]) / np.sum(known[0]))
+    usual = np.sum(known[:, 0], axis=1)
+    white = np.sum(parts[:, ::3], axis=(1, 2)) / usual
     # Of a strong beacon less noise than declared is not to be told from a little model error.
-    unsure = LEAST**2 * float(np.sum(known[3:]) / np.sum(known[0]))
+    unsure = LEAST**2 * np.sum(known[:, 3:], axis=(1, 2)) / usual
     assert log is not None
-    return log, float(np.sqrt(max(white, min(white + unsure, 1.0))))
+    white = np.sqrt(np.maximum(white, np.minimum(white + unsure, 1.0)))
+    return list(zip(log, white.tolist(), strict=True))
 
 
 def by_scale(channels: list[ChannelErrors], alike: Array, lag: int) -> tuple[Array, Array, Array]:
@@ -146,31 +190,30 @@ def by_scale(channels: list[ChannelErrors], alike: Array, lag: int) -> tuple[Arr
     near : ndarray, shape (m,)
         Share of it that is independent, where model error prevails.
     """
-    squares, parts, nears = [np.zeros(0)], [np.zeros((5, 0))], [np.zeros(0)]
-    for scale in _haar(SCALES):
-        seen, left, given = [], [], []
-        for own in channels:
-            used = len(own.seen) // (SCALES * lag) * SCALES * lag
-            shape = (-1, SCALES, lag)
-            rows = [
-                np.einsum("s,bslk->blk", scale, v[:used].reshape(*shape, 6)).reshape(-1, 6)
-                for v in (own.seen, *own.left)
-            ]
-            seen.append(np.sum(rows[0] ** 2, axis=1))
-            left.append([np.sum(row**2, axis=1) for row in rows[1:]])
-            given.append([np.mean(v[:used].reshape(shape), axis=1).ravel() for v in own.variance])
-            close = np.mean(alike[own.epoch][:used].reshape(shape), axis=1).ravel()
-            nears.append(np.minimum(SCALES * lag / close, 1.0))
-        kept, drawn = np.concatenate(left, axis=1), np.concatenate(given, axis=1)
-        # Of a wrong motion too, a stronger field has more.
-        drawn = np.stack([*drawn, drawn[1], drawn[1]])
-        noise, model = channels[0].size
-        total = np.array([noise, model, model, 1.0]) ** 2 * np.sum(drawn, axis=1)
-        share = np.divide(np.sum(kept, axis=1), total, out=np.ones(4), where=total > 0.0)
-        squares += seen
-        rows = share[:, None] * drawn / 6.0
-        parts.append(np.stack([*rows[:3], share[0] * drawn[1] / 6.0, rows[3]]))
-    return np.concatenate(squares), np.concatenate(parts, axis=1), np.concatenate(nears)
+    every, seen, left, given, near = _haar(SCALES), [], [], [], []
+    for own in channels:
+        used = len(own.seen) // (SCALES * lag) * SCALES * lag
+        shape = (-1, SCALES, lag)
+        squares = []
+        for v in (own.seen, *own.left):
+            rows = np.einsum("hs,bslk->hblk", every, v[:used].reshape(*shape, 6))
+            squares.append(np.sum(rows**2, axis=3).reshape(SCALES, -1))
+        seen.append(squares[0])
+        left.append(np.stack(squares[1:]))
+        given.append([np.mean(v[:used].reshape(shape), axis=1).ravel() for v in own.variance])
+        close = np.mean(alike[own.epoch][:used].reshape(shape), axis=1).ravel()
+        near.append(np.minimum(SCALES * lag / close, 1.0))
+    drawn = np.concatenate(given, axis=1)
+    # Of a wrong motion too, a stronger field has more.
+    drawn = np.stack([*drawn, drawn[1], drawn[1]])
+    noise, model = channels[0].size
+    total = np.array([noise, model, model, 1.0]) ** 2 * np.sum(drawn, axis=1)
+    kept = np.sum(np.concatenate(left, axis=2), axis=2)
+    share = np.divide(kept, total[:, None], out=np.ones((4, SCALES)), where=total[:, None] > 0.0)
+    parts = share[:, :, None] * drawn[:, None] / 6.0
+    white = share[0][:, None] * drawn[1] / 6.0
+    expected = np.stack([*parts[:3], white, parts[3]]).reshape(5, -1)
+    return np.concatenate(seen, axis=1).ravel(), expected, np.tile(np.concatenate(near), SCALES)
 
 
 @cache
@@ -194,60 +237,75 @@ def likeliest(
 ) -> Array:
     """Return the logarithm of what each part's standard deviation is too small by.
 
+    Of each of k beacons, or whatever else has residuals of its own.
+
     Parameters
     ----------
-    square : ndarray, shape (m,)
+    square : ndarray, shape (k, m)
         Squared norms of residuals.
-    parts : ndarray, shape (kinds, m)
+    parts : ndarray, shape (k, kinds, m)
         Expected square of a component by each kind of noise, as declared.
-    fixed : ndarray, shape (m,)
+    fixed : ndarray, shape (k, m)
         And by all else.
-    weight : ndarray, shape (m,)
+    weight : ndarray, shape (k, m)
         Of each: how much of it is independent.
     components : int
         Of each residual.
     kinds : sequence of slice
         Parts of which one sigma was declared for all together.  Of the others nothing was: there
         may be none of them.
-    near : ndarray, shape (kinds,), optional
-        What was found with other weights: the search begins there, but never of next to nothing,
-        where the cost has no slope.
+    near : ndarray, shape (k, kinds), optional
+        What was found with other weights: the search begins there.  A part of next to nothing,
+        where the cost has no slope, begins as a little one, unless a little were less likely.
+
+    Returns
+    -------
+    ndarray, shape (k, kinds)
     """
-    start, least = np.full(len(parts), np.log(LEAST)), np.full(len(parts), NONE)
+    count = parts.shape[1]
+    first, least = np.full(count, np.log(LEAST)), np.full(count, NONE)
     for kind in kinds:
-        start[kind] = -0.5 * np.log(kind.stop - kind.start)
+        first[kind] = -0.5 * np.log(kind.stop - kind.start)
         least[kind.start] = LEAST
-    if near is not None:
-        start = np.maximum(near, np.log(LEAST))
     gain, width = NORMAL[components], STUDENT + components
 
     scaled = gain * square
     reach, constant = scaled / STUDENT, width * scaled
+    diagonal = np.arange(count)
 
-    def cost(log: Array) -> float:
+    def cost(log: Array) -> Array:
         squares = np.exp(2.0 * log)
-        variance = squares @ parts + fixed
+        variance = (squares[:, None] @ parts)[:, 0] + fixed
         bounded = width * np.log1p(reach / variance)
-        likelihood = 0.5 * float(weight @ (components * np.log(variance) + bounded))
-        priors = [np.log(np.sum(squares[kind])) / PRIOR for kind in kinds]
-        return likelihood + 0.125 * float(np.sum(np.square(priors)))
+        likelihood = 0.5 * np.einsum("km,km->k", weight, components * np.log(variance) + bounded)
+        for kind in kinds:
+            prior = np.log(np.sum(squares[:, kind], axis=1)) / PRIOR
+            likelihood = likelihood + 0.125 * prior**2
+        return np.asarray(likelihood)
 
     def curved(log: Array) -> tuple[Array, Array]:
         squares = np.exp(2.0 * log)
-        by = squares[:, None] * parts
-        variance = np.sum(by, axis=0) + fixed
+        by = squares[:, :, None] * parts
+        variance = np.sum(by, axis=1) + fixed
         heavy = STUDENT * variance + scaled
         left = (components - constant / heavy) / variance
         bend = (STUDENT * constant / heavy**2 - left) / variance
-        slope = by @ (weight * left)
-        curvature = 2.0 * (by * (weight * bend)) @ by.T + np.diag(2.0 * slope)
+        slope = (by @ (weight * left)[:, :, None])[:, :, 0]
+        curvature = 2.0 * (by * (weight * bend)[:, None]) @ np.swapaxes(by, 1, 2)
+        curvature[:, diagonal, diagonal] += 2.0 * slope
         for kind in kinds:
-            total = float(np.sum(squares[kind]))
-            share, off = squares[kind] / total, 0.5 * np.log(total) / PRIOR**2
-            slope[kind] += off * share
-            curvature[kind, kind] += 2.0 * off * np.diag(share)
-            curvature[kind, kind] += (1.0 / PRIOR**2 - 2.0 * off) * np.outer(share, share)
+            total = np.sum(squares[:, kind], axis=1, keepdims=True)
+            share, off = squares[:, kind] / total, 0.5 * np.log(total) / PRIOR**2
+            slope[:, kind] += off * share
+            curvature[:, diagonal[kind], diagonal[kind]] += 2.0 * off * share
+            outer = share[:, :, None] * share[:, None, :]
+            curvature[:, kind, kind] += (1.0 / PRIOR**2 - 2.0 * off)[:, :, None] * outer
         return slope, curvature
 
-    limits = np.log(np.stack([least, np.full(len(parts), MOST)], axis=1))
+    start = np.tile(first, (len(parts), 1))
+    if near is not None:
+        little = np.log(LEAST)
+        stays = (near < little) & (curved(near)[0] > 0.0)
+        start = np.where(stays, near, np.maximum(near, little))
+    limits = np.log(np.stack([least, np.full(count, MOST)], axis=1))
     return minimise_curved(cost, curved, start, limits)

@@ -114,8 +114,9 @@ class RowFile:
         self._write()
         with pa.ipc.open_stream(self.path) as reader:
             table = reader.read_all()
+        # Whole and without nulls; to flatten them would import pyarrow's functions for tables.
         return {
-            name: table.column(name).combine_chunks().flatten().to_numpy().reshape(-1, size)
+            name: table.column(name).combine_chunks().values.to_numpy().reshape(-1, size)
             for name, size in self.columns.items()
         }
 

@@ -1,6 +1,7 @@
 """YAML is checked against a model before it is believed."""
 
 import re
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
@@ -117,7 +118,9 @@ def _text(path: Path) -> str:
     return text
 
 
+@lru_cache(maxsize=2)
 def _parse(text: str, path: Path) -> object:
+    """Return what a text says; a site is read by a job and before it is known which job it is."""
     try:
         return yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:

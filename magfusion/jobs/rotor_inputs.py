@@ -1,12 +1,17 @@
 """What a job needs to know of beacons that are magnets on shafts."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from magfusion.errors import InputError
 from magfusion.files.drive_columns import beacon_of
-from magfusion.files.stream import Record
 from magfusion.model.samples import Log
 from magfusion.model.site import Beacon, Site
+
+if TYPE_CHECKING:
+    from magfusion.files.stream import Record
 
 PATIENCE = 2.0  # s of samples in a stream, after which the angle of a rotor is missed
 ALL = ""  # as the name of a current that flows through the coils of all

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from magfusion.units import Array
+from magfusion.units import Array, BoolArray
 
 DECREASE = 1e-6  # of the cost; the step that lowers it by less is the last
 DECREASE_CURVED = 1e-9  # relative; the step of Newton that lowers a cost by less is the last
@@ -56,66 +56,86 @@ def minimise_bounded(
 
 
 def minimise_curved(
-    cost: Callable[[Array], float],
+    cost: Callable[[Array], Array],
     curved: Callable[[Array], tuple[Array, Array]],
     start: Array,
     limits: Array,
 ) -> Array:
-    """Return where a cost of logarithms of sigmas is least, by a projected Newton method.
+    """Return where costs of logarithms of sigmas are least, by a projected Newton method.
 
     Bertsekas, SIAM J. Control Optim. 20, 1982, with the absolute eigenvalues of the curvature, so
     that saddles are left.  For searches of a few unknowns by the hundred, of which SciPy's own
-    bookkeeping takes several times what the costs do.
+    bookkeeping takes several times what the costs do, and ours as much as they; so searches that
+    know nothing of each other go side by side.
 
     Parameters
     ----------
+    cost : callable
+        Returns the cost of each search, shape (k,), at an ndarray of shape (k, n).
     curved : callable
-        Returns gradient, shape (n,), and curvature, shape (n, n), at an ndarray of shape (n,).
-    start : ndarray, shape (n,)
+        Returns gradients, shape (k, n), and curvatures, shape (k, n, n).
+    start : ndarray, shape (k, n)
     limits : ndarray, shape (n, 2)
         Least and greatest value of each unknown.
     """
     low, high = limits.T
     at = np.clip(start, low, high)
-    here = cost(at)
+    here, going = cost(at), np.ones(len(at), dtype=bool)
     for _ in range(MOST_STEPS):
         slope, curvature = curved(at)
         free = ~((at <= low) & (slope > 0.0) | (at >= high) & (slope < 0.0))
-        if not np.any(free):
+        going &= np.any(free, axis=1)
+        if not np.any(going):
             break
-        step = np.zeros_like(at)
-        step[free] = _downhill(slope[free], curvature[np.ix_(free, free)])
-        step *= LONGEST / max(float(np.max(np.abs(step))), LONGEST)
-        last = -0.5 * float(slope @ step) < DECREASE_CURVED * max(abs(here), 1.0)
+        step = _downhill(free * slope, curvature * (free[:, :, None] & free[:, None, :])) * free
+        step *= (LONGEST / np.maximum(np.max(np.abs(step), axis=1), LONGEST))[:, None]
+        promised = -0.5 * np.einsum("kn,kn->k", slope, step)
+        last = promised < DECREASE_CURVED * np.maximum(np.abs(here), 1.0)
         # By the logarithm of a variance that comes to nothing a step is a half, again and again.
         # Before the others are found it may yet be wanted, and does not come back from there.
         falling = free & (slope > 0.0)
-        falling &= np.abs(np.diagonal(curvature) - 2.0 * slope) < LINEAR * slope
-        if np.any(falling) and np.all(np.abs(step[~falling]) < FOUND):
-            step[falling] = (low - at)[falling]
-            last = False
-        found = False
-        while not found and np.any(np.abs(step) > SHORTEST):
-            tried = np.clip(at + step, low, high)
-            there = cost(tried)
-            found = there <= here + SUFFICIENT * min(float(slope @ step), 0.0)
-            step *= 0.5
-        if not found:
-            break
-        at, here = tried, there
-        if last:
-            break
+        diagonal = np.einsum("knn->kn", curvature)
+        falling &= np.abs(diagonal - 2.0 * slope) < LINEAR * slope
+        fallen = np.any(falling, axis=1) & np.all(falling | (np.abs(step) < FOUND), axis=1)
+        step = np.where(falling & fallen[:, None], low - at, step)
+        last &= ~fallen
+        at, here, going = _gone(cost, at, here, step, slope, low, high, going)
+        going &= ~last
     return at
 
 
+def _gone(
+    cost: Callable[[Array], Array],
+    at: Array,
+    here: Array,
+    step: Array,
+    slope: Array,
+    low: Array,
+    high: Array,
+    going: BoolArray,
+) -> tuple[Array, Array, BoolArray]:
+    """Return where searches are after so much of a step as goes down, the cost, and which went."""
+    left, gone = going.copy(), np.zeros(len(at), dtype=bool)
+    while True:
+        left &= np.any(np.abs(step) > SHORTEST, axis=1)
+        if not np.any(left):
+            return at, here, gone
+        tried = np.clip(at + step, low, high)
+        there = cost(tried)
+        promised = SUFFICIENT * np.minimum(np.einsum("kn,kn->k", slope, step), 0.0)
+        found = left & (there <= here + promised)
+        at, here = np.where(found[:, None], tried, at), np.where(found, there, here)
+        left, gone, step = left & ~found, gone | found, 0.5 * step
+
+
 def _downhill(slope: Array, curvature: Array) -> Array:
-    """Return Newton's step with the absolute eigenvalues of a curvature."""
+    """Return Newton's steps with the absolute eigenvalues of curvatures."""
     size, axes = np.linalg.eigh(curvature)
     size = np.abs(size)
-    floor = float(np.max(size)) * FLATTEST
-    if floor == 0.0:
-        return -slope
-    return np.asarray(-axes @ ((axes.T @ slope) / np.maximum(size, floor)))
+    floor = np.max(size, axis=1, keepdims=True) * FLATTEST
+    size = np.maximum(size, np.where(floor > 0.0, floor, 1.0))
+    along = np.einsum("kij,ki->kj", axes, slope) / size
+    return np.asarray(-np.einsum("kij,kj->ki", axes, along))
 
 
 def minimise_between(
