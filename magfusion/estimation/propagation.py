@@ -9,7 +9,7 @@ from magfusion.estimation.imu_decimation import thinned
 from magfusion.estimation.inertial import Link, Preintegrated, Steps, inertial_factor, links_between
 from magfusion.estimation.preintegration import cut_at_epochs
 from magfusion.estimation.process_noise import ProcessNoise
-from magfusion.estimation.state import MOTION, State, pose_of, values_of
+from magfusion.estimation.state import MOTION, State, values_of
 from magfusion.model.parameters import Block, Calibration, corrected_imu
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
@@ -80,7 +80,7 @@ def propagate(
     epochs = np.array([state.time, time])
     accel, gyro = state.accel_bias_body, state.gyro_bias_body
     bias = gtsam.imuBias.ConstantBias(accel, gyro)
-    before = gtsam.NavState(pose_of(state), state.velocity_world)
+    before = gtsam.NavState(state.pose, state.velocity_world)
 
     def steps(calibration: Calibration) -> Steps:
         stream = corrected_imu(calibration, blocks, imu)

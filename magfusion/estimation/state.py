@@ -6,7 +6,7 @@ Tangent: rotation and position (body axes, right perturbation of the pose, GTSAM
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import gtsam
 import numpy as np
@@ -46,6 +46,11 @@ class State:
     calibration: Calibration
     cov: Array
 
+    @cached_property
+    def pose(self) -> gtsam.Pose3:
+        """The pose as GTSAM has it."""
+        return gtsam.Pose3(gtsam.Rot3(self.world_from_body), self.position_world)
+
     @property
     def position_sigma(self) -> float:
         """Standard deviation of the position, largest axis (m)."""
@@ -57,15 +62,10 @@ class State:
         return float(np.sqrt(np.max(np.linalg.eigvalsh(self.cov[ROTATION, ROTATION]))))
 
 
-def pose_of(state: State) -> gtsam.Pose3:
-    """Return the pose as GTSAM has it."""
-    return gtsam.Pose3(gtsam.Rot3(state.world_from_body), state.position_world)
-
-
 def values_of(states: list[State]) -> gtsam.Values:
     """Return states as a graph takes them: pose X(i), velocity V(i) and bias B(i) of each."""
     biases = [np.concatenate([s.accel_bias_body, s.gyro_bias_body]) for s in states]
-    poses = [pose_of(state) for state in states]
+    poses = [state.pose for state in states]
     return values_from(poses, [state.velocity_world for state in states], biases)
 
 
@@ -107,7 +107,7 @@ def moved(state: State, blocks: tuple[Block, ...], step: Array) -> State:
 
 def moved_to(state: State, calibration: Calibration, step: Array) -> State:
     """Return the state with its motion moved by a tangent vector (15,), and another calibration."""
-    pose = pose_of(state).retract(step[:6])
+    pose = state.pose.retract(step[:6])
     return replace(
         state,
         world_from_body=pose.rotation().matrix(),
@@ -123,7 +123,7 @@ def between(reference: State, state: State, blocks: tuple[Block, ...]) -> Array:
     """Return the tangent vector that takes ``reference`` to ``state``: the inverse of `moved`."""
     return np.concatenate(
         [
-            pose_of(reference).localCoordinates(pose_of(state)),
+            reference.pose.localCoordinates(state.pose),
             state.velocity_world - reference.velocity_world,
             state.accel_bias_body - reference.accel_bias_body,
             state.gyro_bias_body - reference.gyro_bias_body,

@@ -17,7 +17,7 @@ from magfusion.estimation.carried import (
 from magfusion.estimation.held_motion import HeldMotion
 from magfusion.estimation.input_queue import Arrivals
 from magfusion.estimation.integrity.bank import SubsetBank
-from magfusion.estimation.integrity.judgement import JudgedState, Judgement, told_cov
+from magfusion.estimation.integrity.judgement import JudgedState, Judgement, judged_state, parts_of
 from magfusion.estimation.integrity.levels import Levels
 from magfusion.estimation.navigator_settings import NavigatorSettings
 from magfusion.estimation.prior_ahead import ahead_by_prior
@@ -174,9 +174,8 @@ class StateOfNow:
                 self._blend.told(state) if self._blend.length > 0.0 else (state, np.zeros(9))
             )
             judgement = _wider(said.judgement, more, step)
-            told = vars(own) | {"cov": told_cov(own, judgement), "judgement": judgement}
-            counter, epoch = said.reset_counter, departure.state.time
-            found.append(CarriedState(**told, reset_counter=counter, epoch=epoch))
+            told = judged_state(own, judgement, said.reset_counter)
+            found.append(CarriedState(**parts_of(told), epoch=departure.state.time))
         return found
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.preintegration import preintegration_parameters
-from magfusion.estimation.state import ACCEL_BIAS, GYRO_BIAS, State, pose_of
+from magfusion.estimation.state import ACCEL_BIAS, GYRO_BIAS, State
 from magfusion.files.atomic import abandoned_pattern
 from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
 from magfusion.files.row_file import Mark, RowFile, claim_rows
@@ -245,7 +245,7 @@ def state_errors(states: list[State], truth: Trajectory, measured: BoolArray) ->
     for i, state in enumerate(states):
         true = gtsam.Pose3(gtsam.Rot3(truth.world_from_body[i]), truth.position_world[i])
         own = np.empty(15)
-        own[:6] = true.localCoordinates(pose_of(state))
+        own[:6] = true.localCoordinates(state.pose)
         own[6:9] = state.velocity_world - truth.velocity_world[i]
         own[ACCEL_BIAS] = state.accel_bias_body - truth.accel_bias_body[i]
         own[GYRO_BIAS] = state.gyro_bias_body - truth.gyro_bias_body[i]

@@ -162,8 +162,8 @@ class SubsetBank:
 
     def _taken(self, jacobian: Array, owner: IntArray) -> Array:
         """Return the rows that every filter takes in, zero of what it leaves out."""
-        others = [owner != group for group in range(self.groups)]
-        kept = np.stack([np.ones(len(owner), dtype=bool), *others])
+        # The first filter leaves nobody out.
+        kept = np.arange(-1, self.groups)[:, None] != np.where(owner < 0, self.groups, owner)
         return np.where(kept[:, :, None], jacobian, 0.0)
 
     def _leave_out_together(

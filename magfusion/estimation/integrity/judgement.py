@@ -1,6 +1,7 @@
 """What is said of one state online, and the state with a covariance that it allows."""
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -131,6 +132,15 @@ def told_cov(state: State, judgement: Judgement) -> Array:
 
 def judged_state(state: State, judgement: Judgement, reset_counter: int = 0) -> JudgedState:
     """Return a state of an estimator as it is told."""
-    own = {field.name: getattr(state, field.name) for field in fields(State)}
     told = {"cov": told_cov(state, judgement), "judgement": judgement}
+    own = {name: getattr(state, name) for name in _OF_STATE}
     return JudgedState(**own | told | {"reset_counter": reset_counter})
+
+
+def parts_of(state: JudgedState) -> dict[str, Any]:
+    """Return the fields of a state by their names, to make one of another kind with them."""
+    return {name: getattr(state, name) for name in _OF_JUDGED}
+
+
+_OF_STATE = tuple(field.name for field in fields(State))
+_OF_JUDGED = tuple(field.name for field in fields(JudgedState))

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from magfusion.estimation.integrity.judgement import Judgement
-from magfusion.estimation.state import State, pose_of
+from magfusion.estimation.state import State
 from magfusion.model.trust import Verdict
 
 UNEXPLAINED = float(chdtri(6, 1e-6))  # squared jump of a pose in units of what it was known to
@@ -54,6 +54,6 @@ class Resets:
 
 def unexplained(predicted: State, state: State, before: Judgement) -> bool:
     """Tell whether a pose moved by more than it was known to, at one time."""
-    step = pose_of(predicted).localCoordinates(pose_of(state))
+    step = predicted.pose.localCoordinates(state.pose)
     cov = before.honest(predicted.cov)[:6, :6]
     return bool(step @ np.linalg.solve(cov, step) > UNEXPLAINED)
