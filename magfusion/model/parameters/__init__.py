@@ -226,10 +226,10 @@ def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) ->
     if not step.any():
         return calibration
     own = np.array(step)  # GTSAM's vectors are read-only
-    last = int(own.nonzero()[0][-1])  # what is only considered does not move, and is behind
+    last = int(own.nonzero()[0][-1])  # what is only considered does not move
     for block in blocks:
         if block.columns.start > last:
-            break
+            continue
         part = own[block.columns]
         if part.any():
             calibration = block.parameter.moved(calibration, block.owner, part)
