@@ -35,8 +35,8 @@ GOAL_MIB = 4096.0
 
 
 @dataclass(frozen=True, eq=False)
-class Hour:
-    """What a run keeps beside its navigator."""
+class Kept:
+    """What a run keeps beside its navigator: the squared errors (m^2) of the hour, and of all."""
 
     biases: Biases
     seconds: float = 0.0
@@ -44,6 +44,7 @@ class Hour:
     largest_mib: float = 0.0
     states: int = 0
     first_mib: float = 0.0
+    squares: float = 0.0
     errors: list[float] = field(default_factory=list)
 
 
@@ -70,7 +71,7 @@ def pieces(time_s: Array, first: float) -> Iterator[slice]:
     yield from (slice(*pair) for pair in pairwise(edges.tolist()))
 
 
-def run(options: argparse.Namespace, place: Path) -> Hour:
+def run(options: argparse.Namespace, place: Path) -> Kept:
     """Navigate through the hours that are left; return what came of all."""
     config = EnduranceConfig(options.hours, imu_rate_hz=options.rate_hz)
     seed = (options.seed, 0)
@@ -78,7 +79,7 @@ def run(options: argparse.Namespace, place: Path) -> Hour:
     lockin = replace(default_settings(world.site), step=1.0)
     settings = NavigatorSettings(estimator=options.estimator, lockin=lockin, risk=Risk())
     key = run_key("bench_days", options.hours, options.rate_hz, options.seed, options.estimator)
-    begun = begin(place, key, world.site, settings, Hour(world.start()), resume=options.resume)
+    begun = begin(place, key, world.site, settings, Kept(world.start()), resume=options.resume)
     navigator, kept = begun.navigator, begun.beside
     print("  hour  states  ms a state   loops      MiB  error/mm  (rms, of that hour)")
     for block in range(begun.position, config.blocks):
@@ -105,6 +106,7 @@ def run(options: argparse.Namespace, place: Path) -> Hour:
             bare=kept.bare + bare,
             states=kept.states + len(states),
             largest_mib=max(kept.largest_mib, memory_mib()),
+            squares=kept.squares + sum(off),
             errors=[*kept.errors, *off],
         )
         if (block + 1) % HOUR == 0:
@@ -132,6 +134,7 @@ def main() -> None:
         kept = run(options, options.checkpoint or Path(directory) / "checkpoint.bin")
     found = {
         "states": kept.states,
+        "error_mm": 1e3 * (kept.squares / max(kept.states, 1)) ** 0.5,
         "largest_mib": kept.largest_mib,
         "grown_mib": memory_mib() - kept.first_mib if kept.first_mib else None,
         "seconds": kept.seconds,

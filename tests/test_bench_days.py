@@ -1,0 +1,18 @@
+"""Days of raw samples: the tool's world is one that the filter finds its way in."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+TOOL = Path(__file__).parents[1] / "tools" / "bench_days.py"
+
+
+def test_six_minutes_lead_to_states_in_bounded_memory() -> None:
+    done = subprocess.run(
+        [sys.executable, str(TOOL), "--hours", "0.1"], check=True, capture_output=True, text=True
+    )
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert 300 < found["states"] < 400  # one a second, but for those of the start
+    assert found["largest_mib"] < 1024.0
+    assert found["error_mm"] < 10.0
