@@ -9,13 +9,21 @@ from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.close_log import CloseLog
 from magfusion.estimation.integrity.detection import drowned, without_silence
 from magfusion.estimation.integrity.spectrum import beside_lines
-from magfusion.estimation.motion_compensation import MotionCompensated, demodulate_about, noisier
+from magfusion.estimation.motion_compensation import (
+    KnownMotion,
+    MotionCompensated,
+    demodulate_about,
+    noisier,
+)
+from magfusion.estimation.motion_shape import MotionShape
+from magfusion.estimation.motion_stretches import STRETCH
 from magfusion.estimation.skin_depths import refuse_too_deep
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.audibility import tones_of
 from magfusion.model.parameters import Calibration
-from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields
+from magfusion.model.quaternion import unit
+from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
 from magfusion.model.site import Site
 from magfusion.model.strapdown import resting
 from magfusion.model.trajectory import Trajectory, interpolated
@@ -25,7 +33,7 @@ from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.receiver.receiver import Receiver
 from magfusion.receiver.receivers import receiver_of, windowed
 from magfusion.receiver.slots import has_schedule
-from magfusion.receiver.turn import on_clock
+from magfusion.receiver.turn import BodyTurn, on_clock
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array, BoolArray
 
@@ -120,7 +128,10 @@ class Demodulation:
             found, _ = self.receiver.phasors(waveform, known, windows, site)
             return MotionCompensated.of_slots(found)
         length = self.receiver.settings.window
-        operator = self.receiver.operator(waveform, known, windows, site)
+        motion, turn = _integrated_once(
+            waveform, imu, offset, states if path is None else path, windows, site
+        )
+        operator = self.receiver.operator(waveform, known, windows, site, turn)
         del known  # of a long log it is as much as the log
         if self.blind is not None:
             operator = replace(operator, apart=self.blind)
@@ -132,11 +143,29 @@ class Demodulation:
             calibration,
             path,
             wanted=None if self.close is None else self.close.nodes,
+            motion=motion,
         )
         if self.blind is None:
             return wave
         fields = noisier(wave.fields, self.blind, states, calibration, length)
         return replace(wave, fields=fields)
+
+
+def _integrated_once(
+    waveform: Waveform,
+    imu: ImuSamples,
+    offset: float,
+    path: Trajectory,
+    windows: Windows,
+    site: Site,
+) -> tuple[KnownMotion | None, BodyTurn | None]:
+    """Return the motion along the samples, and how it turns them; None where it comes in parts."""
+    if len(waveform) > STRETCH:
+        return None, None
+    shape = MotionShape.of(path, imu, offset, site.gravity)
+    turned = shape.turned_at(waveform.time)
+    turn = BodyTurn(unit(turned), unit(shape.turned_at(windows.centre)))
+    return KnownMotion(shape, turned), turn
 
 
 def _bias_at(time: Array, states: Trajectory) -> Array:

@@ -105,7 +105,12 @@ class LockinReceiver(Receiver):
         return operator.demodulate(waveform.measured_sensor)[0], windows.number
 
     def operator(
-        self, waveform: Waveform, imu: ImuSamples, windows: Windows, site: Site
+        self,
+        waveform: Waveform,
+        imu: ImuSamples,
+        windows: Windows,
+        site: Site,
+        turn: BodyTurn | None = None,
     ) -> WindowOperator:
         """Return the map from a waveform to phasors, as of `window_operator`.
 
@@ -114,7 +119,9 @@ class LockinReceiver(Receiver):
         known = self._designs
         if known is None or known.windows is not windows or known.time is not waveform.time:
             known = self._designs = designs_of(waveform, site, self.settings, windows)
-        return window_operator(waveform, imu, site, self.settings, windows, designs=known)
+        return window_operator(
+            waveform, imu, site, self.settings, windows, designs=known, turn=turn
+        )
 
     def operator_of_one(
         self, waveform: Waveform, imu: ImuSamples, window: Windows, site: Site, turn: BodyTurn
