@@ -8,6 +8,7 @@ from test_online_separation import NAVIGATOR, _feed
 from test_smoothed_separation import EPOCHS, _walk
 
 from magfusion.estimation.integrity.score_epochs import Epoch, Passed, Sums, heard
+from magfusion.estimation.integrity.score_online import MOST_WAITING
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.navigator import Navigator
 from magfusion.estimation.state import between
@@ -24,7 +25,7 @@ def _waiting() -> tuple[Navigator, Sums, list[Epoch]]:
     score = navigator._update.score
     score.settle()
     score._asked_at = np.inf
-    _feed(navigator, small, LAST, LAST + 12)
+    _feed(navigator, small, LAST, LAST + MOST_WAITING - 1)
     assert score._sums is not None
     return navigator, score._sums, list(score._waiting)
 
@@ -41,7 +42,7 @@ def _assert_alike(found: Sums, expected: Sums) -> None:
 def test_epochs_together_tell_what_they_tell_one_by_one() -> None:
     navigator, sums, waiting = _waiting()
     asked = navigator._update.score.asked
-    assert len(waiting) == 12
+    assert len(waiting) == MOST_WAITING - 1
     offsets = {epoch.predicted.calibration.time_offset for epoch in waiting}
     assert len(offsets) > 1  # what an epoch is linearised with changes from one to the next
     rest = zero_velocity(np.zeros(1, dtype=np.int64), 0.01)

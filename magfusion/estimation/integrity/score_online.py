@@ -28,7 +28,7 @@ from magfusion.units import Array
 
 ASKED_EVERY, ASKED_AFTER = 2.0, 20.0  # s; at the soonest, and at the latest
 ENOUGH = 5  # epochs to be asked of sooner
-MOST_WAITING = 32  # epochs
+MOST_WAITING = 10  # epochs; to hear more at once would make a late update
 
 
 class OnlineScore:
