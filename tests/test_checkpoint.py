@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 
@@ -34,6 +35,10 @@ SCRIPT = Path(sys.executable).parent / "magfusion"
 TIMING = {"elapsed_s", "memory_mb", "update_p50_ms", "update_p99_ms", "update_max_ms"}
 KEY = "ab" * 32
 RESULTS = ("trajectory.tum", "trajectory.parquet", "lagged.parquet", "site.yaml")
+
+
+def _add(file: RowFile, row: Mapping[str, np.ndarray | float]) -> None:
+    file.extend({name: np.array([value]) for name, value in row.items()})
 
 
 def same(one: State, other: State) -> bool:
@@ -186,7 +191,7 @@ def test_killed_before_the_first_checkpoint_it_begins_again(
     output = tmp_path / "run"
     output.mkdir()
     begun = RowFile(output / "checkpoint.rows", {"time": 1})
-    begun.append({"time": 1.0})
+    _add(begun, {"time": 1.0})
     begun.settle()
     begun.close()
     with whole_file(output / "checkpoint.bin") as unfinished:  # and the first checkpoint
@@ -228,13 +233,13 @@ def test_rows_made_after_the_checkpoint_are_forgotten(tmp_path: Path) -> None:
 
     file = RowFile(tmp_path / "rows", columns)
     for k in range(4):
-        file.append(row(k))
+        _add(file, row(k))
     mark = file.settle()
     assert mark.rows == 4
-    file.append(row(9.0))
+    _add(file, row(9.0))
     file.close()
     again = RowFile(tmp_path / "rows", columns, mark)
-    again.append(row(4.0))
+    _add(again, row(4.0))
     assert again.rows()["position"][:, 0].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
     further = again.settle()
     again.close()

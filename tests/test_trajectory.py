@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.model.trajectory import Trajectory, interpolate
+from magfusion.model.trajectory import FEW, Trajectory, interpolate, interpolated
 
 RATE = np.array([0.4, -0.3, 1.2])  # rad/s
 VELOCITY = np.array([1.0, -2.0, 0.5])  # m/s
@@ -14,6 +14,17 @@ def _screw(time: np.ndarray) -> Trajectory:
     """Return steady turning and steady travel, which slerp and lines follow exactly."""
     turns = Rotation.from_rotvec(time[:, None] * RATE).as_matrix()
     return Trajectory(time, turns, time[:, None] * VELOCITY)
+
+
+@pytest.mark.parametrize("count", [7, FEW, FEW + 1])
+def test_columns_are_on_straight_lines_and_held_at_the_ends(count: int) -> None:
+    """Of few times and of many, which are found in different ways."""
+    rng = np.random.default_rng(2)
+    time, values = np.cumsum(rng.uniform(0.1, 1.0, 9)), rng.normal(size=(9, 4))
+    wanted = np.sort(np.append(rng.uniform(-1.0, time[-1] + 1.0, count - 2), time[[0, -1]]))
+    found = interpolated(wanted, time, values)
+    for column, known in zip(found.T, values.T, strict=True):
+        np.testing.assert_allclose(column, np.interp(wanted, time, known), rtol=0.0, atol=1e-12)
 
 
 def test_steady_motion_is_interpolated_exactly() -> None:

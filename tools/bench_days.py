@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,10 +24,9 @@ from magfusion.jobs.drift_world import bare_loop, memory_mib
 from magfusion.model.trust import Risk
 from magfusion.receiver.windows import default_settings
 from magfusion.simulation.demo_site import demo_site
-from magfusion.simulation.disturbance import Ambient
-from magfusion.simulation.endurance import Biases, EnduranceConfig, World, draw_endurance
+from magfusion.simulation.endurance import Biases, EnduranceConfig, draw_endurance
 from magfusion.simulation.log import draw_drives
-from magfusion.simulation.waveform import beacons_world
+from magfusion.simulation.waveform import simulate_waveform
 from magfusion.units import Array
 
 HOUR, BLOCK, PIECE = 60, 60.0, 1.0  # blocks; s
@@ -45,24 +44,7 @@ class Kept:
     states: int = 0
     first_mib: float = 0.0
     squares: float = 0.0
-    errors: list[float] = field(default_factory=list)
-
-
-def waveform(world: World, first: float, rate_hz: float, rng: np.random.Generator) -> Array:
-    """Return the samples of a magnetometer in a minute from a time on (s), shape (n, 3) (T)."""
-    site, stamps = world.true_site, first + np.arange(round(BLOCK * rate_hz)) / rate_hz
-    sensor, drives = (
-        site.platform.magnetometer,
-        draw_drives(site, np.random.default_rng(world.seed)),
-    )
-    turn = world.motion.world_from_body(stamps)
-    place = world.motion.position_world(stamps) + turn.apply(sensor.position_body)
-    field_world = beacons_world(site, drives, stamps, place, Ambient())
-    if site.earth_field_world is not None:
-        field_world += site.earth_field_world
-    found = turn.inv().apply(field_world) @ sensor.body_from_sensor @ sensor.matrix.T
-    noise = sensor.noise_density * np.sqrt(rate_hz / 2.0) * rng.standard_normal(found.shape)
-    return np.asarray(found + sensor.offset + noise)
+    errors: tuple[float, ...] = ()
 
 
 def pieces(time_s: Array, first: float) -> Iterator[slice]:
@@ -76,6 +58,7 @@ def run(options: argparse.Namespace, place: Path) -> Kept:
     config = EnduranceConfig(options.hours, imu_rate_hz=options.rate_hz)
     seed = (options.seed, 0)
     world = draw_endurance(demo_site(synchronised=True), config, seed)
+    drives = draw_drives(world.true_site, np.random.default_rng(seed))
     lockin = replace(default_settings(world.site), step=1.0)
     settings = NavigatorSettings(estimator=options.estimator, lockin=lockin, risk=Risk())
     key = run_key("bench_days", options.hours, options.rate_hz, options.seed, options.estimator)
@@ -85,13 +68,14 @@ def run(options: argparse.Namespace, place: Path) -> Kept:
     for block in range(begun.position, config.blocks):
         made = world.stretch(block, 1, kept.biases)
         imu, began = made.imu, block * BLOCK
-        measured = waveform(world, began, options.rate_hz, np.random.default_rng((*seed, block)))
+        rng = np.random.default_rng((*seed, block))
+        parts = world.motion, world.true_site, drives, options.rate_hz, BLOCK, rng
+        field = simulate_waveform(*parts, begin=began)
         bare = bare_loop(imu, world.site.platform.imu, world.site.gravity) * len(imu)
-        stamps = began + np.arange(len(measured)) / options.rate_hz
         states, spent = [], time.process_time()
-        for own in pieces(stamps, began):
+        for own in pieces(field.time, began):
             navigator.hear_imu(imu.time[own], imu.gyro_body[own], imu.accel_body[own])
-            navigator.add_magnetometer(stamps[own], measured[own])
+            navigator.add_magnetometer(field.time[own], field.measured_sensor[own])
             states += navigator.take()
             navigator.take_lagged()
         spent = time.process_time() - spent
@@ -107,7 +91,7 @@ def run(options: argparse.Namespace, place: Path) -> Kept:
             states=kept.states + len(states),
             largest_mib=max(kept.largest_mib, memory_mib()),
             squares=kept.squares + sum(off),
-            errors=[*kept.errors, *off],
+            errors=(*kept.errors, *off),
         )
         if (block + 1) % HOUR == 0:
             first_mib = kept.first_mib or memory_mib()
@@ -115,7 +99,7 @@ def run(options: argparse.Namespace, place: Path) -> Kept:
             each, loops = 1e3 * kept.seconds / max(kept.states, 1), kept.seconds / kept.bare
             line = f"{(block + 1) // HOUR:6d}{kept.states:8d}{each:12.2f}{loops:8.1f}"
             print(f"{line}{memory_mib():9.0f}{rms:10.2f}", flush=True)
-            kept = replace(kept, first_mib=first_mib, errors=[])
+            kept = replace(kept, first_mib=first_mib, errors=())
             save(navigator, block + 1, kept, place, key)
     return kept
 

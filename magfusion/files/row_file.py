@@ -99,10 +99,6 @@ class RowFile:
         if len(self._waiting) == BATCH:
             self._write()
 
-    def append(self, row: Mapping[str, Array | float]) -> None:
-        """Add one row."""
-        self.extend({name: np.array([row[name]]) for name in self.columns})
-
     def settle(self) -> Mark:
         """See that all rows are on the disk; return how far the file goes."""
         self._write()

@@ -93,28 +93,6 @@ class WindowOperator:
             return by_tone
         return np.take(by_tone, self.tone_of_channel, axis=axis)
 
-    def apply(self, measured_sensor: Array) -> ComplexArray:
-        """Return the phasors of a waveform given at the same sample times.
-
-        Parameters
-        ----------
-        measured_sensor : ndarray, shape (samples, 3)
-            (T)
-
-        Returns
-        -------
-        complex ndarray, shape (n, channels, 3)
-            (T), measured axes at the centre of the window.
-        """
-        still = self._still(measured_sensor)
-        found = np.concatenate(
-            [
-                self._phasor(rows, maps.solver[:, 1:] @ _of_windows(still, maps))
-                for rows, maps in self.designs.pieces()
-            ]
-        )
-        return self._by_channel(found)
-
     def demodulate(self, measured_sensor: Array) -> tuple[FieldSamples, SteadyFields]:
         """Turn raw samples into phasors and the steady field beside them, each with covariance.
 
@@ -132,12 +110,17 @@ class WindowOperator:
     def demodulate_both(
         self, measured_sensor: Array, beside: Array | None = None
     ) -> tuple[FieldSamples, SteadyFields, ComplexArray]:
-        """Return `demodulate` of a waveform, and `apply` of another at the same sample times.
+        """Return `demodulate` of a waveform, and the phasors of another at the same sample times.
 
         Parameters
         ----------
         beside : ndarray, shape (samples, 3), optional
-            The other; what is returned of it is empty where it is not given.
+            The other (T); what is returned of it is empty where it is not given.
+
+        Returns
+        -------
+        complex ndarray, shape (n, channels, 3)
+            The last: measured axes at the centre of the window (T).
         """
         still, parts = self._still(measured_sensor), []
         other = None if beside is None else self._still(beside)

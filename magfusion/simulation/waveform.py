@@ -74,6 +74,7 @@ def simulate_waveform(
     ambient: Ambient | None = None,
     marks: Marks | None = None,
     own: np.random.Generator | None = None,
+    begin: float = 0.0,
 ) -> Waveform:
     """Return the field of everything at each sample's own pose, as the magnetometer gives it.
 
@@ -96,6 +97,8 @@ def simulate_waveform(
         When the coils are driven whose slots no clock tells.
     own : Generator, optional
         Of the instrument's noise; without it all is drawn from one.
+    begin : float
+        First stamp (s): days are simulated a minute at a time.
 
     Raises
     ------
@@ -110,7 +113,7 @@ def simulate_waveform(
             f"magnetometer_rate_hz: found {rate_hz} Hz for {duration} s; give at least one sample"
         )
     magnetometer = site.platform.magnetometer
-    stamps = np.arange(count) / rate_hz
+    stamps = begin + np.arange(count) / rate_hz
     time = stamps + magnetometer.clock_offset
     world_from_body = motion.world_from_body(time)
     lever_world = world_from_body.apply(magnetometer.position_body)

@@ -25,7 +25,7 @@ from magfusion.units import DEGREE, Array, BoolArray, IntArray
 
 ROOT_2, ROOT_2_PI = float(np.sqrt(2.0)), float(np.sqrt(2.0 / np.pi))
 POSE = 6  # axes: rotation, then position
-PRECISE, MOST_STEPS = 1e-4, 60  # of a level
+PRECISE, MOST_STEPS = 1e-7, 60  # of a level
 MOST_DEG = 180.0  # an attitude level beyond it says nothing
 SINGLE_HOLDS = 0.215  # probability of a tail below which a single number bounds it
 LEAST = 1e-30  # rad, m; a deviation below it is none
@@ -295,10 +295,11 @@ def _levels(sigma: Radius, without: Radius, threshold: Array, prior: Array, risk
     )
     threshold = np.concatenate([np.zeros_like(threshold[:, :1]), threshold], axis=1)
     prior = np.concatenate([np.ones_like(prior[:, :1]), prior], axis=1)
-    goal, own = _sigmas_of(risk), risk[:, None] / np.where(prior > 0.0, prior, 1.0)
+    goal, own = np.log(risk), risk[:, None] / np.where(prior > 0.0, prior, 1.0)
 
     def more(level: Array) -> Array:
-        return goal - _sigmas_of((prior * each.tail(level[:, None] - threshold)).sum(axis=1))
+        total = (prior * each.tail(level[:, None] - threshold)).sum(axis=1)
+        return np.asarray(np.log(np.maximum(total, LEAST)) - goal)
 
     # One alone has all of the risk at the lower end, and none more than its part at the upper.
     reach, part = threshold + each.beyond(np.minimum(own, 1.0)), own / prior.shape[1]
@@ -306,11 +307,6 @@ def _levels(sigma: Radius, without: Radius, threshold: Array, prior: Array, risk
     reach = threshold + each.beyond(np.minimum(part, 1.0))
     high = np.max(np.where(prior > 0.0, reach, 0.0), axis=1)
     return _crossing(more, np.maximum(low - PRECISE * high, 0.0), high)
-
-
-def _sigmas_of(probability: Array) -> Array:
-    """Return what grows with the radius of a Gaussian tail almost as a straight line does."""
-    return np.sqrt(np.maximum(-np.log(np.maximum(probability, LEAST)), 0.0))
 
 
 def _crossing(falling: Callable[[Array], Array], low: Array, high: Array) -> Array:

@@ -28,11 +28,6 @@ def dipole_field(offset: Array, moment: Array) -> Array:
     return MU0_OVER_4PI * (3.0 * offset * along / square - moment) / square**1.5
 
 
-def dipole_gradient(offset: Array, moment: Array) -> Array:
-    """Return the gradient of `dipole_field_and_gradient` alone."""
-    return dipole_field_and_gradient(offset, moment)[1]
-
-
 def dipole_field_and_gradient(offset: Array, moment: Array) -> tuple[Array, Array]:
     """Return the dipole field with its gradient: ``[i, j] = d field_i / d offset_j``.
 
