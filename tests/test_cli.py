@@ -16,7 +16,7 @@ from evo.tools import file_interface
 from rerun.chunk import RrdReader
 
 from magfusion.cli import main
-from magfusion.files.bag import Topics
+from magfusion.files.bag_topics import Topics
 from magfusion.files.log import read_log
 from magfusion.files.site import load_site
 from magfusion.jobs.inputs import read_estimate, topics_option

@@ -10,13 +10,9 @@ from mistake_case import Case, good_case, simulated
 from mistake_list import MISTAKES
 
 from magfusion.estimation.demodulation import demodulated
-from magfusion.estimation.integrity.diagnosis import (
-    cause_of,
-    diagnosed,
-    seen_in_streams,
-    with_cause,
-)
+from magfusion.estimation.integrity.diagnosis import diagnosed, seen_in_streams, with_cause
 from magfusion.estimation.integrity.explanation import Explanation, clearly_best
+from magfusion.estimation.integrity.likely_cause import cause_of
 from magfusion.estimation.integrity.motion_causes import timing_causes
 from magfusion.estimation.integrity.motion_comparison import compared, surveyed
 from magfusion.estimation.integrity.recording import recorded

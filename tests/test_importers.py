@@ -36,7 +36,7 @@ from example_bag import (
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from magfusion.errors import InputError
-from magfusion.files.bag import Topics
+from magfusion.files.bag_topics import Topics
 from magfusion.files.log import read_log, write_log
 from magfusion.files.open import open_log
 from magfusion.model.samples import Log

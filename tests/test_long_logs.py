@@ -25,7 +25,8 @@ from example_log import example_log
 
 from magfusion.errors import InputError
 from magfusion.files import bag_rows, long_log, table_stream
-from magfusion.files.bag import Topics, read_bag
+from magfusion.files.bag import read_bag
+from magfusion.files.bag_topics import Topics
 from magfusion.files.foreign import bag_table
 from magfusion.files.foreign.bag_table import plan_bag
 from magfusion.files.foreign.convert import write_stream

@@ -1,7 +1,10 @@
 """The whole offline estimate of one log: start, passes over the waveform, posterior."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from gtsam.symbol_shorthand import V
@@ -24,7 +27,6 @@ from magfusion.estimation.measurements.zero_velocity import may_stand, quiet_bef
 from magfusion.estimation.noise_tuning import Tuned, as_declared, noise_of, plausible, with_noise
 from magfusion.estimation.noise_tuning import settled as same_noise
 from magfusion.estimation.on_new_clock import on_new_clock
-from magfusion.estimation.passes import Passed, PassFile
 from magfusion.estimation.prepared import prepared
 from magfusion.estimation.relaxation import Step, part_of_the_way
 from magfusion.estimation.settings import SmootherSettings as SmootherSettings
@@ -37,6 +39,9 @@ from magfusion.model.site import MotionModel, Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.without_imu import logged, require_motion_prior
 from magfusion.units import Array, BoolArray, IntArray
+
+if TYPE_CHECKING:
+    from magfusion.estimation.passes import PassFile
 
 QUIET = 0.3  # sigmas; a last pass that moved the poses by less has converged all the same
 ON_THE_WAY, CONVERGED = 1e-4, 1e-6  # relative decrease of the cost at which a pass ends
@@ -248,6 +253,8 @@ def _solved(
             del graph, found  # of a long log they are most of what there is
             give_back_memory()
             if passes is not None:
+                from magfusion.estimation.passes import Passed
+
                 passed = Passed(
                     done=done,
                     iterations=iterations,

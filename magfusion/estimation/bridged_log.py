@@ -5,7 +5,10 @@ motion is followed through it by the magnetometer's samples; then they are windo
 a motion that is known less.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -14,7 +17,6 @@ from magfusion.estimation.graph import initial_estimate, read_states
 from magfusion.estimation.integrity.detection import drowned, only, without_silence
 from magfusion.estimation.log_graph import PreparedLog, graph_of
 from magfusion.estimation.motion_compensation import noisier
-from magfusion.estimation.motion_from_field import FieldMotion, motion_from_field
 from magfusion.estimation.solve.bordered import optimise
 from magfusion.estimation.state import State
 from magfusion.model.parameters import Calibration
@@ -24,6 +26,9 @@ from magfusion.receiver.admission import INERTIAL_GAP, Windows, longest_step, si
 from magfusion.receiver.lockin_receiver import LockinReceiver
 from magfusion.receiver.turn import on_clock
 from magfusion.units import Array
+
+if TYPE_CHECKING:
+    from magfusion.estimation.motion_from_field import FieldMotion
 
 LONGEST = 120.0  # s; that is followed without an IMU
 # Of the states that it is followed from, one sigma; the fields find them within a few samples.
@@ -61,11 +66,13 @@ def bridged(log: PreparedLog) -> PreparedLog:
     )
 
 
-Gap = tuple[float, float, FieldMotion]
+Gap = tuple[float, float, "FieldMotion"]
 
 
 def _followed(log: PreparedLog, states: Trajectory, calibration: Calibration) -> list[Gap]:
     """Return the gaps through which the motion could be followed, with when they begin and end."""
+    from magfusion.estimation.motion_from_field import motion_from_field
+
     source = log.demodulation
     receiver, waveform = source.receiver, source.log.waveform
     assert isinstance(receiver, LockinReceiver)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.arrivals import arrivals_of
 from magfusion.estimation.as_heard import fields_heard, samples_heard
 from magfusion.estimation.carried import Departure
 from magfusion.estimation.drive_reference import drive_findings
@@ -28,11 +29,9 @@ from magfusion.estimation.integrity.resets import Resets
 from magfusion.estimation.integrity.summary import Summary
 from magfusion.estimation.measurements.earth import check_earth
 from magfusion.estimation.measurements.measurement import Measurement
-from magfusion.estimation.navigator_data import navigator_rules
 from magfusion.estimation.navigator_settings import NavigatorSettings as NavigatorSettings
 from magfusion.estimation.process_noise import calibration_process_noise
 from magfusion.estimation.propagation import Propagated, propagate
-from magfusion.estimation.several_arrivals import arrivals_of
 from magfusion.estimation.short_windows import ShortWindows
 from magfusion.estimation.state import State
 from magfusion.estimation.state_of_now import CarriedState, Said, StateOfNow
@@ -335,6 +334,8 @@ class Navigator:
 
     def checkpoint(self) -> dict[str, Any]:
         """Return everything needed to go on as plain data: `restored` makes a navigator of it."""
+        from magfusion.estimation.navigator_data import navigator_rules
+
         rules = navigator_rules(self.site, self.blocks)
         self._arrived.settle()
         self._update.score.settle()

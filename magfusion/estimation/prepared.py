@@ -17,10 +17,8 @@ from magfusion.estimation.initialization.offline import (
 from magfusion.estimation.integrity.detection import detected, only
 from magfusion.estimation.likeliest import likeliest
 from magfusion.estimation.log_graph import PreparedLog
-from magfusion.estimation.measurements.held_roll import without_roll
 from magfusion.estimation.measurements.zero_velocity import quiet_before
 from magfusion.estimation.settings import SmootherSettings
-from magfusion.estimation.several_demodulation import demodulated_several
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.one_axis import roll_is_open
 from magfusion.model.parameters import Calibration, initial_calibration
@@ -114,7 +112,11 @@ def prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) -
 
 def _one_roll(states: Trajectory, site: Site, *, signed: bool) -> Trajectory:
     """Return states whose rolls, where nothing tells them, are those of one that does not turn."""
-    return without_roll(states, site, signed=signed) if roll_is_open(site) else states
+    if not roll_is_open(site):
+        return states
+    from magfusion.estimation.measurements.held_roll import without_roll
+
+    return without_roll(states, site, signed=signed)
 
 
 def prepared_again(log: Log, site: Site, settings: SmootherSettings, known: Begun) -> PreparedLog:
@@ -133,7 +135,9 @@ def prepared_again(log: Log, site: Site, settings: SmootherSettings, known: Begu
 
 def _demodulated(log: Log, site: Site, settings: SmootherSettings) -> _Demodulated:
     loose = settings.coupling == "loose"
-    heard = demodulated_several if log.waveforms else demodulated
+    heard = demodulated
+    if log.waveforms:
+        from magfusion.estimation.several_demodulation import demodulated_several as heard
     demodulation = heard(log, site, settings.lockin)
     samples = demodulation.fields
     if loose and has_schedule(site):

@@ -382,11 +382,3 @@ class SeveralArrivals(Arrivals):
         for k, one in found.items():
             by_offset[:, self.site.of_sensor(k)] = one.by_time_offset
         return replace(wave, by_time_offset=by_offset)
-
-
-def arrivals_of(site: Site, lockin: LockinSettings | None) -> Arrivals:
-    """Return what holds the streams of a site's platform."""
-    offset = site.platform.imu.time_offset
-    if site.platform.further:
-        return SeveralArrivals(site, lockin, offset)
-    return Arrivals(receiver_of(site, lockin), offset)

@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from magfusion.estimation.motion_from_field import motion_from_field
 from magfusion.estimation.state import State
 from magfusion.estimation.stream_buffer import Buffer
 from magfusion.model.samples import ImuSamples, Waveform
@@ -63,6 +62,8 @@ class StandIn:
         self.time, self.rows = self.time[kept], self.rows[kept]
         if until - state.time > LONGEST:
             return
+        from magfusion.estimation.motion_from_field import motion_from_field
+
         inertial = ImuSamples(stamps + offset, heard[:, :3], heard[:, 3:])
         part, step = Waveform(time[within], rows[within]), admission.imu_step
         followed = motion_from_field(state, part, inertial, longest_step(step))

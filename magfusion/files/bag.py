@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.bag_rows import Messages, Wanted, read_parts
+from magfusion.files.bag_topics import Topics
 from magfusion.files.lost_rows import LostRows
 from magfusion.files.messages import FIELD, IMU, ROWS, USUAL
 from magfusion.files.plausible import check_field, check_imu
@@ -26,17 +27,6 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.interfaces import Connection
 
-BAG_SUFFIXES = (".mcap", ".db3", ".bag")
-
-
-@dataclass(frozen=True)
-class Topics:
-    """Names of the topics to read; None takes the only one of the type."""
-
-    imu: str | None = None
-    magnetometer: str | None = None
-    truth: str | None = None
-
 
 @dataclass(frozen=True, eq=False)
 class _Stream:
@@ -50,11 +40,6 @@ class _Stream:
     def within(self, span: Span) -> _Stream:
         begin, end = np.searchsorted(self.time_ns, span.bounds_ns)
         return _Stream(self.place, self.msgtype, self.time_ns[begin:end], self.values[begin:end])
-
-
-def is_bag(path: Path) -> bool:
-    """Return whether a path is a bag: a directory with its metadata, or a single file."""
-    return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix in BAG_SUFFIXES
 
 
 def read_bag(

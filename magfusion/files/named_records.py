@@ -1,12 +1,16 @@
 """Which of several magnetometers what comes through a pipe is of."""
 
+from __future__ import annotations
+
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from magfusion.errors import InputError
-from magfusion.files.fields import on_log_clock, side_by_side
-from magfusion.files.stream import FieldsRecord, field_samples
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
+
+if TYPE_CHECKING:
+    from magfusion.files.stream import FieldsRecord
 
 
 def magnetometer_number(site: Site, name: str | None, what: str) -> int:
@@ -41,6 +45,9 @@ def site_fields(entry: FieldsRecord, site: Site) -> FieldSamples:
     InputError
         As `magnetometer_number` and `field_samples`.
     """
+    from magfusion.files.fields import on_log_clock, side_by_side
+    from magfusion.files.stream import field_samples
+
     which = magnetometer_number(site, entry.magnetometer, "fields")
     sensors = site.platform.magnetometers
     if len(sensors) == 1:

@@ -10,7 +10,7 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from magfusion.errors import InputError
-from magfusion.files.bag import Topics
+from magfusion.files.bag_topics import Topics
 from magfusion.files.inertial_tables import FIELD_LAYOUT, IMU_LAYOUT
 from magfusion.files.log import HEADER, LogHeader, is_log
 from magfusion.files.open import open_log

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.restored import restored
 from magfusion.files.checkpoint import (
     Checkpoint,
     claim_checkpoint,
@@ -69,6 +68,8 @@ def begin(
         if place is not None:
             claim_checkpoint(place)
         return Begun(Navigator(site, settings), 0, beside)
+    from magfusion.estimation.restored import restored
+
     with named(place):
         beside = from_plain(type(beside), found.content.get("beside"), "beside")
         navigator = restored(site, settings, found.content.get("navigator"))

@@ -43,7 +43,7 @@ def run_evaluate(settings: EvaluateSettings) -> Figures:
 
 def _read_truth(settings: EvaluateSettings) -> tuple[Trajectory, int]:
     """Return the truth, and the zero of the clock (ns) from which its times count."""
-    from magfusion.files.bag import BAG_SUFFIXES
+    from magfusion.files.bag_topics import BAG_SUFFIXES
     from magfusion.files.open import open_log
     from magfusion.jobs.inputs import read_estimate, topics_option
 

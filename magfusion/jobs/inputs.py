@@ -22,7 +22,7 @@ from magfusion.files.atomic import (
     refuse_in_the_way,
     whole_directory,
 )
-from magfusion.files.bag import Topics
+from magfusion.files.bag_topics import Topics
 from magfusion.files.fields import order_channels
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site

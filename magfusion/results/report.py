@@ -1,17 +1,18 @@
 """Figures that several jobs have in common, and the file that they are written to."""
 
+from __future__ import annotations
+
 import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch import Smoothed
 from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
-from magfusion.estimation.self_survey import Placement
-from magfusion.estimation.snapshot.ambiguity import ambiguities, relations
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.one_axis import roll_is_open
 from magfusion.model.samples import Log
@@ -28,11 +29,14 @@ from magfusion.results.figures import (
     Value,
     determined_figures,
 )
-from magfusion.results.observability import Observability, observability
 from magfusion.results.page import write_page
 from magfusion.results.page_motion import Motion
 from magfusion.results.refinement import parameter_estimates
 from magfusion.units import Array
+
+if TYPE_CHECKING:
+    from magfusion.estimation.self_survey import Placement
+    from magfusion.results.observability import Observability
 
 FAILED = "failed"  # directory of what was found where the verdict is that
 POOR_FIT = 3.0  # whitened residual, one where noise and model are as declared
@@ -231,6 +235,8 @@ def smoothed_figures(result: Smoothed, directions: Section = _REPORT) -> Figures
     if states.pose_cov is not None:
         figures |= sigma_figures(states.pose_cov)
     if result.blocks:
+        from magfusion.results.observability import observability
+
         known = observability(result.calibration, result.blocks, result.calibration_cov)
         figures |= observability_figures(estimates, known, directions)
     return figures | Figures(*estimates) | determined_figures(estimates)
@@ -307,6 +313,8 @@ def _listed(place: Array, digits: int) -> str:
 
 def fix_figures(fixes: Fixes, site: Site) -> Figures:
     """Return the figures of single-epoch fixes, with sentences on their ambiguities."""
+    from magfusion.estimation.snapshot.ambiguity import ambiguities, relations
+
     share = fixes.probability
     second = share[:, 1] if share.shape[1] > 1 else np.zeros(len(fixes))
     epochs, ambiguous = len(fixes), int(np.sum(second > 0.05))

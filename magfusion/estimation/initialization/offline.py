@@ -6,7 +6,10 @@ At epochs without any beacon the gyro carries the attitude on from those with on
 the fix of a cycle to the slots in it.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,9 +21,7 @@ from magfusion.estimation.initialization.chain import (
     start_of,
     start_phases,
 )
-from magfusion.estimation.initialization.search import Found, can_search, search
 from magfusion.estimation.integrity.fix_separation import separate_fixes
-from magfusion.estimation.measurements.zero_rate import freed_of_bias
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.one_axis import roll_is_open
@@ -37,6 +38,9 @@ from magfusion.model.strapdown import (
 )
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, IntArray
+
+if TYPE_CHECKING:
+    from magfusion.estimation.initialization.search import Found
 
 LEAST_DETECTED = 10  # epochs at which a beacon is detected; fewer give no start
 
@@ -95,7 +99,11 @@ def begin(
         whole = start if everywhere else _carried(start, imu, offset, samples.time)
         out.append(OfflineStart(whole, whole.states, declared, fixes))
     tracked = epochs.signed and not roll_is_open(calibration.site)
-    if tracked and _doubtful(chains) and can_search(epochs):
+    if not tracked or not _doubtful(chains):
+        return out
+    from magfusion.estimation.initialization.search import can_search, search
+
+    if can_search(epochs):
         still = replace(imu, gyro_body=imu.gyro_body - _rest_bias(imu, calibration))
         for found in search(epochs, fixes, still, calibration):
             out.append(_tracked(found, fixes, imu, calibration, samples.time))
@@ -106,6 +114,8 @@ def unbiased(imu: ImuSamples, samples: FieldSamples, time_offset: float) -> ImuS
     """Return an inertial stream without the rate that it shows in whole rests, where those are."""
     if not samples.of_rests:
         return imu
+    from magfusion.estimation.measurements.zero_rate import freed_of_bias
+
     half, stamps = 0.5 * samples.window, samples.time - time_offset
     return freed_of_bias(imu, stamps - half, stamps + half)
 

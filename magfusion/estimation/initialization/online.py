@@ -9,15 +9,12 @@ import numpy as np
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.demodulated_apart import each_alone
-from magfusion.estimation.initialization.among_many import among_all, score_among_all
 from magfusion.estimation.initialization.handover import last_state
 from magfusion.estimation.integrity.judge import judged
-from magfusion.estimation.integrity.magnetometer_exclusion import Agreed, agreed
 from magfusion.estimation.integrity.score import Score, score_of
 from magfusion.estimation.integrity.spectrum import beside_lines
 from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.settings import EstimatorSettings
-from magfusion.estimation.several_demodulation import demodulated_several, same_windows
 from magfusion.estimation.state import POSITION, ROTATION, State
 from magfusion.estimation.stream_buffer import Buffer
 from magfusion.model.audibility import are_many
@@ -148,27 +145,25 @@ def find_online_start(
     heard = log
     try:
         if several and are_many(site):  # by what is heard they are chosen
+            from magfusion.estimation.several_demodulation import demodulated_several
+
             log = replace(log, fields=demodulated_several(log, site, settings.lockin).fields)
         if log.waveform is not None and has_schedule(site) and joins(site, log.waveform.marks):
             log = _of_cycles(log, log.waveform, site, settings)
         how = SmootherSettings(loss="huber", **asked)
-        found = _agreed(smooth(log, site, how), log, site, how)
-        log, result = found.log, found.result
+        log, left, result, excluded = _agreed(smooth(log, site, how), log, site, how)
         honest, trust = judged(result, log)
         score = score_of(result, imu)
         state = last_state(result, result.considered)
         if result.calibration.site.unheard or site.platform.further:
-            known = (*result.blocks, *result.considered)
-            state = among_all(state, known, site, settings)
-        if score is not None and result.calibration.site.unheard:
-            score = score_among_all(score, result.blocks, site, settings)
+            state, score = _among_all(state, score, result, site, settings)
     except (EstimationError, InputError) as error:
         return NoStart(f"{error}.")
     except (RuntimeError, np.linalg.LinAlgError):
         return NoStart("The measurements leave a direction of the motion open.")
     if trust.verdict is Verdict.FAILED:
         return NoStart(trust.reasons[0].text, trust)
-    left = [sensor.name for sensor in found.site.platform.magnetometers]
+    kept = [sensor.name for sensor in left.platform.magnetometers]
     given = settings.lockin
     lined = given is not None and len(given.lines_hz) > 0
     beside = given if lined else beside_lines(log, site, given)
@@ -182,27 +177,46 @@ def find_online_start(
         None if beside is given else beside,
         _lines_of_each(heard, site, given) if several else {},
         {b.name: np.sum(result.calibration_response[b.columns] ** 2, 1) for b in result.blocks},
-        tuple(sensor.name for sensor in site.platform.magnetometers if sensor.name not in left),
-        found.findings,
+        tuple(sensor.name for sensor in site.platform.magnetometers if sensor.name not in kept),
+        excluded,
     )
 
 
-def _agreed(result: Smoothed, log: Log, site: Site, settings: SmootherSettings) -> Agreed:
+def _agreed(
+    result: Smoothed, log: Log, site: Site, settings: SmootherSettings
+) -> tuple[Log, Site, Smoothed, tuple[Finding, ...]]:
     """Return a start without a magnetometer that contradicts the others, as of a whole log."""
     if not site.platform.further:
-        return Agreed(log, site, result, ())
+        return log, site, result, ()
+    from magfusion.estimation.integrity.magnetometer_exclusion import agreed
+
     plain = replace(settings, tune=False)
-    return agreed(
+    found = agreed(
         result,
         log,
         site,
         lambda log, site: smooth(log, site, settings),
         lambda log, site: smooth(log, site, plain),
     )
+    return found.log, found.site, found.result, found.findings
+
+
+def _among_all(
+    state: State, score: Score | None, result: Smoothed, site: Site, settings: EstimatorSettings
+) -> tuple[State, Score | None]:
+    """Return a state and its score among all beacons and magnetometers, heard or not."""
+    from magfusion.estimation.initialization.among_many import among_all, score_among_all
+
+    state = among_all(state, (*result.blocks, *result.considered), site, settings)
+    if score is not None and result.calibration.site.unheard:
+        score = score_among_all(score, result.blocks, site, settings)
+    return state, score
 
 
 def _lines_of_each(log: Log, site: Site, given: LockinSettings | None) -> dict[str, LockinSettings]:
     """Return how the receivers of several magnetometers go on that have lines to be fitted."""
+    from magfusion.estimation.several_demodulation import same_windows
+
     lockin, found = same_windows(site, given), dict[str, LockinSettings]()
     for name, own, alone in each_alone(log, site):
         lined = beside_lines(own, alone, lockin)

@@ -1,9 +1,7 @@
 """The likely cause of a doubtful or failed result, of what people get wrong.
 
-Where a witness says that something is wrong, the finite list of usual mistakes is tried on a
-thinned log: those of beacons and magnetometer on snapshots of the fields, those of the inertial
-sensor on how fixes of the fields move.  One is named only where it explains the log, and clearly
-better than any other.
+Where a witness says that something is wrong, and the streams do not show a cause themselves, the
+usual mistakes are tried; see `likely_cause`.
 """
 
 from dataclasses import replace
@@ -11,32 +9,11 @@ from dataclasses import replace
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.demodulation import demodulated
-from magfusion.estimation.integrity.beacon_causes import (
-    MISFIT,
-    beacon_causes,
-    matrix_causes,
-    survey_causes,
-)
-from magfusion.estimation.integrity.explanation import Explanation, clearly_best
-from magfusion.estimation.integrity.field_causes import global_causes
-from magfusion.estimation.integrity.field_snapshots import Snapshots, snapshots_of
 from magfusion.estimation.integrity.magnetometers import first_magnetometer
-from magfusion.estimation.integrity.motion_causes import (
-    EYE,
-    gyro_unit_causes,
-    motion_causes,
-    timing_causes,
-)
-from magfusion.estimation.integrity.motion_comparison import compared, surveyed
-from magfusion.estimation.integrity.phase_causes import phase_causes
-from magfusion.model.samples import FieldSamples, ImuSamples, Log
+from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
-from magfusion.receiver.cycles import whole_cycles
-from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
-from magfusion.units import Array, BoolArray
 
 # What the raw streams show themselves needs no other cause.
 OF_SAMPLES = {
@@ -63,11 +40,6 @@ SEEN = OF_SAMPLES | {
 FIRST = 1e6  # weight: a cause comes before what it causes
 OF_SEEN = FIRST / 2.0  # and before what the streams show, which may be beside it
 OF_CATCH_ALL = FIRST / 4.0  # but what only says where something is wrong may be of what they show
-LONGEST = 100.0  # s; of a longer log parts are tried
-PARTS = 4
-FEWEST = 8  # epochs
-LEAST_WAY = 0.3  # m; who goes less far sees each beacon from one side
-STRANGE = 1e3  # and above which it is no field of this site
 
 
 def diagnosed(
@@ -88,6 +60,9 @@ def diagnosed(
         return None
     if not site.beacons or any(beacon.unknown is not None for beacon in site.beacons):
         return None
+    # Of all that can be wrong nothing is needed where nothing is.
+    from magfusion.estimation.integrity.likely_cause import cause_of
+
     try:
         said = cause_of(log, site, settings)
     except (EstimationError, InputError, np.linalg.LinAlgError):
@@ -122,144 +97,3 @@ def with_cause(trust: Trust, log: Log, site: Site, settings: LockinSettings | No
 
     found = tuple(placed(finding) for finding in trust.findings)
     return Trust(found if cause is None else (*found, cause), trust.unverified)
-
-
-def cause_of(
-    log: Log, site: Site, settings: LockinSettings | None = None
-) -> tuple[Explanation, str] | None:
-    """Return the mistake that explains a log, with the sentences that say it.
-
-    Raises
-    ------
-    InputError, EstimationError
-        Where the log holds no field that is usable.
-    """
-    part = _part(log)
-    samples = _demodulated(part, site, settings)
-    samples = samples.rows(np.asarray(samples.valid.any(axis=1)))
-    if len(samples) < FEWEST:
-        return None
-    known = snapshots_of(samples, part.imu, site)
-    tried = _of_fields(known, samples, _steady(part, site))
-    of_fields, of_motion = clearly_best(tried), None
-    if known.chi_square < MISFIT * known.freedom:
-        # As declared the fields may be so: what explains them is weighed against what moves.
-        of_motion = clearly_best(_of_motion(known, samples, part.imu))
-    elif of_fields is None and any(one.clear for one in tried):
-        return None  # it is of the fields, whichever it is: no inertial sensor explains it
-    elif of_fields is None:
-        rest = _unexplained(known)
-        if rest is not None:
-            return rest
-        of_motion = clearly_best(_of_motion(known, samples, part.imu))
-    if of_motion is not None and (of_fields is None or of_motion.fall > of_fields.fall):
-        return of_motion, of_motion.text(
-            "the motion by the fields against that by the inertial sensor"
-        )
-    if of_fields is not None:
-        return of_fields, of_fields.text(f"the fields at {len(known.samples)} epochs")
-    return None
-
-
-def _unexplained(known: Snapshots) -> tuple[Explanation, str] | None:
-    """Return what is to be said of fields that no single mistake explains."""
-    before, freedom = known.chi_square, max(known.freedom, 1.0)
-    excess = before / freedom
-    if excess < MISFIT or not _moves(known):
-        return None
-    rms = float(np.sqrt(excess))
-    if excess > STRANGE:
-        code, text = (
-            "other_site",
-            f"The fields contradict the site's file as a whole (residual {rms:.3g} where 1 is"
-            " expected), and no single usual mistake explains it. Check that the site is that of"
-            " this room, with these beacons at these frequencies.",
-        )
-    else:
-        share = 100.0 * rms * known.site.model_error
-        code, text = (
-            "iron",
-            f"The fields deviate from the beacons' by about {share:.2g} % from place to place, and"
-            " neither another survey nor other moments explain it: as iron in the room does, or a"
-            " line near a tone. Learn a field map (magfusion calibrate fieldmap), or declare"
-            f" world.model_error {0.01 * share:.2g}.",
-        )
-    return Explanation(code, text, "", before, before, freedom, catch_all=True), text
-
-
-def _demodulated(log: Log, site: Site, settings: LockinSettings | None) -> FieldSamples:
-    """Return phasors turned by the gyro, or by nothing where that leaves less noise.
-
-    Nothing of the fields may hang on an inertial sensor that is itself in doubt: a gyro whose axes
-    or signs are wrong makes more noise of the Earth field than none does.
-    """
-    still = replace(log, imu=replace(log.imu, gyro_body=np.zeros_like(log.imu.gyro_body)))
-    found = []
-    for one in (log, still):
-        samples = demodulated(one, site, settings).fields
-        if has_schedule(site):
-            samples = whole_cycles(samples, one.imu, site)
-        noise = np.trace(samples.phasor_cov, axis1=2, axis2=3)
-        found.append((float(np.nanmedian(noise)), samples))
-    return min(found, key=lambda pair: pair[0])[1]
-
-
-def _steady(log: Log, site: Site) -> float | None:
-    """Return the usual size of the field, relative to the Earth's."""
-    if log.vectors is None or site.earth_field_world is None:
-        return None
-    size = np.linalg.norm(log.vectors.measured_sensor, axis=1)
-    return float(np.median(size) / np.linalg.norm(site.earth_field_world))
-
-
-def _of_fields(known: Snapshots, samples: FieldSamples, steady: float | None) -> list[Explanation]:
-    tried = [*matrix_causes(known, steady), *beacon_causes(known), *phase_causes(known, samples)]
-    if clearly_best(tried) is None:
-        tried += global_causes(known)
-    # Where the platform stands, and of one beacon that may be wrong in two ways, no more is told.
-    if _moves(known) and not any(one.clear and one.after < known.freedom for one in tried):
-        tried += survey_causes(known)
-    return tried
-
-
-def _moves(known: Snapshots) -> bool:
-    place = known.fixes.position_world[:, 0]
-    return float(np.max(np.ptp(place, axis=0))) > LEAST_WAY
-
-
-def _of_motion(known: Snapshots, samples: FieldSamples, imu: ImuSamples) -> list[Explanation]:
-    site = known.site
-    if not site.platform.inertial:
-        return []
-    every = surveyed(samples, known.calibration)
-    motion = compared(every, imu, site)
-    if motion is None:
-        return []
-    before, _ = motion.explained(EYE, EYE)
-    return [
-        *motion_causes(motion, site),
-        *gyro_unit_causes(every, imu, site, before, motion.freedom),
-        *timing_causes(every, imu, site, before, motion.freedom),
-    ]
-
-
-def _part(log: Log) -> Log:
-    """Return a log, or of a long one some parts of it."""
-    first, last = float(log.imu.time[0]), float(log.imu.time[-1])
-    if last - first <= LONGEST:
-        return log
-    begins = np.linspace(first, last - LONGEST / PARTS, PARTS)
-
-    def within(time: Array) -> BoolArray:
-        since = time[:, None] - begins
-        return np.asarray(np.any((since >= 0.0) & (since < LONGEST / PARTS), axis=1))
-
-    imu, wave, fields = log.imu, log.waveform, log.fields
-    kept = within(imu.time)
-    return replace(
-        log,
-        imu=ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept]),
-        waveform=None if wave is None else wave.rows(within(wave.time)),
-        fields=None if fields is None else fields.rows(within(fields.time)),
-        steady=None,
-    )

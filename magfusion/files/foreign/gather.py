@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from magfusion.errors import InputError
-from magfusion.files.bag import is_bag
+from magfusion.files.bag_topics import is_bag
 from magfusion.files.euroc import find_magnetometer, is_euroc
 from magfusion.files.foreign.arrays import ARRAYS, array_source
 from magfusion.files.foreign.bag_table import plan_bag
