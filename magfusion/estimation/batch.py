@@ -215,8 +215,9 @@ def _solved(
         # Another pass is sure to come.
         short = (done == 0 or tuning) and done + 1 < settings.passes
         tolerance = ON_THE_WAY if short else CONVERGED
-        # Noise is told from the residuals by the sigmas, which must then be as they are.
-        roughly = short and not (tuning and (done > 0 or not by_waveform))
+        # The noise that stays is told from the residuals by the sigmas as they are.
+        finds = tuning and (done > 0 or not by_waveform)
+        roughly = short and not (finds and done >= TUNINGS)
         graph, gaps = graph_of(log, states, calibration, wave, standing, roughly=roughly)
         begun = initial_estimate(states, calibration, segments)
         found = optimise(graph, begun, tolerance=tolerance)
@@ -236,10 +237,11 @@ def _solved(
         old, calibration = calibration, found.estimate.calibration
         standing = standing | stood
         segments = found.estimate.segments
-        if tuning and (wave is not None or not by_waveform):
+        if finds:
             give_back_memory()
             latest = noise_of(log, graph, found.estimate, states, wave, declared)
-            tuning = done < TUNINGS and plausible(latest) and not same_noise(tuned, latest)
+            again = roughly or (done < TUNINGS and not same_noise(tuned, latest))
+            tuning = again and plausible(latest)
             tuned, settled = latest if plausible(latest) else as_declared(latest), False
             log = replace(log, declared=with_noise(log.declared, tuned))
             calibration = with_noise(calibration, tuned)

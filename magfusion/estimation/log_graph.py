@@ -160,8 +160,8 @@ def graph_of(
     standing : bool ndarray, shape (states,), optional
         Where the platform is known to stand.
     roughly : bool
-        Whether another graph will follow, and no noise is found by this one: the sigmas of the
-        inertial factors may be a tenth off.
+        Whether another graph will follow, and the noise that stays is not found by this one: the
+        sigmas of the inertial factors may be a tenth off.
     """
     links, bridged = _links(log, states, calibration, roughly=roughly)
     measurements = [
