@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
+from magfusion.model.quaternion import cross
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
 from magfusion.units import Array, BoolArray
@@ -200,6 +201,18 @@ def convolved(value: Array, kernel: Array, mode: Literal["valid", "same"]) -> Ar
     return np.asarray(irfft(spectrum, size, axis=0)[first : first + count])
 
 
+def _products(vectors: Array) -> Array:
+    """Return columns of which the products sum to squares of cross products, the others taken off.
+
+    By ``|a x b|^2 = |a|^2 |b|^2 - (a b)^2``: the first, and six that are taken off.
+    """
+    x, y, z = vectors.T
+    root = np.sqrt(2.0)
+    square = x**2 + y**2 + z**2
+    apart = x**2, y**2, z**2, root * x * y, root * y * z, root * z * x
+    return np.stack([square, *apart], axis=1)
+
+
 class Clocks:
     """Turn of the field and rates on one grid, by the stamps of each."""
 
@@ -221,11 +234,12 @@ class Clocks:
             return 0.0, -np.inf
         field, change = field[count:-count], change[count:-count]
         total = float(np.sum(change**2))
-        left = np.empty(2 * count + 1)
-        for k in range(2 * count + 1):
-            # A sample that is shifted to later is taken from before.
-            taken = rate[2 * count - k : len(rate) - k]
-            left[k] = np.sum((change + np.cross(taken, field)) ** 2)
+        # Of the change and the rate by the field; a sample shifted to later is taken from before.
+        turned, rated = _products(field), _products(rate)
+        turned[:, 1:] *= -1.0
+        pairs = [*zip(rate.T, 2.0 * cross(field.T, change.T), strict=True)]
+        pairs += zip(rated.T, turned.T, strict=True)
+        left = total + sum(np.correlate(by, own, "valid") for by, own in pairs)[::-1]
         k = int(np.argmin(left))
         finer = 0.0
         if 0 < k < 2 * count:
