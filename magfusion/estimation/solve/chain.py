@@ -127,13 +127,32 @@ def inverses(diagonal: Array, following: Array) -> Array:
     diagonal, following : ndarray
         As of `Chain`.
     """
-    out, pivot = np.empty_like(diagonal), diagonal[:, 0]
-    for i in range(out.shape[1]):
-        out[:, i] = _inverse(pivot)
-        if i + 1 < out.shape[1]:
-            back = np.swapaxes(out[:, i] @ following[:, i], 1, 2)
-            pivot = diagonal[:, i + 1] - back @ following[:, i]
+    out, count, taken = np.empty_like(diagonal), diagonal.shape[1], np.zeros(1)
+    # In units in which all numbers of a state are about one.
+    size = np.sqrt(np.maximum(np.einsum("hnii->hni", diagonal), np.finfo(np.float64).tiny))
+    for begin in range(0, count, STRETCH):
+        here = slice(begin, min(begin + STRETCH, count))
+        square = size[:, here, :, None] * size[:, here, None, :]
+        own = diagonal[:, here] / square
+        last = min(begin + STRETCH, count - 1)
+        between = size[:, begin:last, :, None] * size[:, begin + 1 : last + 1, None]
+        after = following[:, begin:last] / between
+        for k in range(own.shape[1]):
+            inverse = _inverted(own[:, k] - taken)
+            out[:, begin + k] = inverse
+            if k < after.shape[1]:
+                taken = np.swapaxes(inverse @ after[:, k], 1, 2) @ after[:, k]
+        out[:, here] /= square
     return out
+
+
+def _inverted(matrix: Array) -> Array:
+    """Return inverses of symmetric positive matrices of like units, (h, k, k)."""
+    try:
+        inverse = np.linalg.inv(matrix)
+    except np.linalg.LinAlgError:
+        return _inverse(matrix)
+    return np.asarray(0.5 * (inverse + np.swapaxes(inverse, 1, 2)))
 
 
 def _covariances(inverse: Array, gain: Array, kept: int) -> Array:
