@@ -56,30 +56,6 @@ def test_passes_that_run_out_are_reported() -> None:
     assert enough.state[0, 0] == pytest.approx(np.sqrt(2.0), rel=1e-12)
 
 
-def test_a_rival_that_creeps_far_behind_is_given_up() -> None:
-    behind = np.array([0.0, 100.0, 0.0, 10.0])  # of what no step takes away
-    asked = np.zeros(4, dtype=int)
-
-    def model(rows: np.ndarray, state: np.ndarray) -> Normal:
-        asked[rows] += 1
-        x, y = state.T
-        error = np.stack([30.0 * (y - x**2), 1.0 - x, behind[rows]], axis=1)
-        slope = np.zeros((len(rows), 3, 2))
-        slope[:, 0] = 30.0 * np.stack([-2.0 * x, np.ones(len(x))], axis=1)
-        slope[:, 1, 0] = -1.0
-        return normal_equations(error, slope)
-
-    start = np.array([[1.1, 1.2], [-1.2, 1.0], [1.1, 1.2], [-1.2, 1.0]])
-    alone, steps = minimise(model, start), asked.copy()
-    asked[:] = 0
-    rivals = minimise(model, start, rivals=2)
-    assert np.all(alone.converged)
-    assert rivals.converged.tolist() == [True, False, True, True]  # the last is near enough
-    assert asked[1] < steps[1]
-    np.testing.assert_array_equal(asked[[0, 2, 3]], steps[[0, 2, 3]])
-    np.testing.assert_array_equal(rivals.state[[0, 2, 3]], alone.state[[0, 2, 3]])
-
-
 def test_a_direction_that_no_residual_feels_stays() -> None:
     def model(_: np.ndarray, state: np.ndarray) -> Normal:
         jacobian = np.zeros((1, 2, 3))

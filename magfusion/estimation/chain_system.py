@@ -5,7 +5,7 @@ of every state, and what else is asked of all of them, come of one sweep (`solve
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -157,14 +157,15 @@ def field_piece(
     spread: Array,
 ) -> Piece:
     """Return the rows of some epochs of a measurement."""
-    found = factors.rows(states, calibration, factors.blocks)
-    jacobian = found.jacobian(dimension(factors.blocks))
+    size, every = dimension(factors.blocks), placed((*factors.blocks, *considered))
+    found = factors.rows(states, calibration, every)
     right = np.zeros((*found.error.shape, 1 + spread.shape[1]))
     right[..., 0] = -found.error
-    if considered:
-        by_other = factors.rows(states, calibration, considered).by_calibration
-        if by_other is not None:
-            right[..., 1:] = -_spread_over(by_other, spread)
+    by_every = found.by_calibration
+    if by_every is not None and considered:
+        right[..., 1:] = -_spread_over(by_every[..., size:], spread)
+        found = replace(found, by_calibration=by_every[..., :size])
+    jacobian = found.jacobian(size)
     by_state, by_calibration = jacobian[..., :MOTION], jacobian[..., MOTION:]
     return Piece(factors.measurement.epoch, by_state, by_calibration, right)
 

@@ -140,7 +140,7 @@ def _solved(epochs: Epochs) -> Fixes:
     if any(is_sized(beacon) for beacon in problem.calibration.site.beacons):
         # Candidates are those of dipoles: at full weight some end short of the minimum.
         start = solved_from(_softened(problem).rows(epoch), start).state
-    solved = solved_from(problem.rows(epoch), start, count)
+    solved = solved_from(problem.rows(epoch), start)
     best = np.argmin(solved.cost.reshape(-1, count), axis=1) + count * np.arange(len(problem.time))
     again = epochs.reweighed(solved.state.rotation[best], solved.state.position[best])
     if again is not None:

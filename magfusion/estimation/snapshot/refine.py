@@ -235,15 +235,13 @@ def _spread(problem: Problem, kind: Parameter) -> Array:
     return out
 
 
-def solved_from(problem: Problem, start: State, rivals: int = 1) -> Solved:
+def solved_from(problem: Problem, start: State) -> Solved:
     """Move every row to the minimum next to its start.
 
     Parameters
     ----------
     start : State
         Of the same rows.
-    rivals : int
-        So many rows in a row are of one epoch; see `magfusion.estimation.solve.batched.minimise`.
     """
     spread = _spread(problem, PHASE), _spread(problem, GAIN)
     count = start.phase.shape[1]
@@ -258,7 +256,7 @@ def solved_from(problem: Problem, start: State, rivals: int = 1) -> Solved:
     def moved(flat: Array, step: Array) -> Array:
         return _flat(_moved(_state(flat, count), step, *spread))
 
-    found = minimise(model, _flat(start), moved, relative=1e-7, absolute=1e-4, rivals=rivals)
+    found = minimise(model, _flat(start), moved, relative=1e-7, absolute=1e-4)
     return Solved(_state(found.state, count), found.cost, found.information)
 
 

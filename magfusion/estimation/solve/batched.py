@@ -17,8 +17,6 @@ SETTLED = 1e-11  # relative fall of the cost below which a problem is solved
 ROUNDING = 1e-13  # relative rise of the cost that is no rise
 DAMPING_START, DAMPING_LEAST, DAMPING_STOP = 1e-3, 1e-12, 1e9
 EASED, TIGHTENED = 0.2, 10.0  # factors of the damping after a good step and after a bad one
-FAIR = 12  # steps after which one of several rivals may be given up
-BEHIND, TIMES = 1e3, 10.0  # where its cost is larger than so much, and so many times the least
 UNFELT = 1e-15  # of the largest column of a Jacobian: no residual feels this direction
 # Smallest over largest singular value of a Jacobian of unit columns.  Rounding makes 1e-16 of a
 # zero, whatever the processor; noise of a thousandth makes 1e-3 of it.
@@ -43,7 +41,7 @@ class Solution(NamedTuple):
     state: Array  # (problems, ...) as the start
     cost: Array  # (problems,) sum of squares
     information: Array  # (problems, n, n) there
-    converged: BoolArray  # (problems,) False where the passes ran out, or a rival is ahead
+    converged: BoolArray  # (problems,) False where the passes ran out or nothing is finite
 
 
 Model = Callable[[IntArray, Array], Normal]
@@ -67,7 +65,6 @@ def minimise(
     passes: int = PASSES,
     relative: float = SETTLED,
     absolute: float = 0.0,
-    rivals: int = 1,
 ) -> Solution:
     """Minimise the sum of squares of each problem.
 
@@ -85,9 +82,6 @@ def minimise(
     relative, absolute : float
         A step that lowers the cost by less than this share of it, or by less than this, is the
         last.
-    rivals : int
-        So many problems in a row are starts of one and the same.  One that creeps along far behind
-        another is no solution of it, wherever it would end, and is given up there.
     """
     state = start.copy()
     rows = np.arange(len(state))
@@ -96,7 +90,7 @@ def minimise(
         state, normal.cost.copy(), normal.information.copy(), np.zeros(len(state), dtype=bool)
     )
     damping = np.full(len(rows), DAMPING_START)
-    for done in range(passes):
+    for _ in range(passes):
         if not len(rows):
             break
         trial = move(state[rows], _step(normal, damping))
@@ -113,15 +107,10 @@ def minimise(
             )
         )
         damping = np.maximum(damping * np.where(better, EASED, TIGHTENED), DAMPING_LEAST)
-        ended, behind = settled | (damping > DAMPING_STOP), np.zeros(len(rows), dtype=bool)
-        if rivals > 1 and done >= FAIR:
-            found.cost[rows] = normal.cost
-            least = np.min(found.cost.reshape(-1, rivals), axis=1)[rows // rivals]
-            behind = (normal.cost > BEHIND + TIMES * least) & ~ended
-            ended |= behind
+        ended = settled | (damping > DAMPING_STOP)
         if np.any(ended):
             # Where no step lowers the cost, however short, it is least to rounding.
-            solved = (settled | np.isfinite(normal.cost)) & ~behind
+            solved = settled | np.isfinite(normal.cost)
             _keep(found, rows[ended], Normal(*(part[ended] for part in normal)), solved[ended])
             rows, damping = rows[~ended], damping[~ended]
             normal = Normal(*(part[~ended] for part in normal))
