@@ -10,8 +10,8 @@ from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.demodulated_apart import each_alone
 from magfusion.estimation.initialization.handover import last_state
-from magfusion.estimation.integrity.judge import judged
-from magfusion.estimation.integrity.score import Score, score_of
+from magfusion.estimation.integrity.judge import judged_with_score
+from magfusion.estimation.integrity.score import Score
 from magfusion.estimation.integrity.spectrum import beside_lines
 from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.settings import EstimatorSettings
@@ -152,8 +152,7 @@ def find_online_start(
             log = _of_cycles(log, log.waveform, site, settings)
         how = SmootherSettings(loss="huber", **asked)
         log, left, result, excluded = _agreed(smooth(log, site, how), log, site, how)
-        honest, trust = judged(result, log)
-        score = score_of(result, imu)
+        honest, trust, score = judged_with_score(result, log)
         state = last_state(result, result.considered)
         if result.calibration.site.unheard or site.platform.further:
             state, score = _among_all(state, score, result, site, settings)

@@ -6,6 +6,7 @@ and is not said beside it; the covariance takes what all of them say.
 
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +20,12 @@ from magfusion.estimation.integrity.place_witness import of_place
 from magfusion.estimation.integrity.priors_of_log import bias_change, calibration_change
 from magfusion.estimation.integrity.recording import BRIDGED, recorded
 from magfusion.estimation.integrity.residual_blocks import fields, fixes, inertial
-from magfusion.estimation.integrity.score import field_residual, moved_estimate, scores_of
+from magfusion.estimation.integrity.score import (
+    Score,
+    field_residual,
+    moved_estimate,
+    scores_of,
+)
 from magfusion.estimation.integrity.signal import detected_in
 from magfusion.estimation.integrity.smoothed_compass import compass
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
@@ -35,6 +41,14 @@ FEW = 2  # causes at once
 STRONGER = 1.5  # than a trace is what leaves it
 
 
+class Judged(NamedTuple):
+    """A result with a covariance that its witnesses allow, what they say, and what is held."""
+
+    result: Smoothed
+    trust: Trust
+    score: Score | None
+
+
 def judged(result: Smoothed, log: Log) -> tuple[Smoothed, Trust]:
     """Return a result with a covariance that its witnesses allow, and what they say.
 
@@ -43,6 +57,12 @@ def judged(result: Smoothed, log: Log) -> tuple[Smoothed, Trust]:
     log : Log
         Of which the result is: its raw streams are witnesses too.
     """
+    found = judged_with_score(result, log)
+    return found.result, found.trust
+
+
+def judged_with_score(result: Smoothed, log: Log) -> Judged:
+    """Return the same, with the score of everything that the result holds."""
     log, _ = logged(log, result.declared.site)
     alone = result.earth_residual is None
     states = result.states if alone else None  # else the Earth field has had its say in them
@@ -53,7 +73,7 @@ def judged(result: Smoothed, log: Log) -> tuple[Smoothed, Trust]:
     give_back_memory()
     pose_cov = result.states.pose_cov
     if pose_cov is None:
-        return result, trust
+        return Judged(result, trust, None)
     at = result.states
     place = of_place(result.declared.site, at.time, at.world_from_body, at.position_world, pose_cov)
     trust |= Trust(place)
@@ -66,7 +86,7 @@ def judged(result: Smoothed, log: Log) -> tuple[Smoothed, Trust]:
         factor = factor if said.factor is None else np.maximum(factor, said.factor)
         spread = spread if said.spread is None else spread + said.spread
     widened = replace(result.states, pose_cov=factor[:, None, None] * pose_cov + spread)
-    return replace(result, states=widened), trust
+    return Judged(replace(result, states=widened), trust, score)
 
 
 def _heard(case: Case) -> Iterator[Testimony]:

@@ -239,7 +239,7 @@ class Clocks:
         turned[:, 1:] *= -1.0
         pairs = [*zip(rate.T, 2.0 * cross(field.T, change.T), strict=True)]
         pairs += zip(rated.T, turned.T, strict=True)
-        left = total + sum(np.correlate(by, own, "valid") for by, own in pairs)[::-1]
+        left = total + np.sum([np.correlate(by, own, "valid") for by, own in pairs], axis=0)[::-1]
         k = int(np.argmin(left))
         finer = 0.0
         if 0 < k < 2 * count:
