@@ -13,7 +13,7 @@ from magfusion.estimation.solve.chain import inverses
 from magfusion.estimation.state import states_in
 from magfusion.units import Array
 
-STRETCH = 256  # states that are eliminated at once
+STRETCH = 128  # states that are eliminated at once
 
 
 def left_over(graph: Graph, estimate: Estimate, beside: Columns, native: NativeRows) -> Array:

@@ -163,23 +163,23 @@ def field_piece(
     right[..., 0] = -found.error
     by_every = found.by_calibration
     if by_every is not None and considered:
-        right[..., 1:] = -_spread_over(by_every[..., size:], spread)
+        _spread_over(by_every[..., size:], -spread, right[..., 1:])
         found = replace(found, by_calibration=by_every[..., :size])
     jacobian = found.jacobian(size)
     by_state, by_calibration = jacobian[..., :MOTION], jacobian[..., MOTION:]
     return Piece(factors.measurement.epoch, by_state, by_calibration, right)
 
 
-def _spread_over(by_other: Array, spread: Array) -> Array:
-    """Return the columns that a spread makes of those of parameters; most spreads are diagonal."""
+def _spread_over(by_other: Array, spread: Array, out: Array) -> None:
+    """Write what a spread makes of the columns of parameters; most spreads are diagonal."""
     if not spread.size or np.any(np.count_nonzero(spread, axis=0) > 1):
-        return np.asarray(by_other @ spread)
+        np.matmul(by_other, spread, out=out)
+        return
     at = np.argmax(np.abs(spread), axis=0)
-    first = int(at[0])
-    if np.array_equal(at, np.arange(first, first + len(at))):
-        here = slice(first, first + len(at))
-        return np.asarray(by_other[..., here] * spread[at, np.arange(len(at))])
-    return np.asarray(by_other[..., at] * spread[at, np.arange(len(at))])
+    first, scale = int(at[0]), spread[at, np.arange(len(at))]
+    together = np.array_equal(at, np.arange(first, first + len(at)))
+    own = by_other[..., first : first + len(at)] if together else by_other[..., at]
+    np.multiply(own, scale, out=out)
 
 
 def column_groups(considered: tuple[Block, ...], epochs: int) -> list[slice]:

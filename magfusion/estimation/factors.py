@@ -22,7 +22,7 @@ from magfusion.units import Array, IntArray
 CALIBRATION_KEY = gtsam.symbol("c", 0)
 CONSIDERED_KEY = gtsam.symbol("h", 0)
 NUISANCE_KEY = gtsam.symbol("n", 0)
-PIECE = 256  # epochs that are differentiated at once
+PIECE = 128  # epochs that are differentiated at once: by hundreds of parameters, tens of megabytes
 Key = Callable[[int], int]  # of an epoch's variable
 
 

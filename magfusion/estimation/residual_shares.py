@@ -1,5 +1,6 @@
 """What an estimate leaves of errors in the residuals: drawn errors, given to its linear system."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -113,7 +114,7 @@ class Leavings:
         every = [field / self._weight for field in left[0]]
         of_imu = [(self._unwhitening @ own[..., None])[..., 0] for own in left[1]]
         self._inertial = of_imu
-        self._apart = [self._without_pose(field) for field in every]
+        self._apart = self._without_pose(every)
 
     def _drawn(self, site: Site, sensor_world: Array, windows: float) -> list[tuple[Array, Array]]:
         """Return drawn errors of fields and inertial factors: noise, model errors, the IMU's."""
@@ -144,21 +145,22 @@ class Leavings:
         nothing, still = np.zeros_like(drawn), np.zeros_like(imu)
         return [(drawn, still), (rough, still), (smooth, still), (nothing, imu)]
 
-    def _without_pose(self, field: Array) -> Array:
+    def _without_pose(self, fields: Sequence[Array]) -> list[Array]:
         """Return errors without what any other pose of their own epoch would explain.
 
         What inertial errors leave in the fields is that of a pose, and must not pass for noise.
         """
         weight = np.repeat(self._weight[..., 0] ** 2, 6, axis=1)
         several = np.sum(self._samples.valid, axis=1) >= FEWEST_CHANNELS
-        by, error = self._by_pose, field.reshape(len(field), -1)
-        normal = np.einsum("nri,nr,nrj->nij", by, weight, by)
+        by = self._by_pose
+        weighed = np.swapaxes(weight[..., None] * by, 1, 2)
+        errors = np.stack([field.reshape(len(field), -1) for field in fields], axis=-1)
+        normal = weighed @ by
         scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), np.finfo(float).tiny))
         normal = normal / scale[:, None] / scale[..., None] + LOOSE * np.eye(6)
-        right = np.einsum("nri,nr,nr->ni", by, weight, error) / scale
-        step = np.linalg.solve(normal, right[..., None])[..., 0] / scale
-        moved = error - np.einsum("nri,ni->nr", by, step)
-        return np.where(several[:, None], moved, error).reshape(field.shape)
+        step = np.linalg.solve(normal, weighed @ errors / scale[..., None]) / scale[..., None]
+        left = np.where(several[:, None, None], errors - by @ step, errors)
+        return [left[..., k].reshape(field.shape) for k, field in enumerate(fields)]
 
     def channels_of(self, beacon: int) -> list[ChannelErrors]:
         """Return the errors of the channels of a beacon, given by its number."""
