@@ -243,8 +243,9 @@ def _seen(
         coils = (mapped.correction @ coils[..., None])[..., 0]
         gradients = mapped.correction @ gradients + mapped.slope
     in_body = coils @ beacon_from_body
-    by_body = measured_from_beacon[..., None, :, :] @ gradients
-    by_body = by_body @ beacon_from_body[..., None, :, :]
+    # All coils at once: one product of a pose where there would be many.
+    flat = gradients.reshape(*gradients.shape[:-3], -1, 3) @ beacon_from_body
+    by_body = measured_from_beacon[..., None, :, :] @ flat.reshape(gradients.shape)
     turning = -np.swapaxes(_times(skew(in_body), body_from_sensor), -1, -2)
     by_rotation = turning - _times(by_body, skew(magnetometer.position_body))
     parts = (_times(in_body, body_from_sensor), by_rotation, by_body)
