@@ -12,7 +12,7 @@ from small_problem import small_log
 
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.integrity.judge import judged
-from magfusion.estimation.integrity.score import score_of
+from magfusion.estimation.integrity.score import scores_of
 from magfusion.estimation.integrity.statistics import (
     effective_number,
     holm,
@@ -175,8 +175,9 @@ def test_the_score_foretells_what_solving_again_finds() -> None:
         site, position_body=site.platform.magnetometer.position_body + np.array([0.01, 0.0, 0.0])
     )
     held = smooth(log, off, SmootherSettings(estimate=()))
-    score = score_of(held, log.imu)
-    assert score is not None
+    scores = scores_of(held, log.imu)
+    assert scores is not None
+    score = scores.held
     lever = next(b for b in score.held if b.parameter == SENSOR_POSITION)
     rows = np.arange(len(score.information))[lever.columns]
     information = score.information[np.ix_(rows, rows)]

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.batch import SmootherSettings, smooth
 from magfusion.estimation.integrity.fix_separation import separate_fixes
-from magfusion.estimation.integrity.score import score_of
+from magfusion.estimation.integrity.score import scores_of
 from magfusion.estimation.integrity.suspects import suspects
 from magfusion.estimation.preintegration import preintegration_parameters
 from magfusion.estimation.snapshot.likelihood import fix_epochs
@@ -112,8 +112,9 @@ def _gains(site: Site, declared: Site) -> dict[str, float]:
     config = SimulationConfig(DEMO_BOX_WORLD, duration=20.0, perturb=False)
     log = simulate_log(site, config, np.random.default_rng(4)).log
     result = smooth(log, declared, SmootherSettings(estimate=()))
-    score = score_of(result, log.imu)
-    assert score is not None
+    scores = scores_of(result, log.imu)
+    assert scores is not None
+    score = scores.held
     gains = {}
     for suspect in suspects(declared, score.held):
         gradient = suspect.combine.T @ score.gradient

@@ -116,18 +116,6 @@ class Score:
         return np.asarray(spread @ np.linalg.solve(inner, spread.T))
 
 
-def score_of(result: Smoothed, imu: ImuSamples) -> Score | None:
-    """Return the score of everything that a result holds; None where there is nothing to ask.
-
-    Parameters
-    ----------
-    imu : ImuSamples
-        As it was recorded.
-    """
-    scores = scores_of(result, imu)
-    return None if scores is None else scores.held
-
-
 class Scores(NamedTuple):
     """The score of everything that is held, and with what else is asked.
 
@@ -147,6 +135,8 @@ def scores_of(result: Smoothed, imu: ImuSamples, beside: Sequence[Block] = ()) -
 
     Parameters
     ----------
+    imu : ImuSamples
+        As it was recorded.
     beside : sequence of Block
         What else is asked, in the same sweep.
     """
