@@ -289,3 +289,27 @@ def test_what_a_command_says_that_it_imports_is_there() -> None:
     for module, _ in JOBS.values():
         for name in importlib.import_module(f"magfusion.jobs.{module}").COMMAND.imports:
             assert importlib.util.find_spec(f"magfusion.{name}") is not None, name
+
+
+@pytest.mark.parametrize("job", ["smooth", "navigate"])
+def test_a_command_imports_nothing_that_only_other_runs_ask(job: str) -> None:
+    """Of a mistake, bags, slots, the pipe and doubtful starts others know, when they are asked."""
+    others = {
+        "magfusion.estimation.initialization.search",
+        "magfusion.estimation.integrity.likely_cause",
+        "magfusion.estimation.several_arrivals",
+        "magfusion.files.bag",
+        "magfusion.files.stream",
+        "magfusion.receiver.slot_receiver",
+    }
+    told = f"""
+import sys
+from importlib import import_module
+from magfusion.jobs.{job} import COMMAND
+for name in COMMAND.imports:
+    import_module(f"magfusion.{{name}}")
+print(*({others!r} & set(sys.modules)))
+"""
+    done = _child("-c", told)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == []
