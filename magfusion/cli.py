@@ -23,12 +23,7 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from magfusion.errors import EstimationError, InputError, InputErrors
-from magfusion.files.standard_streams import (
-    binary_output,
-    end_at_once,
-    occupy_closed,
-    until_closed,
-)
+from magfusion.files.standard_streams import binary_output, occupy_closed, quick_exit, until_closed
 from magfusion.files.without_pandas import without_pandas
 from magfusion.jobs import GROUPS, JOBS
 from magfusion.jobs.settings import Command, Option, Settings, options
@@ -55,7 +50,7 @@ def main(arguments: list[str] | None = None) -> None:
     given = [part for part in given if part != DEBUG]
     if arguments is None and not debug:
         warnings.simplefilter("ignore")  # a library's warnings are no sentence of ours
-    ended = end_at_once() if arguments is None else []
+    ended = quick_exit() if arguments is None else []
     if arguments is None:
         gc.disable()  # until what the command needs is imported; see `_import_uncollected`
     occupy_closed()

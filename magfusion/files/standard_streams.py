@@ -64,7 +64,7 @@ def until_closed() -> Iterator[None]:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def end_at_once() -> list[int]:
+def quick_exit() -> list[int]:
     """Let the system take back at once what the process holds, when all else has ended.
 
     Python clears it object by object, which is a thirtieth of a short run (mypy ends alike).  What

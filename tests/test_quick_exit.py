@@ -9,14 +9,14 @@ import pytest
 PROGRAM = """
 import atexit, sys, threading, time
 from pathlib import Path
-from magfusion.files.standard_streams import end_at_once
+from magfusion.files.standard_streams import quick_exit
 
 class Slow:
     def __del__(self, touch=Path(sys.argv[1], "cleared").touch):
         touch()
 
 kept = Slow()
-status = end_at_once()
+status = quick_exit()
 atexit.register(Path(sys.argv[1], "registered").touch)
 threading.Thread(target=lambda: (time.sleep(0.2), Path(sys.argv[1], "thread").touch())).start()
 print("written", end="")
