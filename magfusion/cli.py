@@ -50,7 +50,7 @@ def main(arguments: list[str] | None = None) -> None:
     given = [part for part in given if part != DEBUG]
     if arguments is None and not debug:
         warnings.simplefilter("ignore")  # a library's warnings are no sentence of ours
-    ended = quick_exit() if arguments is None else []
+    ended = quick_exit() if arguments is None and not debug else []
     if arguments is None:
         gc.disable()  # until what the command needs is imported; see `_import_uncollected`
     occupy_closed()
