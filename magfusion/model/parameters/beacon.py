@@ -1,5 +1,6 @@
 """Parameters of a beacon: where it is, how strong, and how its drive runs."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
 
@@ -77,13 +78,15 @@ class _LogMoment(BeaconParameter, SiteParameter):
     walk = "clock.log_moment_walk"
 
     def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
-        beacon = self.part(calibration.site, owner)
-        coils = tuple(
-            replace(coil, moment_beacon=coil.moment_beacon * np.exp(change))
-            for coil, change in zip(beacon.coils, step, strict=True)
+        return self.all_moved(calibration, {owner: step})
+
+    def all_moved(self, calibration: Calibration, steps: Mapping[str, Array]) -> Calibration:
+        site = calibration.site  # remade once, not for every beacon
+        beacons = tuple(
+            _louder(beacon, steps[beacon.name]) if beacon.name in steps else beacon
+            for beacon in site.beacons
         )
-        site = self.with_part(calibration.site, replace(beacon, coils=coils))
-        return replace(calibration, site=site)
+        return replace(calibration, site=replace(site, beacons=beacons))
 
     def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
         beacons = (self.part(c.site, owner) for c in (old, new))
@@ -113,9 +116,13 @@ class _OfDrive(BeaconParameter):
         return len(site.platform.magnetometers)
 
     def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
+        return self.all_moved(calibration, {owner: step})
+
+    def all_moved(self, calibration: Calibration, steps: Mapping[str, Array]) -> Calibration:
         value = getattr(calibration, self.attribute).copy()
-        mine = self.mine(calibration.site, owner)
-        value[mine] += step if len(step) == 1 else np.resize(step, np.count_nonzero(mine))
+        for owner, step in steps.items():
+            mine = self.mine(calibration.site, owner)
+            value[mine] += step if len(step) == 1 else np.resize(step, np.count_nonzero(mine))
         return replace(calibration, **{self.attribute: value})
 
     def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
@@ -176,6 +183,15 @@ class _Gain(_OfDrive):
 
     def own_jacobian(self, view: PhasorView) -> ComplexArray:
         return view.phasor[..., None]
+
+
+def _louder(beacon: Beacon, step: Array) -> Beacon:
+    """Return the beacon with the logarithm of each coil's moment moved."""
+    coils = tuple(
+        replace(coil, moment_beacon=coil.moment_beacon * factor)
+        for coil, factor in zip(beacon.coils, np.exp(step), strict=True)
+    )
+    return replace(beacon, coils=coils)
 
 
 BEACON_ROTATION, BEACON_POSITION, LOG_MOMENT = _Rotation(), _Position(), _LogMoment()

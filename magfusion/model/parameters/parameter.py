@@ -208,6 +208,12 @@ class Parameter:
         value = calibration.others.get(name, 0.0) + step
         return replace(calibration, others={**calibration.others, name: value})
 
+    def all_moved(self, calibration: Calibration, steps: Mapping[str, Array]) -> Calibration:
+        """Return the calibration moved by the steps of several owners."""
+        for owner, step in steps.items():
+            calibration = self.moved(calibration, owner, step)
+        return calibration
+
     def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
         """Return the step that takes one calibration to another: the inverse of `moved`."""
         name, zero = f"{owner}.{self.kind}", np.zeros(1)
