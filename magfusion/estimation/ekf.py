@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -47,10 +48,8 @@ def _filter() -> type:
     return ExtendedKalmanFilter
 
 
-def _step(cov: Array, error: Array, jacobian: Array) -> tuple[Array, Array]:
-    size = len(cov)
-    kalman = _filter()(dim_x=size, dim_z=len(error))
-    kalman.x = np.zeros(size)  # filterpy's own (n, 1) would broadcast to a matrix
+def _step(kalman: Any, cov: Array, error: Array, jacobian: Array) -> tuple[Array, Array]:
+    kalman.x = np.zeros(len(cov))  # filterpy's own (n, 1) would broadcast to a matrix
     kalman.P = cov
     kalman.update(
         -error,
@@ -61,7 +60,7 @@ def _step(cov: Array, error: Array, jacobian: Array) -> tuple[Array, Array]:
     return np.asarray(kalman.x), np.asarray(0.5 * (kalman.P + kalman.P.T))
 
 
-def _step_from_far(cov: Array, error: Array, jacobian: Array) -> tuple[Array, Array]:
+def _step_from_far(_kalman: Any, cov: Array, error: Array, jacobian: Array) -> tuple[Array, Array]:
     """Return step and covariance by QR: the innovation's covariance spans too many digits."""
     prior = np.linalg.inv(np.linalg.cholesky(cov))
     right = np.concatenate([np.zeros(len(cov)), -error])
@@ -89,6 +88,8 @@ class ErrorStateFilter:
     def __init__(self, state: State, blocks: tuple[Block, ...], considered: int = 0) -> None:
         self.blocks, self.state, self.considered = blocks, state, considered
         self.lagged = state
+        # How much is measured, each update says; to make another filter costs a third of one.
+        self._kalman = _filter()(dim_x=len(state.cov), dim_z=1)
 
     def absorb(
         self,
@@ -121,7 +122,7 @@ class ErrorStateFilter:
             if state is not prior:  # from the prediction, which holds the prior
                 error = error - jacobian @ between(prior, state, self.blocks)
             try:
-                found = (_step_from_far if far else _step)(prior.cov, error, jacobian)
+                found = (_step_from_far if far else _step)(self._kalman, prior.cov, error, jacobian)
             except np.linalg.LinAlgError as failure:
                 raise EstimationError(f"the filter's update failed ({failure})") from failure
             step, cov = consider_update(*found, prior.cov, self.considered)

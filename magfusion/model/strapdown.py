@@ -259,7 +259,7 @@ def resting(
         Where rate and specific force scatter less about their means over the stretch than they may.
     """
     span = motion.rest_span if span is None else span
-    centres = np.mean(gyro_body, axis=0), np.mean(accel_body, axis=0)
+    centre = np.concatenate([np.mean(gyro_body, axis=0), np.mean(accel_body, axis=0)])
     asked = time if at is None else time[at]
     quiet = np.empty(len(asked), dtype=bool)
     for begin in range(0, len(time), CHUNK):
@@ -271,16 +271,17 @@ def resting(
         last = np.searchsorted(time, here[-1] + span / 2, side="right")
         lo = np.searchsorted(time[first:last], asked[own] - span / 2)
         hi = np.searchsorted(time[first:last], asked[own] + span / 2, side="right")
-        quiet[own] = (
-            _variance(gyro_body[first:last] - centres[0], lo, hi) < motion.rest_gyro**2
-        ) & (_variance(accel_body[first:last] - centres[1], lo, hi) < motion.rest_accel**2)
+        both = np.concatenate([gyro_body[first:last], accel_body[first:last]], axis=1)
+        gyro, accel = _variance(both - centre, lo, hi).T
+        quiet[own] = (gyro < motion.rest_gyro**2) & (accel < motion.rest_accel**2)
     inside = (asked - span / 2 >= time[0]) & (asked + span / 2 <= time[-1])
     return quiet & inside
 
 
 def _variance(centred: Array, lo: IntArray, hi: IntArray) -> Array:
-    """Return the sum of the axes' variances over rows from ``lo`` to before ``hi``."""
-    total = np.zeros((len(centred) + 1, 6))
+    """Return the sums of each vector's variances over rows from ``lo`` to before ``hi``, (n, 2)."""
+    total = np.zeros((len(centred) + 1, 12))
     np.cumsum(np.concatenate([centred, centred**2], axis=1), axis=0, out=total[1:])
     mean = (total[hi] - total[lo]) / (hi - lo)[:, None]
-    return np.asarray(np.sum(mean[:, 3:] - mean[:, :3] ** 2, axis=1))
+    variance = mean[:, 6:] - mean[:, :6] ** 2
+    return np.asarray(np.sum(variance.reshape(-1, 2, 3), axis=2))

@@ -7,6 +7,7 @@ find the platform elsewhere.  None of them knows the truth.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import chdtri
@@ -16,11 +17,17 @@ from magfusion.estimation.integrity.judgement import Judgement
 from magfusion.estimation.integrity.running import Running, nothing
 from magfusion.estimation.integrity.steady_field import DOUBT, off_earth
 from magfusion.estimation.state import MOTION, ROTATION, State
-from magfusion.model.parameters import Block, Calibration, difference, initial_calibration
+from magfusion.model.parameters import (
+    Block,
+    Calibration,
+    difference,
+    initial_calibration,
+    prior_sigma,
+)
 from magfusion.model.samples import SteadyFields
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Verdict
-from magfusion.units import Array
+from magfusion.units import Array, BoolArray
 
 MEMORY = 10.0  # s; of the innovations and of the compasses
 LEAST_SPAN = 1.0  # s; of inertial data, before gravity is judged
@@ -281,23 +288,17 @@ class OnlineWitness:
             self._declared = declared
         change = difference(declared, state.calibration, self.estimated)
         left = np.diagonal(state.cov)[MOTION : MOTION + len(change)]
-        elapsed = state.time - self._began
-        found, inflation = [], 1.0
-        total, number = 0.0, 0
-        for block in self.estimated:
-            if block.parameter.of_log:
-                continue
-            walk = block.parameter.walk_per_sqrt_hour(self.site) ** 2 * elapsed / 3600.0
-            prior = block.sigma**2 + walk
-            own = change[block.columns]
-            # What was only considered moves the estimate, and its error with it: it is in both.
-            borrowed = self._borrowed.get(block.name, np.zeros(len(own)))
-            both = 2.0 * np.minimum(borrowed, left[block.columns])
-            gained = np.maximum(prior - left[block.columns] + both, LEAST_GAIN * prior)
-            score = float(np.max(np.abs(own) / np.sqrt(gained)))
-            usual = np.maximum(prior, gained)
-            total, number = total + float(np.sum(own**2 / usual)), number + len(own)
-            if score > DOUBT:
+        walk = self._walk * (state.time - self._began) / 3600.0
+        prior = prior_sigma(self.estimated) ** 2 + walk
+        # What was only considered moves the estimate, and its error with it: it is in both.
+        both = 2.0 * np.minimum(self._borrowed_variance(), left)
+        gained = np.maximum(prior - left + both, LEAST_GAIN * prior)
+        scores, usual = np.abs(change) / np.sqrt(gained), np.maximum(prior, gained)
+        of_site, found, inflation = self._of_site, [], 1.0
+        total, number = float(np.sum((change**2 / usual)[of_site])), int(np.sum(of_site))
+        for block in self.estimated if np.any(scores[of_site] > DOUBT) else ():
+            score = float(np.max(scores[block.columns]))
+            if not block.parameter.of_log and score > DOUBT:
                 text = (
                     f"{block.name} came out {score:.1f} times what its declared sigma allows: a"
                     " wrong value in the site, or a sigma that is too small."
@@ -313,6 +314,22 @@ class OnlineWitness:
             inflation = max(inflation, total / number)
         self._prior = Judgement(tuple(found), inflation=inflation)
         return self._prior
+
+    @cached_property
+    def _of_site(self) -> BoolArray:
+        """Which of the estimated parameters are no log's own."""
+        own = [np.full(len(b.sigma), not b.parameter.of_log) for b in self.estimated]
+        return np.concatenate(own)
+
+    @cached_property
+    def _walk(self) -> Array:
+        """Variance that each estimated parameter gains in an hour."""
+        own = (b.parameter.walk_per_sqrt_hour(self.site) ** 2 for b in self.estimated)
+        return np.repeat(list(own), [len(b.sigma) for b in self.estimated])
+
+    def _borrowed_variance(self) -> Array:
+        own = (self._borrowed.get(b.name, np.zeros(len(b.sigma))) for b in self.estimated)
+        return np.concatenate(list(own))
 
     def _of_gravity(self) -> Judgement:
         """Judge what is left of the mean specific force: no platform falls for seconds."""

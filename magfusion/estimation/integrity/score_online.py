@@ -21,7 +21,7 @@ from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.state import MOTION, State, states_of
 from magfusion.model.audibility import are_many
-from magfusion.model.parameters import BeaconParameter, Block
+from magfusion.model.parameters import CLOCK_RATE, TIME_OFFSET, BeaconParameter, Block
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
 from magfusion.units import Array
@@ -57,6 +57,7 @@ class OnlineScore:
         steady: bool,
     ) -> None:
         self.site, self._tangent, self._steady = site, (estimated, considered), steady
+        self._each_alone = any(b.parameter not in (TIME_OFFSET, CLOCK_RATE) for b in estimated)
         self._sums, self._asked_at, self._said = None, -np.inf, Judgement()
         self._waiting: list[Epoch] = []
         self._unasked = 0
@@ -97,11 +98,11 @@ class OnlineScore:
         self._sums, self._waiting = None, []
 
     def foresee(self, measurement: Measurement, predicted: State) -> None:
-        """Predict of many beacons all that is asked: who asks for less of it finds it there.
+        """Predict all that is asked: who asks for less of it finds it there.
 
-        Of few, epochs wait to be heard together.
+        Of few beacons whose calibration stays, epochs wait to be predicted together.
         """
-        if self._sums is None or not are_many(self.site):
+        if self._sums is None or not (self._each_alone or are_many(self.site)):
             return
         self._hear([measurement], predicted.time)
         at = states_of([predicted]), predicted.calibration, self.asked.asked

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -109,7 +110,7 @@ class _OfDrive(BeaconParameter):
 
     def mine(self, site: Site, owner: str) -> BoolArray:
         """Return which entries are the owner's; here one a channel."""
-        return np.array([name == owner for name, _ in site.channels], dtype=bool)
+        return _named(tuple(name for name, _ in site.channels), owner)
 
     def copies(self, site: Site) -> int:
         """Return how often the array has it: the channels of every magnetometer do."""
@@ -155,7 +156,7 @@ class _Drift(_OfDrive):
         return np.array([0.0 if self.part(site, owner).synchronised else site.clock.drift_sigma])
 
     def mine(self, site: Site, owner: str) -> BoolArray:
-        return np.array([beacon.name == owner for beacon in site.beacons], dtype=bool)
+        return _named(tuple(beacon.name for beacon in site.beacons), owner)
 
     def copies(self, site: Site) -> int:
         return 1
@@ -183,6 +184,14 @@ class _Gain(_OfDrive):
 
     def own_jacobian(self, view: PhasorView) -> ComplexArray:
         return view.phasor[..., None]
+
+
+@lru_cache(maxsize=1024)
+def _named(names: tuple[str, ...], owner: str) -> BoolArray:
+    """Tell which names are the owner's; sites that differ in numbers alone have the same names."""
+    mine = np.array([name == owner for name in names], dtype=bool)
+    mine.flags.writeable = False
+    return mine
 
 
 def _louder(beacon: Beacon, step: Array) -> Beacon:
