@@ -1,10 +1,11 @@
 """What of a calibration does not stay as it is, and how fast it may go."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from magfusion.model.parameters import Block, Calibration
+from magfusion.model.parameters import Block, Calibration, Parameter
 from magfusion.model.site import Site
 from magfusion.units import Array
 
@@ -37,8 +38,8 @@ class ProcessNoise:
         if not self.variance.any():
             return np.zeros((len(self.variance),) * 2)
         gained = np.diag(self.variance * elapsed)
-        columns = {block.key: block.columns for block in self.blocks}
-        for block in self.blocks:
+        columns = self._columns
+        for block in self._walking:
             dragged = block.parameter.drags(calibration, block.owner, time)
             if dragged is None or (dragged[0], block.owner) not in columns:
                 continue
@@ -47,6 +48,15 @@ class ProcessNoise:
             gained[rows, own] = by_step @ gained[own, own]
             gained[own, rows] = gained[rows, own].T
         return gained
+
+    @cached_property
+    def _columns(self) -> dict[tuple[Parameter, str], slice]:
+        return {block.key: block.columns for block in self.blocks}
+
+    @cached_property
+    def _walking(self) -> list[Block]:
+        """The blocks that walk: what stays drags nothing."""
+        return [block for block in self.blocks if self.variance[block.columns].any()]
 
 
 def calibration_process_noise(

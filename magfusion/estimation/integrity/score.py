@@ -45,8 +45,6 @@ from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.samples import ImuSamples
 from magfusion.units import Array
 
-LARGE = 256  # columns; of many beacons most are known, and what has no spread is left out
-
 
 @dataclass(frozen=True, eq=False)
 class Score:
@@ -110,8 +108,7 @@ class Score:
         return np.diag(np.concatenate(own) / prior_sigma(self.held))
 
     def _taken(self, spread: Array) -> Array:
-        if spread.shape[1] > LARGE:
-            spread = spread[:, np.any(spread != 0.0, axis=0)]
+        spread = spread[:, np.any(spread != 0.0, axis=0)]  # most of it is known
         inner = np.eye(spread.shape[1]) + spread.T @ self.information @ spread
         return np.asarray(spread @ np.linalg.solve(inner, spread.T))
 

@@ -244,8 +244,13 @@ def difference(reference: Calibration, moved: Calibration, blocks: tuple[Block, 
     step = np.zeros(dimension(blocks))
     if moved is reference:  # as of a filter that estimates none
         return step
+    of_kind: dict[Parameter, list[Block]] = {}
     for block in blocks:
-        step[block.columns] = block.parameter.difference(reference, moved, block.owner)
+        of_kind.setdefault(block.parameter, []).append(block)
+    for parameter, own in of_kind.items():
+        steps = parameter.all_differences(reference, moved, [block.owner for block in own])
+        for block, part in zip(own, steps, strict=True):
+            step[block.columns] = part
     return step
 
 

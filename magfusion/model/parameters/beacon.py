@@ -1,6 +1,6 @@
 """Parameters of a beacon: where it is, how strong, and how its drive runs."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import ClassVar
@@ -90,9 +90,19 @@ class _LogMoment(BeaconParameter, SiteParameter):
         return replace(calibration, site=replace(site, beacons=beacons))
 
     def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
-        beacons = (self.part(c.site, owner) for c in (old, new))
-        before, after = (np.linalg.norm(beacon.moments_beacon, axis=1) for beacon in beacons)
-        return np.log(after / before)
+        (step,) = self.all_differences(old, new, [owner])
+        return step
+
+    def all_differences(
+        self, old: Calibration, new: Calibration, owners: Sequence[str]
+    ) -> list[Array]:
+        coils = [[self.part(c.site, owner).coils for owner in owners] for c in (old, new)]
+        before, after = (
+            np.linalg.norm([coil.moment_beacon for own in each for coil in own], axis=1)
+            for each in coils
+        )
+        last = np.cumsum([len(own) for own in coils[0][:-1]])
+        return np.split(np.log(after / before), last)
 
     def own_jacobian(self, view: PhasorView) -> ComplexArray:
         return view.whole.log_moments

@@ -1,6 +1,6 @@
 """What a calibration parameter is: all that is particular to one kind of it, in one object."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple
@@ -218,6 +218,12 @@ class Parameter:
         """Return the step that takes one calibration to another: the inverse of `moved`."""
         name, zero = f"{owner}.{self.kind}", np.zeros(1)
         return new.others.get(name, zero) - old.others.get(name, zero)
+
+    def all_differences(
+        self, old: Calibration, new: Calibration, owners: Sequence[str]
+    ) -> Iterable[Array]:
+        """Return the steps of several owners that take one calibration to another."""
+        return [self.difference(old, new, owner) for owner in owners]
 
     def value(self, calibration: Calibration, owner: str) -> Array | None:
         """Return what it is, flat, in the unit of a step; None where only changes are numbers."""
