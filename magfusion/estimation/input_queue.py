@@ -382,6 +382,9 @@ class Arrivals:
         A state is the platform's where the IMU's stamp says; under another offset it is the same
         state, a little earlier or later (s) on the log's clock.
         """
+        lag = float(state.calibration.imu_offset(np.array(state.time))) - self.applied_offset
+        if abs(lag) < OFFSET_STALE:
+            return 0.0
         by_state, run = np.zeros(len(state.cov)), state.time - state.calibration.imu_begin
         for block in blocks:
             if block.parameter in (TIME_OFFSET, CLOCK_RATE):
@@ -390,9 +393,8 @@ class Arrivals:
                 )
         if not np.any(by_state):
             return 0.0
-        lag = float(state.calibration.imu_offset(np.array(state.time))) - self.applied_offset
         sigma = float(np.sqrt(by_state @ state.cov @ by_state))
-        if abs(lag) < max(OFFSET_STALE, 2.0 * sigma):
+        if abs(lag) < 2.0 * sigma:
             return 0.0
         self.applied_offset += lag
         return lag

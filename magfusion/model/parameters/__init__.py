@@ -227,13 +227,13 @@ def retract(calibration: Calibration, blocks: tuple[Block, ...], step: Array) ->
         return calibration
     own = np.array(step)  # GTSAM's vectors are read-only
     last = int(own.nonzero()[0][-1])  # what is only considered does not move
+    numbers = own.tolist()
     steps: dict[Parameter, dict[str, Array]] = {}
     for block in blocks:
         if block.columns.start > last:
             continue
-        part = own[block.columns]
-        if part.any():
-            steps.setdefault(block.parameter, {})[block.owner] = part
+        if any(numbers[block.columns]):
+            steps.setdefault(block.parameter, {})[block.owner] = own[block.columns]
     for parameter, of_owners in steps.items():
         calibration = parameter.all_moved(calibration, of_owners)
     return calibration

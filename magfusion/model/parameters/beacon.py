@@ -101,8 +101,8 @@ class _LogMoment(BeaconParameter, SiteParameter):
             np.linalg.norm([coil.moment_beacon for own in each for coil in own], axis=1)
             for each in coils
         )
-        last = np.cumsum([len(own) for own in coils[0][:-1]])
-        return np.split(np.log(after / before), last)
+        steps = iter(np.log(after / before).tolist())
+        return [np.array([next(steps) for _ in own]) for own in coils[0]]
 
     def own_jacobian(self, view: PhasorView) -> ComplexArray:
         return view.whole.log_moments
@@ -137,9 +137,16 @@ class _OfDrive(BeaconParameter):
         return replace(calibration, **{self.attribute: value})
 
     def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
+        (step,) = self.all_differences(old, new, [owner])
+        return step
+
+    def all_differences(
+        self, old: Calibration, new: Calibration, owners: Sequence[str]
+    ) -> list[Array]:
         change = getattr(new, self.attribute) - getattr(old, self.attribute)
-        mine = change[self.mine(old.site, owner)]
-        return mine[: len(mine) // self.copies(old.site)]
+        copies = self.copies(old.site)
+        every = (change[self.mine(old.site, owner)] for owner in owners)
+        return [mine[: len(mine) // copies] for mine in every]
 
 
 class _Phase(_OfDrive):
@@ -189,8 +196,10 @@ class _Gain(_OfDrive):
 
     group, kind, attribute = "gain", "gain", "log_gain"
 
-    def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
-        return super().difference(old, new, owner)[:1]
+    def all_differences(
+        self, old: Calibration, new: Calibration, owners: Sequence[str]
+    ) -> list[Array]:
+        return [step[:1] for step in super().all_differences(old, new, owners)]
 
     def own_jacobian(self, view: PhasorView) -> ComplexArray:
         return view.phasor[..., None]

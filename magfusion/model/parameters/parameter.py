@@ -1,6 +1,6 @@
 """What a calibration parameter is: all that is particular to one kind of it, in one object."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple
@@ -221,7 +221,7 @@ class Parameter:
 
     def all_differences(
         self, old: Calibration, new: Calibration, owners: Sequence[str]
-    ) -> Iterable[Array]:
+    ) -> list[Array]:
         """Return the steps of several owners that take one calibration to another."""
         return [self.difference(old, new, owner) for owner in owners]
 
