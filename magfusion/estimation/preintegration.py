@@ -70,15 +70,16 @@ def cut_at_epochs(
     new[0] = True
     np.not_equal(grid[1:], grid[:-1], out=new[1:])
     grid = grid[new]
-    gyro, accel = (interpolated(grid, time, stream) for stream in (imu.gyro_body, imu.accel_body))
+    both = interpolated(grid, time, np.concatenate([imu.gyro_body, imu.accel_body], axis=1))
+    mean = 0.5 * (both[:-1] + both[1:])
     first = np.searchsorted(grid, epochs)
     bridged = np.zeros(len(epochs) - 1, dtype=bool)
     if gap.any():
         silent = np.flatnonzero(in_gap(time, grid, known))
         bridged[np.searchsorted(first, silent, side="right") - 1] = True
     return Increments(
-        0.5 * (gyro[:-1] + gyro[1:]),
-        0.5 * (accel[:-1] + accel[1:]),
+        mean[:, :3].copy(),
+        mean[:, 3:].copy(),
         grid[1:] - grid[:-1],
         first,
         bridged,
