@@ -122,6 +122,18 @@ def test_no_step_moves_nothing_and_no_step_changes_its_start():
     assert np.array_equal(predict_channels(unmoved, time, rotation, position), before)
 
 
+def test_steps_of_all_beacons_at_once_are_those_of_each_alone():
+    start, step = moved_calibration(), small_step(11)
+    at_once, one_by_one = retract(start, ALL, step), start
+    for block in ALL:
+        one_by_one = block.parameter.moved(one_by_one, block.owner, step[block.columns])
+    np.testing.assert_allclose(difference(at_once, one_by_one, ALL), 0.0, atol=1e-15)
+    for block in ALL:
+        alone = block.parameter.difference(start, at_once, block.owner)
+        found = difference(start, at_once, ALL)[block.columns]
+        np.testing.assert_allclose(found, alone, rtol=1e-13, atol=1e-16)
+
+
 def test_retract_turns_on_the_right_and_shifts_beacons_in_world_axes():
     site = mixed_site()
     start, step = initial_calibration(site, 0.0), small_step(10)
