@@ -1,5 +1,6 @@
 """Inertial data between field epochs: cut, averaged and preintegrated."""
 
+from collections import deque
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -165,9 +166,9 @@ def preintegrate(
         measurement = gtsam.PreintegratedCombinedMeasurementsG(
             wide if increments.bridged[i] else usual, bias
         )
-        integrate = measurement.integrateMeasurement
-        for a, w, step in zip(accel[lo:hi], gyro[lo:hi], dt[lo:hi], strict=True):
-            integrate(a, w, step)
+        steps = accel[lo:hi], gyro[lo:hi], dt[lo:hi]
+        # A loop in Python over the samples takes longer.
+        deque(map(measurement.integrateMeasurement, *steps), maxlen=0)
         out.append(measurement)
     return out
 
