@@ -60,7 +60,7 @@ def _step(kalman: Any, cov: Array, error: Array, jacobian: Array) -> tuple[Array
     return np.asarray(kalman.x), np.asarray(0.5 * (kalman.P + kalman.P.T))
 
 
-def _step_from_far(_kalman: Any, cov: Array, error: Array, jacobian: Array) -> tuple[Array, Array]:
+def _step_from_far(cov: Array, error: Array, jacobian: Array) -> tuple[Array, Array]:
     """Return step and covariance by QR: the innovation's covariance spans too many digits."""
     prior = np.linalg.inv(np.linalg.cholesky(cov))
     right = np.concatenate([np.zeros(len(cov)), -error])
@@ -122,7 +122,11 @@ class ErrorStateFilter:
             if state is not prior:  # from the prediction, which holds the prior
                 error = error - jacobian @ between(prior, state, self.blocks)
             try:
-                found = (_step_from_far if far else _step)(self._kalman, prior.cov, error, jacobian)
+                found = (
+                    _step_from_far(prior.cov, error, jacobian)
+                    if far
+                    else _step(self._kalman, prior.cov, error, jacobian)
+                )
             except np.linalg.LinAlgError as failure:
                 raise EstimationError(f"the filter's update failed ({failure})") from failure
             step, cov = consider_update(*found, prior.cov, self.considered)
