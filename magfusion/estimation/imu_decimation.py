@@ -1,33 +1,55 @@
 """Fewer steps of an inertial stream between epochs far apart, that integrate to the same.
 
-GTSAM integrates one step a call.  Here the steps of a long interval are joined by tens or twenties,
-two joined steps at a time: their rates make the turns of the two halves, their specific forces the
-velocity and the position gained over both, exactly as the Galilean group composes them of the
-single steps.  The noise's covariance and the derivatives by the biases are those of the longer
-steps.  GTSAM's scheme of the covariance is of first order: the sigmas differ by half a step's share
-of the interval.  The derivatives differ by a twelfth of the square of the turn in a step, of a
-change of bias that the next pass makes nothing.
+GTSAM integrates one step a call.  Here the steps of a long interval are joined by eights, tens or
+twenties, two joined steps at a time: their rates make the turns of the two halves, their specific
+forces the velocity and the position gained over both, exactly as the Galilean group composes them
+of the single steps.  The noise's covariance and the derivatives by the biases are those of the
+longer steps.  GTSAM's scheme of the covariance is of first order: the sigmas differ by less than
+half a step's share of the interval.  The derivatives differ by a twelfth of the square of the turn
+in a step, of a change of bias that the next pass makes nothing.
 """
 
-from dataclasses import dataclass, replace
+from bisect import bisect_left
+from dataclasses import replace
+from math import factorial
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.preintegration import Increments, cut_at_epochs, preintegrate
-from magfusion.model.quaternion import cross, product, turned
+from magfusion.model.quaternion import cross, matrices, product, turned, vectors
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel
 from magfusion.receiver.admission import meets
 from magfusion.units import Array, BoolArray, IntArray
 
-JOINED = (20, 10)  # steps made one: as many as leave enough
-FEWEST_LEFT = 200  # joined steps of an interval that is thinned
-ROUGHLY_JOINED, ROUGHLY_LEFT = (20, 10, 7, 5), 8  # where sigmas a tenth wrong do no harm
+# Steps made one, and how many joined ones an interval must have left.
+Way = tuple[int, int]
+JOINED: tuple[Way, ...] = ((20, 200), (10, 200), (8, 50))
+# Where sigmas a tenth wrong do no harm.
+ROUGHLY_JOINED: tuple[Way, ...] = ((20, 8), (10, 8), (7, 8), (5, 8))
 MOST_TURN = 0.5  # rad; within a joined step, for the series and for the derivatives
-CHUNK = 8192  # pairs of joined steps at a time: what is computed of them stays in the cache
+CHUNK = 65_536  # steps joined at a time: what is computed of them stays in the cache
 STRETCH = 200_000  # samples cut at a time: what is made of them is no multiple of a long log
+_AT_REST = np.concatenate([np.eye(3), 0.5 * np.eye(3)], axis=1)
+# Of `_coefficients` the factors of 1, x^2, x^4 ...
+_SERIES = np.array(
+    [
+        [
+            (-1) ** k / factorial(2 * k + 2),
+            (-1) ** k / factorial(2 * k + 3),
+            (-1) ** k / factorial(2 * k + 4),
+            (-0.25) ** k / factorial(2 * k),
+            0.5 * (-0.25) ** k / factorial(2 * k + 1),
+        ]
+        for k in range(5)
+    ]
+)
+# The square up to which, after the first, 1, 2, ... terms do: the next is nothing beside the first.
+_FEW_TERMS = [
+    (1e-17 / np.max(np.abs(_SERIES[k] / _SERIES[0]))) ** (1 / k) for k in range(2, len(_SERIES))
+]
 
 
 def preintegrate_stream(
@@ -81,8 +103,8 @@ def preintegrate_stream(
         if silence is not None:
             silent = meets(*silence, epochs[begin:end], epochs[begin + 1 : end + 1])
             increments = replace(increments, bridged=increments.bridged | silent)
-        ways = (ROUGHLY_JOINED, ROUGHLY_LEFT) if roughly else (JOINED, FEWEST_LEFT)
-        increments = thinned(increments, accel_bias[here], gyro_bias[here], *ways)
+        ways = ROUGHLY_JOINED if roughly else JOINED
+        increments = thinned(increments, accel_bias[here], gyro_bias[here], ways)
         measured += preintegrate(increments, model, gravity, accel_bias[here], gyro_bias[here])
         bridged.append(increments.bridged)
         begin = end
@@ -90,11 +112,7 @@ def preintegrate_stream(
 
 
 def thinned(
-    increments: Increments,
-    accel_bias: Array,
-    gyro_bias: Array,
-    ways: tuple[int, ...] = JOINED,
-    fewest: int = FEWEST_LEFT,
+    increments: Increments, accel_bias: Array, gyro_bias: Array, ways: tuple[Way, ...] = JOINED
 ) -> Increments:
     """Join the steps of the long intervals.
 
@@ -103,11 +121,9 @@ def thinned(
     accel_bias, gyro_bias : ndarray, shape (epochs, 3)
         At which they will be preintegrated (m/s^2, rad/s): there the result is the same to
         rounding.
-    ways : tuple of int
-        Numbers of steps that may be joined to one, falling.  Of each interval the first is taken
-        that leaves enough steps.
-    fewest : int
-        Joined steps of an interval that are enough.
+    ways : tuple of (int, int)
+        How many steps may be joined to one, falling, and how many joined steps of an interval are
+        enough for it.  Of each interval the first way is taken that leaves enough.
 
     Returns
     -------
@@ -115,15 +131,13 @@ def thinned(
         The given ones where no interval is long.  Left single are intervals with a gap, steps that
         fill no pair, and those of a fast turn.
     """
-    steps = np.diff(increments.first)
-    if steps.max(initial=0) < fewest * ways[-1]:
-        return increments
-    for i, joined in enumerate(ways):
-        long = (steps >= fewest * joined) & ~increments.bridged
-        if i > 0:
-            long &= steps < fewest * ways[i - 1]
-        if np.any(long):
+    left = np.diff(increments.first)
+    left[increments.bridged] = 0
+    for joined, fewest in ways:
+        long = left >= fewest * joined
+        if long.any():
             increments = _with_joined(increments, joined, long, accel_bias, gyro_bias)
+            left[long] = 0
     return increments
 
 
@@ -131,26 +145,26 @@ def _with_joined(
     increments: Increments, joined: int, long: BoolArray, accel_bias: Array, gyro_bias: Array
 ) -> Increments:
     start, owner = _pairs(increments, joined, long)
+    every = np.concatenate([increments.gyro_body.T, increments.accel_body.T, increments.dt[None]])
+    biases = np.concatenate([gyro_bias.T, accel_bias.T])
+    single, number = np.arange(joined)[:, None], max(CHUNK // (2 * joined), 1)
+    made, begun = [], []
+    for lo in range(0, len(start), number):
+        first = start[lo : lo + number]
+        rows = single + np.concatenate([first, first + joined])
+        bias = biases.take(np.tile(owner[lo : lo + number], 2), axis=1)
+        both, gentle = _joined(every.take(rows, axis=1), bias)
+        made.append(both[:, :, gentle])
+        begun.append(first[gentle])
+    first, both = np.concatenate(begun), np.concatenate(made, axis=2)
     kept = np.ones(len(increments.dt), dtype=bool)
-    made, first = [], []
-    for lo in range(0, len(start), CHUNK):
-        rows, interval = start[lo : lo + CHUNK], owner[lo : lo + CHUNK]
-        bias = np.concatenate([gyro_bias[interval], accel_bias[interval]], axis=1)
-        halves = _halves(increments, joined, rows, bias)
-        gentle = np.max(halves.path, axis=0) < MOST_TURN
-        made.append(_joined(halves, bias)[gentle])
-        first.append(rows[gentle])
-    begun, both = np.concatenate(first), np.concatenate(made)
-    for k in range(2 * joined):
-        kept[begun + k] = k % joined == 0
-    left = np.flatnonzero(kept)
-    place = np.searchsorted(left, begun)
-    gyro, accel, dt = increments.gyro_body[left], increments.accel_body[left], increments.dt[left]
-    for half in range(2):
-        gyro[place + half] = both[:, half, :3]
-        accel[place + half] = both[:, half, 3:6]
-        dt[place + half] = both[:, half, 6]
-    return Increments(gyro, accel, dt, np.searchsorted(left, increments.first), increments.bridged)
+    kept[np.arange(2 * joined)[:, None] + first] = False
+    kept[first] = kept[first + joined] = True
+    for half, steps in enumerate(both.swapaxes(0, 1)):
+        every[:, first + half * joined] = steps
+    every = every[:, kept]
+    ends = np.append(0, np.cumsum(kept))[increments.first]
+    return Increments(every[:3].T.copy(), every[3:6].T.copy(), every[6], ends, increments.bridged)
 
 
 def _pairs(increments: Increments, joined: int, long: BoolArray) -> tuple[IntArray, IntArray]:
@@ -161,112 +175,152 @@ def _pairs(increments: Increments, joined: int, long: BoolArray) -> tuple[IntArr
     return increments.first[owner] + 2 * joined * within, owner
 
 
-@dataclass(frozen=True, eq=False)
-class _Halves:
-    """What the steps of two joined ones integrate to, each from rest at its own beginning.
+class _Moved(NamedTuple):
+    """What steps integrate to, each from rest at its own beginning.
 
     Parameters
     ----------
-    turn : ndarray, shape (4, 2, n)
+    turn : ndarray, shape (4, k, n)
         Quaternion, scalar first.
-    velocity, position : ndarray, shape (3, 2, n)
-        Gained, in the axes of the beginning (m/s, m).
-    dt : ndarray, shape (2, n)
+    gained : ndarray, shape (3, 2, k, n)
+        Velocity and position, in the axes of the beginning (m/s, m).
+    dt : ndarray, shape (k, n)
         (s)
-    path : ndarray, shape (2, n)
-        Angle turned through, to and fro (rad).
     """
 
     turn: Array
-    velocity: Array
-    position: Array
+    gained: Array
     dt: Array
-    path: Array
+
+    def part(self, steps: slice) -> "_Moved":
+        """Return some of the k steps."""
+        return _Moved(self.turn[:, steps], self.gained[:, :, steps], self.dt[steps])
+
+    def then(self, later: "_Moved") -> "_Moved":
+        """Return what these steps and later ones integrate to, one after the other."""
+        gained = self.gained + turned(self.turn[:, None], later.gained)
+        gained[:, 1] += self.gained[:, 0] * later.dt
+        return _Moved(product(self.turn, later.turn), gained, self.dt + later.dt)
 
 
-def _halves(increments: Increments, joined: int, start: IntArray, bias: Array) -> _Halves:
-    shape = (2, len(start))
-    turn, path = np.zeros((4, *shape)), np.zeros(shape)
-    turn[0] = 1.0
-    velocity, position, total = np.zeros((3, *shape)), np.zeros((3, *shape)), np.zeros(shape)
-    gyro_bias, accel_bias = bias.T[:3, None], bias.T[3:, None]
-    for k in range(joined):
-        rows = np.stack([start + k, start + joined + k])
-        dt = increments.dt[rows]
-        rotation = (np.moveaxis(increments.gyro_body[rows], 2, 0) - gyro_bias) * dt
-        gained = (np.moveaxis(increments.accel_body[rows], 2, 0) - accel_bias) * dt
-        square = np.sum(rotation**2, axis=0)
-        once = cross(rotation, gained)
-        twice = cross(rotation, once)
-        b, c, d = _coefficients(square)
-        position += velocity * dt + turned(turn, (0.5 * gained + c * once + d * twice) * dt)
-        velocity += turned(turn, gained + b * once + c * twice)
-        turn = product(turn, _quaternion(rotation, square))
-        path += np.sqrt(square)
-        total += dt
-    return _Halves(turn, velocity, position, total, path)
+def _of_steps(steps: Array, bias: Array) -> tuple[_Moved, Array]:
+    """Return what single steps, (7, k, n), integrate to, and the angle that each turns through."""
+    dt = steps[6]
+    rotation, gained = (steps[:6].reshape(2, 3, *dt.shape) - bias.reshape(2, 3, 1, -1)) * dt
+    square = np.einsum("i...,i...->...", rotation, rotation)
+    b, c, d, cosine, sine = _coefficients(square)
+    once = cross(rotation, gained)
+    twice = cross(rotation, once)
+    both = np.empty((3, 2, *dt.shape))
+    both[:, 0] = gained + b * once + c * twice
+    both[:, 1] = (0.5 * gained + c * once + d * twice) * dt
+    turn = np.empty((4, *dt.shape))
+    turn[0] = cosine
+    np.multiply(sine, rotation, out=turn[1:])
+    return _Moved(turn, both, dt), np.sqrt(square)
 
 
-def _joined(halves: _Halves, bias: Array) -> Array:
-    """Return rate, specific force and length of both steps, shape (n, 2, 7).
+def _one_after_the_other(steps: _Moved) -> _Moved:
+    """Return what all k steps integrate to, k of it 1: neighbours together, and these again."""
+    number = len(steps.dt)
+    if number == 1:
+        return steps
+    even = number - number % 2
+    pairs = steps.part(slice(0, even, 2)).then(steps.part(slice(1, even, 2)))
+    if even < number:
+        last = steps.part(slice(even, None))
+        pairs = _Moved(
+            np.concatenate([pairs.turn, last.turn], axis=1),
+            np.concatenate([pairs.gained, last.gained], axis=2),
+            np.concatenate([pairs.dt, last.dt]),
+        )
+    return _one_after_the_other(pairs)
+
+
+def _joined(steps: Array, bias: Array) -> tuple[Array, BoolArray]:
+    """Return two steps that integrate to what many do.
 
     Constant over each step, they give the turns of the halves, and together velocity and position
     of the whole.
+
+    Parameters
+    ----------
+    steps : ndarray, shape (7, k, 2 n)
+        Rate, specific force and length of the single steps of n first halves, then of the second.
+    bias : ndarray, shape (6, 2 n)
+        Of gyro and accelerometer (rad/s, m/s^2).
+
+    Returns
+    -------
+    both : ndarray, shape (7, 2, n)
+        Rate, specific force and length.
+    gentle : ndarray of bool, shape (n,)
+        Whether neither half turns far.
     """
-    first, second = halves.dt[..., None, None]
-    quaternion = np.moveaxis(halves.turn, 0, 2)
-    turn = Rotation.from_quat(quaternion.reshape(-1, 4), scalar_first=True)
-    rotation = turn.as_rotvec().reshape(2, -1, 3)
-    after = turn.as_matrix().reshape(2, -1, 3, 3)[0]
-    (to_velocity, to_velocity_2), (to_position, to_position_2) = _by_force(rotation)
-    v_1, v_2 = np.moveaxis(halves.velocity, 0, 2)[..., None]
-    p_1, p_2 = np.moveaxis(halves.position, 0, 2)[..., None]
-    whole = np.concatenate([v_1 + after @ v_2, p_1 + v_1 * second + after @ p_2], axis=1)
-    system = np.empty((len(bias), 6, 6))
-    system[:, :3, :3] = to_velocity * first
-    system[:, :3, 3:] = after @ to_velocity_2 * second
-    system[:, 3:, :3] = to_position * first**2 + to_velocity * first * second
-    system[:, 3:, 3:] = after @ to_position_2 * second**2
-    force = np.linalg.solve(system, whole).reshape(-1, 2, 3) + bias[:, None, 3:]
-    length = halves.dt.T[..., None]
-    rate = np.swapaxes(rotation, 0, 1) / length + bias[:, None, :3]
-    return np.concatenate([rate, force, length], axis=2)
+    moved, angle = _of_steps(steps, bias)
+    gentle = np.maximum(*angle.sum(axis=0).reshape(2, -1)) < MOST_TURN
+    halves = _one_after_the_other(moved)
+    turn, dt = halves.turn[:, 0], halves.dt[0]
+    n = len(gentle)
+    second = dt[n:, None, None]
+    rotation, after = vectors(turn), matrices(turn[:, :n])
+    gained = halves.gained[:, :, 0].T  # (2 n, 2, 3)
+    whole = gained[:n] + gained[n:] @ after.transpose(0, 2, 1)
+    whole[:, 1] += gained[:n, 0] * second[:, 0]
+    by_force = _by_force(rotation) * dt[:, None, None]
+    by_force[..., 3:] *= dt[:, None, None]
+    system = np.empty((n, 6, 6))
+    system[:, :3, :3] = by_force[:n, :, :3]
+    system[:, 3:, :3] = by_force[:n, :, 3:] + by_force[:n, :, :3] * second
+    later = after @ by_force[n:]
+    system[:, :3, 3:], system[:, 3:, 3:] = later[..., :3], later[..., 3:]
+    force = np.linalg.solve(system, whole.reshape(n, 6, 1))
+    both = np.empty((7, 2, n))
+    both[:3] = (rotation / dt).reshape(3, 2, n)
+    both[3:6] = force.reshape(n, 2, 3).transpose(2, 1, 0)
+    both[:6] += bias.reshape(6, 2, n)
+    both[6] = dt.reshape(2, n)
+    return both, gentle
 
 
-def _by_force(rotation: Array) -> tuple[Array, Array]:
+def _by_force(rotation: Array) -> Array:
     """Return velocity and position by a constant specific force, of a unit of time.
 
     Parameters
     ----------
-    rotation : ndarray, shape (..., 3)
+    rotation : ndarray, shape (3, n)
         Turned through at a constant rate (rad).
 
     Returns
     -------
-    tuple of ndarray, shape (..., 3, 3)
+    ndarray, shape (n, 3, 6)
         Integral, and integral of the integral, of the rotation's matrix.
     """
-    b, c, d = (k[..., None, None] for k in _coefficients(np.sum(rotation**2, axis=-1)))
-    once = -np.cross(rotation[..., None, :], np.eye(3))
+    factors = _coefficients(np.einsum("ij,ij->j", rotation, rotation))
+    once = np.zeros((rotation.shape[1], 3, 3))
+    x, y, z = rotation
+    once[:, 2, 1], once[:, 0, 2], once[:, 1, 0] = x, y, z
+    once -= once.transpose(0, 2, 1).copy()
     twice = once @ once
-    return np.eye(3) + b * once + c * twice, 0.5 * np.eye(3) + c * once + d * twice
+    b, c, d = (factor[:, None, None] for factor in factors[:3])
+    out = np.empty((*once.shape[:2], 6))
+    out[..., :3] = b * once + c * twice
+    out[..., 3:] = c * once + d * twice
+    out += _AT_REST
+    return out
 
 
-def _coefficients(square: Array) -> tuple[Array, Array, Array]:
-    """Return (1 - cos x) / x^2, (x - sin x) / x^3, (x^2 / 2 - 1 + cos x) / x^4 of small squares."""
-    x = square
-    return (
-        1 / 2 - x * (1 / 24 - x * (1 / 720 - x * (1 / 40320 - x / 3628800))),
-        1 / 6 - x * (1 / 120 - x * (1 / 5040 - x * (1 / 362880 - x / 39916800))),
-        1 / 24 - x * (1 / 720 - x * (1 / 40320 - x * (1 / 3628800 - x / 479001600))),
-    )
+def _coefficients(square: Array) -> Array:
+    """Return functions of the angle x of a rotation from its square, a small one, shape (5, ...).
 
-
-def _quaternion(rotation: Array, square: Array) -> Array:
-    """Return the quaternion of a small rotation, scalar first, by the series of half the angle."""
-    x = square / 4.0
-    out = np.empty((4, *square.shape))
-    out[0] = 1.0 - x * (1 / 2 - x * (1 / 24 - x * (1 / 720 - x * (1 / 40320 - x / 3628800))))
-    share = 1.0 - x * (1 / 6 - x * (1 / 120 - x * (1 / 5040 - x * (1 / 362880 - x / 39916800))))
-    out[1:] = 0.5 * share * rotation
+    (1 - cos x) / x^2, (x - sin x) / x^3, (x^2 / 2 - 1 + cos x) / x^4, and of half the angle the
+    cosine and half of sin(x / 2) / (x / 2).
+    """
+    last = 1 + bisect_left(_FEW_TERMS, square.max())
+    terms = _SERIES.reshape(*_SERIES.shape, *(1,) * square.ndim)
+    out = np.asarray(terms[last] * square)
+    for term in terms[last - 1 : 0 : -1]:
+        out += term
+        out *= square
+    out += terms[0]
     return out
