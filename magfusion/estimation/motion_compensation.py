@@ -13,7 +13,6 @@ from magfusion.estimation.motion_stretches import joined, only_stretch, stretche
 from magfusion.estimation.sending import Sending
 from magfusion.estimation.state import State, as_trajectory
 from magfusion.model.audibility import Owned, only_owned, owned_at
-from magfusion.model.channel_effects import tone_frequencies
 from magfusion.model.field import predict_earth
 from magfusion.model.noise import calibration_error, model_error, sensor_positions
 from magfusion.model.parameters import Calibration, linearize_channels, predict_channels
@@ -138,7 +137,7 @@ def taken_off(
                 motion,
                 heard,
                 earth,
-                carriers(tone_frequencies(heard.site), time),
+                carriers(heard.site.tone_frequencies_hz, time),
                 Motion(*change_of),
                 through_nodes=True,
             )

@@ -9,7 +9,6 @@ import pyarrow as pa
 from magfusion.errors import InputError
 from magfusion.files.plausible import check_field
 from magfusion.files.table import TIME, Layout, Span, Table, read_table, write_table
-from magfusion.model.channel_effects import tone_frequencies
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.units import Array, IntArray
@@ -146,7 +145,7 @@ def on_log_clock(fields: FieldSamples, site: Site) -> FieldSamples:
     late = site.platform.magnetometer.clock_offset
     if not late:
         return fields
-    turn = np.exp(-2j * np.pi * tone_frequencies(site) * late)
+    turn = np.exp(-2j * np.pi * site.tone_frequencies_hz * late)
     return replace(
         fields, time=fields.time + late, phasor_sensor=fields.phasor_sensor * turn[:, None]
     )
@@ -157,7 +156,7 @@ def by_own_clocks(fields: FieldSamples, site: Site) -> FieldSamples:
     offsets = [sensor.clock_offset for sensor in site.platform.magnetometers]
     if not any(offsets):
         return fields
-    tones, parts = tone_frequencies(site), []
+    tones, parts = site.tone_frequencies_hz, []
     for sensor, late in enumerate(offsets):
         mine = site.of_sensor(sensor)
         own = fields.rows(np.any(fields.valid[:, mine], axis=1))

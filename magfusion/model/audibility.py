@@ -10,7 +10,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from magfusion.model.channel_effects import tone_frequencies
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Beacon, Site
 from magfusion.units import MU0_OVER_4PI, Array, BoolArray, IntArray
@@ -55,7 +54,7 @@ def tones_of(site: Site) -> Tones:
     """
     alone = any(slot is not None for beacon in site.beacons for _, slot in beacon.tones)
     planned = tuple(k if b.planned else -1 for k, b in enumerate(site.beacons) for _ in b.tones)
-    return _tones(tuple(tone_frequencies(site).tolist()), planned, alone=alone)
+    return _tones(tuple(site.tone_frequencies_hz.tolist()), planned, alone=alone)
 
 
 @lru_cache(maxsize=8)
@@ -135,7 +134,7 @@ def owned_at(
         Share of each one's field that is not foreseen, where what is foreseen was taken off; those
         that are not heard at the end.
     """
-    count = len(tone_frequencies(site))
+    count = len(site.tone_frequencies_hz)
     site = replace(site, beacons=(*site.beacons, *(b for _, b in site.unheard)), unheard=())
     tones = tones_of(site)
     near, far = (largest_fields(site, sensor_world, sign * margin) for sign in (1.0, -1.0))

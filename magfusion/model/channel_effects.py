@@ -6,7 +6,6 @@ phasor.
 
 import numpy as np
 
-from magfusion.model.once import once_a_site
 from magfusion.model.response import AxisResponses, FrequencyResponse
 from magfusion.model.site import Site
 from magfusion.units import Array, ComplexArray
@@ -50,7 +49,7 @@ def responded(site: Site) -> tuple[Array, Array] | None:
     alike = [s.response if isinstance(s.response, FrequencyResponse) else None for s in sensors]
     if all(response is None for response in alike) or not site.beacons:
         return None
-    frequencies_hz = tone_frequencies(site)
+    frequencies_hz = site.tone_frequencies_hz
     none = np.zeros_like(frequencies_hz)
     parts = [(none, none) if r is None else r.at(frequencies_hz) for r in alike]
     if len(parts) == 1:
@@ -67,7 +66,7 @@ def axis_factors(site: Site) -> ComplexArray | None:
     sensors = site.platform.magnetometers
     if not site.beacons or not any(isinstance(s.response, AxisResponses) for s in sensors):
         return None
-    frequencies_hz = tone_frequencies(site)
+    frequencies_hz = site.tone_frequencies_hz
     alike = np.ones((len(frequencies_hz), 3), dtype=np.complex128)
     return np.concatenate(
         [
@@ -75,12 +74,6 @@ def axis_factors(site: Site) -> ComplexArray | None:
             for s in sensors
         ]
     )
-
-
-@once_a_site
-def tone_frequencies(site: Site) -> Array:
-    """Return the frequency of each channel of a magnetometer (Hz)."""
-    return np.concatenate([beacon.tone_frequencies_hz for beacon in site.beacons])
 
 
 def of_all_sensors(site: Site, by_tone: Array) -> Array:

@@ -91,7 +91,7 @@ def _source(beacon: Beacon) -> Sources:
         world_from_beacon=beacon.world_from_beacon,
         excitation=beacon.excitation,
         loops=_loops(beacon),
-        concentric=bool(np.all(beacon.centres_beacon == beacon.centres_beacon[0])),
+        concentric=beacon.concentric,
         field_map=beacon.field_map,
         decay=None if beacon.conductivity == 0.0 else _decay(beacon),
     )
@@ -118,6 +118,23 @@ def side_by_side(site: Site) -> Groups:
     if known is None:
         known = _BESIDE[site] = _grouped([alone(beacon) for beacon in site.beacons])
     return known
+
+
+def keep_sources(site: Site, other: Site) -> None:
+    """Let a site have the sources of one that differs in sizes of moments alone, if known."""
+    known = _BESIDE.get(site)
+    # The places of the loops that stand for a long coil hang on its moment's direction.
+    if known is None or any(c.length is not None for b in other.beacons for c in b.coils):
+        return
+    _BESIDE[other] = tuple(
+        (rows, _with_moments(source, [other.beacons[k].moments_beacon for k in rows]))
+        for rows, source in known
+    )
+
+
+def _with_moments(source: Sources, moments_beacon: list[Array]) -> Sources:
+    moment = np.array(moments_beacon)[:, None] if len(moments_beacon) > 1 else moments_beacon[0]
+    return source._replace(loops=source.loops._replace(moment=moment))
 
 
 def _grouped(sources: list[Sources]) -> Groups:

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.model.channel_effects import tone_frequencies
 from magfusion.model.field import power_error_cov, predict
 from magfusion.model.field_map import block_diagonal
 from magfusion.model.ground import conductivity_of, ground_error
@@ -267,7 +266,7 @@ def _relative_error(site: Site, square: Array) -> Array:
         relative = calibration_error(site, distance, sensor)[:, site.owner[mine]]
         late = site.platform.magnetometers[sensor].sigma.clock_offset
         if late:
-            relative = np.hypot(relative, 2.0 * np.pi * late * tone_frequencies(site))
+            relative = np.hypot(relative, 2.0 * np.pi * late * site.tone_frequencies_hz)
         parts.append(relative)
     return np.concatenate(parts, axis=1)
 

@@ -217,6 +217,11 @@ class Beacon:
         """Magnetic centres of the coils (m), shape (coils, 3)."""
         return np.array([c.centre_beacon for c in self.coils])
 
+    @cached_property
+    def concentric(self) -> bool:
+        """Whether all coils are at one place."""
+        return bool(np.all(self.centres_beacon == self.centres_beacon[0]))
+
 
 @dataclass(frozen=True)
 class ClockModel:
@@ -384,6 +389,11 @@ class Site:
         """
         own = tuple((b.name, k) for b in self.beacons for k in range(len(b.tones)))
         return own * len(self.platform.magnetometers)
+
+    @cached_property
+    def tone_frequencies_hz(self) -> Array:
+        """Frequency of each channel of a magnetometer (Hz)."""
+        return np.concatenate([beacon.tone_frequencies_hz for beacon in self.beacons])
 
     @cached_property
     def owner(self) -> IntArray:

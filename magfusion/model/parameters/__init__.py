@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.model.channel_effects import axis_factors, responded, tone_frequencies
+from magfusion.model.channel_effects import axis_factors, responded
 from magfusion.model.parameters.beacon import BEACON_POSITION as BEACON_POSITION
 from magfusion.model.parameters.beacon import BEACON_ROTATION as BEACON_ROTATION
 from magfusion.model.parameters.beacon import DRIFT as DRIFT
@@ -109,7 +109,7 @@ def seen_by(calibration: Calibration, sensor: int) -> Calibration:
         return calibration
     mine, one = site.of_sensor(sensor), site.platform.magnetometers[sensor]
     late = float(calibration.clock_offsets[sensor])
-    frequencies_hz = tone_frequencies(site)
+    frequencies_hz = site.tone_frequencies_hz
     return replace(
         calibration,
         site=replace(site, platform=site.platform.carrying((one,))),

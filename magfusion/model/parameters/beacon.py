@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from magfusion.model.moments import with_moments
 from magfusion.model.parameters.parameter import (
     AXES,
     CENTIMETRE,
@@ -82,12 +83,13 @@ class _LogMoment(BeaconParameter, SiteParameter):
         return self.all_moved(calibration, {owner: step})
 
     def all_moved(self, calibration: Calibration, steps: Mapping[str, Array]) -> Calibration:
-        site = calibration.site  # remade once, not for every beacon
-        beacons = tuple(
-            _louder(beacon, steps[beacon.name]) if beacon.name in steps else beacon
+        site = calibration.site
+        moments = {
+            beacon.name: beacon.moments_beacon * np.exp(steps[beacon.name])[:, None]
             for beacon in site.beacons
-        )
-        return replace(calibration, site=replace(site, beacons=beacons))
+            if beacon.name in steps
+        }
+        return replace(calibration, site=with_moments(site, moments))
 
     def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
         (step,) = self.all_differences(old, new, [owner])
@@ -96,13 +98,12 @@ class _LogMoment(BeaconParameter, SiteParameter):
     def all_differences(
         self, old: Calibration, new: Calibration, owners: Sequence[str]
     ) -> list[Array]:
-        coils = [[self.part(c.site, owner).coils for owner in owners] for c in (old, new)]
         before, after = (
-            np.linalg.norm([coil.moment_beacon for own in each for coil in own], axis=1)
-            for each in coils
+            [self.part(c.site, owner).moments_beacon for owner in owners] for c in (old, new)
         )
-        steps = iter(np.log(after / before).tolist())
-        return [np.array([next(steps) for _ in own]) for own in coils[0]]
+        sizes = (np.linalg.norm(np.concatenate(each), axis=1) for each in (after, before))
+        steps = iter(np.log(np.divide(*sizes)).tolist())
+        return [np.array([next(steps) for _ in own]) for own in before]
 
     def own_jacobian(self, view: PhasorView) -> ComplexArray:
         return view.whole.log_moments
@@ -211,15 +212,6 @@ def _named(names: tuple[str, ...], owner: str) -> BoolArray:
     mine = np.array([name == owner for name in names], dtype=bool)
     mine.flags.writeable = False
     return mine
-
-
-def _louder(beacon: Beacon, step: Array) -> Beacon:
-    """Return the beacon with the logarithm of each coil's moment moved."""
-    coils = tuple(
-        replace(coil, moment_beacon=coil.moment_beacon * factor)
-        for coil, factor in zip(beacon.coils, np.exp(step), strict=True)
-    )
-    return replace(beacon, coils=coils)
 
 
 BEACON_ROTATION, BEACON_POSITION, LOG_MOMENT = _Rotation(), _Position(), _LogMoment()

@@ -12,7 +12,6 @@ from magfusion.model.channel_effects import (
     driven,
     of_all_sensors,
     responded,
-    tone_frequencies,
     warmed,
 )
 from magfusion.model.field import EarthObservation
@@ -99,7 +98,7 @@ class Calibration:
 
         As measured: with what was recorded of the currents, and the magnetometer's response.
         """
-        frequencies = of_all_sensors(self.site, tone_frequencies(self.site))
+        frequencies = of_all_sensors(self.site, self.site.tone_frequencies_hz)
         rate = 2.0 * np.pi * frequencies * self.drift[self.site.owner]
         phase = self.phase + (time[..., None] - self.reference_time) * rate
         current, response = driven(self.site, time), responded(self.site)
