@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 import pytest
+from tracker_site import tracker_site
 
 from magfusion.model.moments import with_moments
 from magfusion.model.parameters import (
@@ -16,7 +17,6 @@ from magfusion.model.parameters import (
 )
 from magfusion.model.site import Beacon, Coil, Site
 from magfusion.simulation.demo_site import demo_site
-from tracker_site import tracker_site
 
 
 def tracker() -> Site:
