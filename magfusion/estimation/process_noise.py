@@ -37,26 +37,26 @@ class ProcessNoise:
         """
         if not self.variance.any():
             return np.zeros((len(self.variance),) * 2)
-        gained = np.diag(self.variance * elapsed)
-        columns = self._columns
-        for block in self._walking:
+        by_walk, columns = np.eye(len(self.variance)), self._columns
+        for block in self._dragging:
             dragged = block.parameter.drags(calibration, block.owner, time)
-            if dragged is None or (dragged[0], block.owner) not in columns:
-                continue
-            rows, own, by_step = columns[dragged[0], block.owner], block.columns, dragged[1]
-            gained[rows, rows] += by_step @ gained[own, own] @ by_step.T
-            gained[rows, own] = by_step @ gained[own, own]
-            gained[own, rows] = gained[rows, own].T
-        return gained
+            if dragged is not None and (dragged[0], block.owner) in columns:
+                by_walk[columns[dragged[0], block.owner], block.columns] = dragged[1]
+        return np.asarray(by_walk * (self.variance * elapsed) @ by_walk.T)
 
     @cached_property
     def _columns(self) -> dict[tuple[Parameter, str], slice]:
         return {block.key: block.columns for block in self.blocks}
 
     @cached_property
-    def _walking(self) -> list[Block]:
-        """The blocks that walk: what stays drags nothing."""
-        return [block for block in self.blocks if self.variance[block.columns].any()]
+    def _dragging(self) -> list[Block]:
+        """The blocks that walk, and may move others by it: what stays drags nothing."""
+        return [
+            block
+            for block in self.blocks
+            if type(block.parameter).drags is not Parameter.drags
+            and self.variance[block.columns].any()
+        ]
 
 
 def calibration_process_noise(

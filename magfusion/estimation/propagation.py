@@ -9,7 +9,7 @@ from magfusion.estimation.imu_decimation import thinned
 from magfusion.estimation.inertial import Link, Preintegrated, Steps, inertial_factor, links_between
 from magfusion.estimation.preintegration import cut_at_epochs
 from magfusion.estimation.process_noise import ProcessNoise
-from magfusion.estimation.state import MOTION, State, values_of
+from magfusion.estimation.state import MOTION, State, values_from
 from magfusion.model.parameters import Block, Calibration, corrected_imu
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
@@ -85,18 +85,14 @@ def propagate(
     def steps(calibration: Calibration) -> Steps:
         stream = corrected_imu(calibration, blocks, imu)
         increments = cut_at_epochs(stream, time_offset, epochs, usual)
-        increments = replace(increments, bridged=increments.bridged | blind)
+        if blind:
+            increments = replace(increments, bridged=np.ones_like(increments.bridged))
         return Steps(thinned(increments, accel[None], gyro[None]), accel, gyro)
 
-    def later_state(found: list[Preintegrated]) -> State:
-        after = found[0].predict(before, bias)
-        return replace(
-            state,
-            time=time,
-            world_from_body=after.pose().rotation().matrix(),
-            position_world=np.asarray(after.pose().translation()),
-            velocity_world=np.asarray(after.velocity()),
-        )
+    def values(found: list[Preintegrated]) -> gtsam.Values:
+        both = before, found[0].predict(before, bias)
+        velocities = [at.velocity() for at in both]
+        return values_from([at.pose() for at in both], velocities, [bias.vector()] * 2)
 
     own = steps(state.calibration)
     (link,) = links_between(
@@ -105,11 +101,10 @@ def propagate(
         ],
         state.calibration,
         blocks,
-        lambda found: values_of([state, later_state(found)]),
+        values,
     )
-    later = later_state([link.measurement])
     factor = inertial_factor(0, link.measurement)
-    rows, _ = factor.linearize(values_of([state, later])).jacobian()
+    rows, _ = factor.linearize(values([link.measurement])).jacobian()
     root = np.linalg.inv(rows[:, _AFTER])
     transition = np.eye(len(state.cov))
     transition[:MOTION, :MOTION] = -root @ rows[:, _BEFORE]
@@ -123,5 +118,14 @@ def propagate(
     cov[:MOTION] = motion @ state.cov
     cov[:, :MOTION] = cov @ motion.T
     cov += noise
+    after = link.measurement.predict(before, bias)
+    later = replace(
+        state,
+        time=time,
+        world_from_body=after.pose().rotation().matrix(),
+        position_world=np.asarray(after.pose().translation()),
+        velocity_world=np.asarray(after.velocity()),
+        cov=cov,
+    )
     bridged = bool(own.increments.bridged[0])
-    return Propagated(replace(later, cov=cov), replace(link, steps=own), bridged, transition, noise)
+    return Propagated(later, replace(link, steps=own), bridged, transition, noise)

@@ -259,7 +259,7 @@ def resting(
         Where rate and specific force scatter less about their means over the stretch than they may.
     """
     span = motion.rest_span if span is None else span
-    centre = np.concatenate([np.mean(gyro_body, axis=0), np.mean(accel_body, axis=0)])
+    centre = np.concatenate([gyro_body.mean(axis=0), accel_body.mean(axis=0)])
     asked = time if at is None else time[at]
     quiet = np.empty(len(asked), dtype=bool)
     for begin in range(0, len(time), CHUNK):
@@ -280,6 +280,8 @@ def resting(
 
 def _variance(centred: Array, lo: IntArray, hi: IntArray) -> Array:
     """Return the sums of each vector's variances over rows from ``lo`` to before ``hi``, (n, 2)."""
+    if len(lo) == 1:
+        return np.asarray(centred[lo[0] : hi[0]].var(axis=0).reshape(1, 2, 3).sum(axis=2))
     total = np.zeros((len(centred) + 1, 12))
     np.cumsum(np.concatenate([centred, centred**2], axis=1), axis=0, out=total[1:])
     mean = (total[hi] - total[lo]) / (hi - lo)[:, None]

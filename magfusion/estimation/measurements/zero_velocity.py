@@ -65,7 +65,8 @@ def quiet_before(imu: ImuSamples, stamps: Array, motion: MotionModel) -> BoolArr
     enough = last - first >= FEWEST_SAMPLES
     first, last = np.minimum(first, count - 1), np.maximum(np.minimum(last, count), 1)
     covered = (time[first] <= stamps - span) & (time[last - 1] >= stamps - REACH)
-    silent = np.concatenate([[0], np.cumsum(np.diff(time) > LONGEST_SILENCE)])
+    silent = np.zeros(count, dtype=np.int64)
+    np.cumsum(time[1:] - time[:-1] > LONGEST_SILENCE, out=silent[1:])
     middle = np.minimum(np.searchsorted(time, stamps - span / 2), count - 1)
     streams = time, imu.gyro_body, imu.accel_body
     still = resting(*streams, span - REACH, motion=motion, at=middle)
@@ -85,7 +86,9 @@ def may_stand(velocity_world: Array, cov: Array, motion: MotionModel) -> BoolArr
     cov : ndarray, shape (..., 3, 3)
         Of it (m^2/s^2).
     """
-    known = np.max(np.diagonal(cov, axis1=-2, axis2=-1), axis=-1) < motion.rest_known_speed**2
+    known = np.diagonal(cov, axis1=-2, axis2=-1).max(axis=-1) < motion.rest_known_speed**2
+    if not known.any():
+        return np.asarray(known)
     cov = cov + motion.rest_speed_sigma**2 * np.eye(3)
     solved = np.linalg.solve(cov, velocity_world[..., None])[..., 0]
     return known & (np.sum(velocity_world * solved, axis=-1) < REST_GATE)
