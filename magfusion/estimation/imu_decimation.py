@@ -18,19 +18,18 @@ import gtsam
 import numpy as np
 
 from magfusion.estimation.preintegration import Increments, cut_at_epochs, preintegrate
+from magfusion.model.perturbation import skew
 from magfusion.model.quaternion import cross, matrices, product, turned, vectors
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel
 from magfusion.receiver.admission import meets
 from magfusion.units import Array, BoolArray, IntArray
 
-# Steps made one, and how many joined ones an interval must have left.
-Way = tuple[int, int]
-JOINED: tuple[Way, ...] = ((20, 200), (10, 200), (8, 50))
-# Where sigmas a tenth wrong do no harm.
-ROUGHLY_JOINED: tuple[Way, ...] = ((20, 8), (10, 8), (7, 8), (5, 8))
+JOINED = (25, 20, 10)  # steps made one
+FEWEST_LEFT = 20  # joined steps of an interval that is thinned: sigmas differ by some thousandths
+ROUGHLY_JOINED, ROUGHLY_LEFT = (20, 10, 7, 5), 8  # where sigmas a tenth wrong do no harm
 MOST_TURN = 0.5  # rad; within a joined step, for the series and for the derivatives
-CHUNK = 65_536  # steps joined at a time: what is computed of them stays in the cache
+CHUNK = 32_768  # steps joined at a time: what is computed of them stays in the cache
 STRETCH = 200_000  # samples cut at a time: what is made of them is no multiple of a long log
 _AT_REST = np.concatenate([np.eye(3), 0.5 * np.eye(3)], axis=1)
 # Of `_coefficients` the factors of 1, x^2, x^4 ...
@@ -103,8 +102,8 @@ def preintegrate_stream(
         if silence is not None:
             silent = meets(*silence, epochs[begin:end], epochs[begin + 1 : end + 1])
             increments = replace(increments, bridged=increments.bridged | silent)
-        ways = ROUGHLY_JOINED if roughly else JOINED
-        increments = thinned(increments, accel_bias[here], gyro_bias[here], ways)
+        ways = (ROUGHLY_JOINED, ROUGHLY_LEFT) if roughly else (JOINED, FEWEST_LEFT)
+        increments = thinned(increments, accel_bias[here], gyro_bias[here], *ways)
         measured += preintegrate(increments, model, gravity, accel_bias[here], gyro_bias[here])
         bridged.append(increments.bridged)
         begin = end
@@ -112,7 +111,11 @@ def preintegrate_stream(
 
 
 def thinned(
-    increments: Increments, accel_bias: Array, gyro_bias: Array, ways: tuple[Way, ...] = JOINED
+    increments: Increments,
+    accel_bias: Array,
+    gyro_bias: Array,
+    ways: tuple[int, ...] = JOINED,
+    fewest: int = FEWEST_LEFT,
 ) -> Increments:
     """Join the steps of the long intervals.
 
@@ -121,9 +124,11 @@ def thinned(
     accel_bias, gyro_bias : ndarray, shape (epochs, 3)
         At which they will be preintegrated (m/s^2, rad/s): there the result is the same to
         rounding.
-    ways : tuple of (int, int)
-        How many steps may be joined to one, falling, and how many joined steps of an interval are
-        enough for it.  Of each interval the first way is taken that leaves enough.
+    ways : tuple of int
+        Numbers of steps that may be joined to one, falling.  Of each interval that is taken which
+        leaves the fewest steps, of those that leave enough.
+    fewest : int
+        Joined steps of an interval that are enough.
 
     Returns
     -------
@@ -131,13 +136,17 @@ def thinned(
         The given ones where no interval is long.  Left single are intervals with a gap, steps that
         fill no pair, and those of a fast turn.
     """
-    left = np.diff(increments.first)
-    left[increments.bridged] = 0
-    for joined, fewest in ways:
-        long = left >= fewest * joined
-        if long.any():
-            increments = _with_joined(increments, joined, long, accel_bias, gyro_bias)
-            left[long] = 0
+    steps = np.diff(increments.first)
+    steps[increments.bridged] = 0
+    if steps.max(initial=0) < fewest * ways[-1]:
+        return increments
+    joined = np.array(ways)[:, None]
+    left = 2 * (steps // (2 * joined)) + steps % (2 * joined)
+    left[steps < fewest * joined] = steps.max()
+    way = np.where(steps < fewest * ways[-1], -1, left.argmin(axis=0))
+    for k, number in enumerate(ways):
+        if (long := way == k).any():
+            increments = _with_joined(increments, number, long, accel_bias, gyro_bias)
     return increments
 
 
@@ -146,24 +155,20 @@ def _with_joined(
 ) -> Increments:
     start, owner = _pairs(increments, joined, long)
     every = np.concatenate([increments.gyro_body.T, increments.accel_body.T, increments.dt[None]])
-    biases = np.concatenate([gyro_bias.T, accel_bias.T])
-    single, number = np.arange(joined)[:, None], max(CHUNK // (2 * joined), 1)
+    bias = np.concatenate([gyro_bias.T, accel_bias.T])
+    within, number = np.arange(2 * joined).reshape(2, joined).T, max(CHUNK // (2 * joined), 1)
     made, begun = [], []
     for lo in range(0, len(start), number):
         first = start[lo : lo + number]
-        rows = single + np.concatenate([first, first + joined])
-        bias = biases.take(np.tile(owner[lo : lo + number], 2), axis=1)
-        both, gentle = _joined(every.take(rows, axis=1), bias)
+        steps = every.take(within[..., None] + first, axis=1)
+        both, gentle = _joined(steps, bias.take(owner[lo : lo + number], axis=1))
         made.append(both[:, :, gentle])
         begun.append(first[gentle])
     first, both = np.concatenate(begun), np.concatenate(made, axis=2)
     kept = np.ones(len(increments.dt), dtype=bool)
-    kept[np.arange(2 * joined)[:, None] + first] = False
-    kept[first] = kept[first + joined] = True
-    for half, steps in enumerate(both.swapaxes(0, 1)):
-        every[:, first + half * joined] = steps
-    every = every[:, kept]
-    ends = np.append(0, np.cumsum(kept))[increments.first]
+    kept[within[1:, :, None] + first] = False
+    every[:, within[0][:, None] + first] = both
+    every, ends = every[:, kept], np.append(0, np.cumsum(kept))[increments.first]
     return Increments(every[:3].T.copy(), every[3:6].T.copy(), every[6], ends, increments.bridged)
 
 
@@ -175,66 +180,54 @@ def _pairs(increments: Increments, joined: int, long: BoolArray) -> tuple[IntArr
     return increments.first[owner] + 2 * joined * within, owner
 
 
-class _Moved(NamedTuple):
-    """What steps integrate to, each from rest at its own beginning.
+class _Halves(NamedTuple):
+    """What the steps of two joined ones integrate to, each from rest at its own beginning.
 
     Parameters
     ----------
-    turn : ndarray, shape (4, k, n)
+    turn : ndarray, shape (4, 2, n)
         Quaternion, scalar first.
-    gained : ndarray, shape (3, 2, k, n)
-        Velocity and position, in the axes of the beginning (m/s, m).
-    dt : ndarray, shape (k, n)
+    velocity, position : ndarray, shape (3, 2, n)
+        Gained, in the axes of the beginning (m/s, m).
+    dt : ndarray, shape (2, n)
         (s)
+    path : ndarray, shape (2, n)
+        Angle turned through, to and fro (rad).
     """
 
     turn: Array
-    gained: Array
+    velocity: Array
+    position: Array
     dt: Array
-
-    def part(self, steps: slice) -> "_Moved":
-        """Return some of the k steps."""
-        return _Moved(self.turn[:, steps], self.gained[:, :, steps], self.dt[steps])
-
-    def then(self, later: "_Moved") -> "_Moved":
-        """Return what these steps and later ones integrate to, one after the other."""
-        gained = self.gained + turned(self.turn[:, None], later.gained)
-        gained[:, 1] += self.gained[:, 0] * later.dt
-        return _Moved(product(self.turn, later.turn), gained, self.dt + later.dt)
+    path: Array
 
 
-def _of_steps(steps: Array, bias: Array) -> tuple[_Moved, Array]:
-    """Return what single steps, (7, k, n), integrate to, and the angle that each turns through."""
+def _halves(steps: Array, bias: Array) -> _Halves:
     dt = steps[6]
-    rotation, gained = (steps[:6].reshape(2, 3, *dt.shape) - bias.reshape(2, 3, 1, -1)) * dt
+    rotation, gained = (steps[:6] - bias[:, None, None]).reshape(2, 3, *dt.shape) * dt
     square = np.einsum("i...,i...->...", rotation, rotation)
     b, c, d, cosine, sine = _coefficients(square)
     once = cross(rotation, gained)
     twice = cross(rotation, once)
-    both = np.empty((3, 2, *dt.shape))
+    both = np.empty((3, 2, *dt.shape))  # velocity and position that each step gains
     both[:, 0] = gained + b * once + c * twice
     both[:, 1] = (0.5 * gained + c * once + d * twice) * dt
-    turn = np.empty((4, *dt.shape))
+    turn = np.empty((4, *dt.shape))  # of the first steps, one, two ... of them
     turn[0] = cosine
     np.multiply(sine, rotation, out=turn[1:])
-    return _Moved(turn, both, dt), np.sqrt(square)
-
-
-def _one_after_the_other(steps: _Moved) -> _Moved:
-    """Return what all k steps integrate to, k of it 1: neighbours together, and these again."""
-    number = len(steps.dt)
-    if number == 1:
-        return steps
-    even = number - number % 2
-    pairs = steps.part(slice(0, even, 2)).then(steps.part(slice(1, even, 2)))
-    if even < number:
-        last = steps.part(slice(even, None))
-        pairs = _Moved(
-            np.concatenate([pairs.turn, last.turn], axis=1),
-            np.concatenate([pairs.gained, last.gained], axis=2),
-            np.concatenate([pairs.dt, last.dt]),
-        )
-    return _one_after_the_other(pairs)
+    reach = 1
+    while reach < len(dt):
+        turn[:, reach:] = product(turn[:, :-reach], turn[:, reach:])
+        reach *= 2
+    both[:, :, 1:] = turned(turn[:, None, :-1], both[:, :, 1:])
+    velocity = both[:, 0].cumsum(axis=1)
+    return _Halves(
+        turn=turn[:, -1],
+        velocity=velocity[:, -1],
+        position=both[:, 1].sum(axis=1) + (velocity[:, :-1] * dt[1:]).sum(axis=1),
+        dt=dt.sum(axis=0),
+        path=np.sqrt(square).sum(axis=0),
+    )
 
 
 def _joined(steps: Array, bias: Array) -> tuple[Array, BoolArray]:
@@ -245,9 +238,9 @@ def _joined(steps: Array, bias: Array) -> tuple[Array, BoolArray]:
 
     Parameters
     ----------
-    steps : ndarray, shape (7, k, 2 n)
-        Rate, specific force and length of the single steps of n first halves, then of the second.
-    bias : ndarray, shape (6, 2 n)
+    steps : ndarray, shape (7, k, 2, n)
+        Rate, specific force and length of the single steps of both halves.
+    bias : ndarray, shape (6, n)
         Of gyro and accelerometer (rad/s, m/s^2).
 
     Returns
@@ -257,30 +250,26 @@ def _joined(steps: Array, bias: Array) -> tuple[Array, BoolArray]:
     gentle : ndarray of bool, shape (n,)
         Whether neither half turns far.
     """
-    moved, angle = _of_steps(steps, bias)
-    gentle = np.maximum(*angle.sum(axis=0).reshape(2, -1)) < MOST_TURN
-    halves = _one_after_the_other(moved)
-    turn, dt = halves.turn[:, 0], halves.dt[0]
-    n = len(gentle)
-    second = dt[n:, None, None]
-    rotation, after = vectors(turn), matrices(turn[:, :n])
-    gained = halves.gained[:, :, 0].T  # (2 n, 2, 3)
-    whole = gained[:n] + gained[n:] @ after.transpose(0, 2, 1)
-    whole[:, 1] += gained[:n, 0] * second[:, 0]
-    by_force = _by_force(rotation) * dt[:, None, None]
-    by_force[..., 3:] *= dt[:, None, None]
-    system = np.empty((n, 6, 6))
-    system[:, :3, :3] = by_force[:n, :, :3]
-    system[:, 3:, :3] = by_force[:n, :, 3:] + by_force[:n, :, :3] * second
-    later = after @ by_force[n:]
-    system[:, :3, 3:], system[:, 3:, 3:] = later[..., :3], later[..., 3:]
-    force = np.linalg.solve(system, whole.reshape(n, 6, 1))
-    both = np.empty((7, 2, n))
-    both[:3] = (rotation / dt).reshape(3, 2, n)
-    both[3:6] = force.reshape(n, 2, 3).transpose(2, 1, 0)
-    both[:6] += bias.reshape(6, 2, n)
-    both[6] = dt.reshape(2, n)
-    return both, gentle
+    halves = _halves(steps, bias)
+    rotation, after = vectors(halves.turn), matrices(halves.turn[:, 0])
+    first, second = halves.dt[..., None, None]
+    (v_1, v_2), (p_1, p_2) = (
+        each.transpose(1, 2, 0)[..., None] for each in (halves.velocity, halves.position)
+    )
+    whole = np.concatenate([v_1 + after @ v_2, p_1 + v_1 * second + after @ p_2], axis=1)
+    by_1, by_2 = _by_force(rotation)
+    system = np.empty((len(after), 6, 6))
+    system[:, :3, :3] = by_1[..., :3] * first
+    system[:, 3:, :3] = by_1[..., 3:] * first**2 + by_1[..., :3] * (first * second)
+    later = after @ by_2
+    system[:, :3, 3:] = later[..., :3] * second
+    system[:, 3:, 3:] = later[..., 3:] * second**2
+    both = np.empty((7, *halves.dt.shape))
+    both[:3] = rotation / halves.dt
+    both[3:6] = np.linalg.solve(system, whole).reshape(-1, 2, 3).T
+    both[:6] += bias[:, None]
+    both[6] = halves.dt
+    return both, halves.path.max(axis=0) < MOST_TURN
 
 
 def _by_force(rotation: Array) -> Array:
@@ -288,22 +277,19 @@ def _by_force(rotation: Array) -> Array:
 
     Parameters
     ----------
-    rotation : ndarray, shape (3, n)
+    rotation : ndarray, shape (3, ...)
         Turned through at a constant rate (rad).
 
     Returns
     -------
-    ndarray, shape (n, 3, 6)
+    ndarray, shape (..., 3, 6)
         Integral, and integral of the integral, of the rotation's matrix.
     """
-    factors = _coefficients(np.einsum("ij,ij->j", rotation, rotation))
-    once = np.zeros((rotation.shape[1], 3, 3))
-    x, y, z = rotation
-    once[:, 2, 1], once[:, 0, 2], once[:, 1, 0] = x, y, z
-    once -= once.transpose(0, 2, 1).copy()
+    once = skew(np.moveaxis(rotation, 0, -1))
     twice = once @ once
-    b, c, d = (factor[:, None, None] for factor in factors[:3])
-    out = np.empty((*once.shape[:2], 6))
+    factors = _coefficients(np.einsum("i...,i...->...", rotation, rotation))
+    b, c, d = factors[:3, ..., None, None]
+    out = np.empty((*once.shape[:-1], 6))
     out[..., :3] = b * once + c * twice
     out[..., 3:] = c * once + d * twice
     out += _AT_REST
