@@ -13,6 +13,7 @@ from magfusion.estimation.measurements.phasors import leaves_out
 from magfusion.estimation.propagation import Propagated
 from magfusion.estimation.state import MOTION, State, between, consider_update, moved, states_of
 from magfusion.estimation.without_statistics import without_statistics
+from magfusion.model.altered import altered
 from magfusion.model.parameters import Block
 from magfusion.units import Array
 
@@ -132,7 +133,7 @@ class ErrorStateFilter:
             step, cov = consider_update(*found, prior.cov, self.considered)
             if not np.all(np.isfinite(step)):
                 raise EstimationError("the filter's step is not finite")
-            state = moved(replace(prior, cov=cov), self.blocks, step)
+            state = moved(altered(prior, cov=cov), self.blocks, step)
         self.state = self.lagged = state
 
     def replace_state(self, state: State) -> None:

@@ -11,6 +11,7 @@ in a step, of a change of bias that the next pass makes nothing.
 
 from bisect import bisect_left
 from dataclasses import replace
+from functools import lru_cache
 from math import factorial
 from typing import NamedTuple
 
@@ -136,18 +137,22 @@ def thinned(
         The given ones where no interval is long.  Left single are intervals with a gap, steps that
         fill no pair, and those of a fast turn.
     """
-    steps = np.diff(increments.first)
+    steps = increments.first[1:] - increments.first[:-1]
     steps[increments.bridged] = 0
     if steps.max(initial=0) < fewest * ways[-1]:
         return increments
-    joined = np.array(ways)[:, None]
-    left = 2 * (steps // (2 * joined)) + steps % (2 * joined)
-    left[steps < fewest * joined] = steps.max()
-    way = np.where(steps < fewest * ways[-1], -1, left.argmin(axis=0))
-    for k, number in enumerate(ways):
-        if (long := way == k).any():
-            increments = _with_joined(increments, number, long, accel_bias, gyro_bias)
+    way = np.array([_way(number, ways, fewest) for number in steps.tolist()])
+    for joined in ways:
+        if (long := way == joined).any():
+            increments = _with_joined(increments, joined, long, accel_bias, gyro_bias)
     return increments
+
+
+@lru_cache(maxsize=4096)
+def _way(steps: int, ways: tuple[int, ...], fewest: int) -> int:
+    """Return how many steps of an interval are joined to one; 1 where it is too short."""
+    enough = [joined for joined in ways if steps >= fewest * joined]
+    return min(enough, key=lambda n: 2 * (steps // (2 * n)) + steps % (2 * n), default=1)
 
 
 def _with_joined(

@@ -39,7 +39,7 @@ from magfusion.estimation.still_samples import StillSamples
 from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
 from magfusion.model.drive import DriveSamples, DriveShares
 from magfusion.model.marks import Marks
-from magfusion.model.parameters import dimension, placed
+from magfusion.model.parameters import dimension, inertial_blocks, placed
 from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.samples import FieldSamples, SteadyFields
 from magfusion.model.site import Site
@@ -96,6 +96,7 @@ class Navigator:
         estimated, considered = self.settings.blocks(site)
         self.blocks = (*estimated, *placed(considered, dimension(estimated)))
         self._considered = dimension(considered)
+        self._of_imu = self.blocks if inertial_blocks(self.blocks) else ()
         risk, bank = self.settings.risk, None
         # Without its only beacon there is nothing to compare with.
         if risk is not None and len(site.beacons) > 1:
@@ -499,9 +500,6 @@ class Navigator:
         offset, usual = self._arrived.applied_offset, self._arrived.usual
         imu = self._arrived.motion_samples(state.time - offset, time - offset)
         blind = self._arrived.stand_in.covers(state.time - offset, time - offset)
-        noise, blocks, site = (
-            self._process_noise,
-            self.blocks,
-            with_white_noise(self.site, *self._white),
-        )
+        noise, site = self._process_noise, with_white_noise(self.site, *self._white)
+        blocks = self._of_imu
         return propagate(state, imu, time, site, offset, noise, usual, blocks, blind=blind)

@@ -63,6 +63,8 @@ def cut_at_epochs(
     time = imu.time + time_offset
     known = float(np.median(np.diff(time))) if usual is None else usual
     edges, gap = _gaps(time, epochs, known)
+    if len(epochs) == 2 and not gap.any():
+        return _one_interval(imu, time, epochs)
     # One long step would tie the position to the velocity: its noise would be singular.
     stamps = _filled(time, edges, np.flatnonzero(gap), epochs, known)
     inside = (stamps > epochs[0]) & (stamps < epochs[-1])
@@ -84,6 +86,23 @@ def cut_at_epochs(
         grid[1:] - grid[:-1],
         first,
         bridged,
+    )
+
+
+def _one_interval(imu: ImuSamples, time: Array, epochs: Array) -> Increments:
+    """Return the steps between two epochs, as online: the samples between them are used as is."""
+    rows = slice(time.searchsorted(epochs[0], side="right"), time.searchsorted(epochs[1]))
+    both = np.concatenate([imu.gyro_body, imu.accel_body], axis=1)
+    begin, end = interpolated(epochs, time, both)
+    both = np.concatenate([begin[None], both[rows], end[None]])
+    grid = np.concatenate([epochs[:1], time[rows], epochs[1:]])
+    mean = 0.5 * (both[:-1] + both[1:])
+    return Increments(
+        mean[:, :3].copy(),
+        mean[:, 3:].copy(),
+        grid[1:] - grid[:-1],
+        np.array([0, len(mean)]),
+        np.zeros(1, dtype=bool),
     )
 
 

@@ -37,16 +37,28 @@ class ProcessNoise:
         """
         if not self.variance.any():
             return np.zeros((len(self.variance),) * 2)
-        by_walk, columns = np.eye(len(self.variance)), self._columns
+        by_walk, columns = np.eye(self._walking), self._columns
         for block in self._dragging:
             dragged = block.parameter.drags(calibration, block.owner, time)
             if dragged is not None and (dragged[0], block.owner) in columns:
                 by_walk[columns[dragged[0], block.owner], block.columns] = dragged[1]
-        return np.asarray(by_walk * (self.variance * elapsed) @ by_walk.T)
+        gained, walking = np.zeros((len(self.variance),) * 2), slice(self._walking)
+        gained[walking, walking] = by_walk * (self.variance[walking] * elapsed) @ by_walk.T
+        return gained
 
     @cached_property
     def _columns(self) -> dict[tuple[Parameter, str], slice]:
         return {block.key: block.columns for block in self.blocks}
+
+    @cached_property
+    def _walking(self) -> int:
+        """Of the first so many parameters any walks, or may be moved by another's walk."""
+        dragged = {block.owner for block in self._dragging}
+        return max(
+            block.columns.stop
+            for block in self.blocks
+            if self.variance[block.columns].any() or block.owner in dragged
+        )
 
     @cached_property
     def _dragging(self) -> list[Block]:

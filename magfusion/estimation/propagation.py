@@ -10,6 +10,7 @@ from magfusion.estimation.inertial import Link, Preintegrated, Steps, inertial_f
 from magfusion.estimation.preintegration import cut_at_epochs
 from magfusion.estimation.process_noise import ProcessNoise
 from magfusion.estimation.state import MOTION, State, values_from
+from magfusion.model.altered import altered
 from magfusion.model.parameters import Block, Calibration, corrected_imu
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
@@ -115,11 +116,12 @@ def propagate(
     if process_noise is not None:
         noise[MOTION:, MOTION:] = process_noise.cov(state.calibration, time, time - state.time)
     cov, motion = state.cov.copy(), transition[:MOTION]
-    cov[:MOTION] = motion @ state.cov
-    cov[:, :MOTION] = cov @ motion.T
+    across = motion @ state.cov
+    cov[:MOTION, :MOTION] = across @ motion.T
+    cov[:MOTION, MOTION:], cov[MOTION:, :MOTION] = across[:, MOTION:], across[:, MOTION:].T
     cov += noise
     after = link.measurement.predict(before, bias)
-    later = replace(
+    later = altered(
         state,
         time=time,
         world_from_body=after.pose().rotation().matrix(),
@@ -128,4 +130,4 @@ def propagate(
         cov=cov,
     )
     bridged = bool(own.increments.bridged[0])
-    return Propagated(later, replace(link, steps=own), bridged, transition, noise)
+    return Propagated(later, altered(link, steps=own), bridged, transition, noise)

@@ -29,7 +29,7 @@ _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 def product(a: Array, b: Array) -> Array:
     """Return the products ``a b`` of quaternions, shape (4, ...), scalar first."""
     if a.size + b.size < FEW:  # of few it is the calls that take the time
-        parts = b[_PLACES]
+        parts = b.take(_PLACES, axis=0)
         parts *= _SIGNS.reshape(4, 4, *(1,) * (b.ndim - 1))
         return np.asarray(np.add.reduce(a[:, None] * parts, axis=0))
     (p, q, r, s), (w, x, y, z) = a, b

@@ -259,6 +259,8 @@ def resting(
         Where rate and specific force scatter less about their means over the stretch than they may.
     """
     span = motion.rest_span if span is None else span
+    if at is not None and len(at) == 1:  # as online, where it is the calls that take the time
+        return np.array([_rests(time, gyro_body, accel_body, float(time[at[0]]), span, motion)])
     centre = np.concatenate([gyro_body.mean(axis=0), accel_body.mean(axis=0)])
     asked = time if at is None else time[at]
     quiet = np.empty(len(asked), dtype=bool)
@@ -278,10 +280,25 @@ def resting(
     return quiet & inside
 
 
+def _rests(
+    time: Array,
+    gyro_body: Array,
+    accel_body: Array,
+    asked: float,
+    span: float,
+    motion: MotionModel,
+) -> bool:
+    """Return `resting` of one time (s)."""
+    begin, end = asked - span / 2, asked + span / 2
+    if begin < time[0] or end > time[-1]:
+        return False
+    rows = slice(time.searchsorted(begin), time.searchsorted(end, side="right"))
+    gyro, accel = (stream[rows].var(axis=0).sum() for stream in (gyro_body, accel_body))
+    return bool(gyro < motion.rest_gyro**2 and accel < motion.rest_accel**2)
+
+
 def _variance(centred: Array, lo: IntArray, hi: IntArray) -> Array:
     """Return the sums of each vector's variances over rows from ``lo`` to before ``hi``, (n, 2)."""
-    if len(lo) == 1:
-        return np.asarray(centred[lo[0] : hi[0]].var(axis=0).reshape(1, 2, 3).sum(axis=2))
     total = np.zeros((len(centred) + 1, 12))
     np.cumsum(np.concatenate([centred, centred**2], axis=1), axis=0, out=total[1:])
     mean = (total[hi] - total[lo]) / (hi - lo)[:, None]

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -67,10 +68,18 @@ def measured_noise(samples: ImuSamples, declared: ImuModel) -> tuple[ImuModel, l
     return model, findings
 
 
+# A running estimate asks for it at every state.
+_KNOWN: WeakKeyDictionary[Site, tuple[float, float, Site]] = WeakKeyDictionary()
+
+
 def with_white_noise(site: Site, gyro: float, accel: float) -> Site:
     """Return a site with other densities of its inertial sensor (rad/s, m/s^2, per root of Hz)."""
     imu = site.platform.imu
     if (gyro, accel) == (imu.gyro_noise, imu.accel_noise):
         return site
-    own = replace(imu, gyro_noise=gyro, accel_noise=accel)
-    return replace(site, platform=replace(site.platform, imu=own))
+    known = _KNOWN.get(site)
+    if known is None or known[:2] != (gyro, accel):
+        own = replace(imu, gyro_noise=gyro, accel_noise=accel)
+        other = replace(site, platform=replace(site.platform, imu=own))
+        known = _KNOWN[site] = (gyro, accel, other)
+    return known[2]

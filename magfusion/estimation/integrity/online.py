@@ -104,6 +104,7 @@ class OnlineWitness:
         self._beginning = Judgement()
         self._declared: Calibration | None = None
         self._borrowed = {}
+        self._borrowed_variance: Array | None = None
 
     # What is heard
 
@@ -116,6 +117,7 @@ class OnlineWitness:
             Variance that estimated parameters have of what was only considered.
         """
         self._began, self._beginning, self._borrowed = time, said, dict(borrowed)
+        self._borrowed_variance = None
 
     def hear(self, state: State, gate: Gate, heard: Heard) -> None:
         """Take in an epoch: the state after it, and what its gate said."""
@@ -251,7 +253,7 @@ class OnlineWitness:
         if not self.site.platform.inertial:
             return Judgement()
         imu, elapsed = self.site.platform.imu, state.time - self._began
-        found, inflation, turn = [], 1.0, 0.0
+        found, inflation, turn, variance = [], 1.0, 0.0, state.cov.diagonal()
         for code, name, bias, sigma, walk, first, unit in (
             ("accel_bias", "accelerometer", state.accel_bias_body, imu.accel_bias_sigma,
              imu.accel_bias_walk, 9, "m/s^2"),
@@ -259,9 +261,10 @@ class OnlineWitness:
              12, "rad/s"),
         ):  # fmt: skip
             prior = sigma**2 + walk**2 * elapsed
-            own = np.diagonal(state.cov)[first : first + 3]
+            own = variance[first : first + 3]
             score = np.abs(bias) / np.sqrt(np.maximum(prior - own, LEAST_GAIN * prior))
-            axis, worst = int(np.argmax(score)), float(np.max(score))
+            axis = int(score.argmax())
+            worst = float(score[axis])
             if worst < DOUBT:
                 continue
             size = float(np.linalg.norm(bias))
@@ -289,14 +292,18 @@ class OnlineWitness:
         change = difference(declared, state.calibration, self.estimated)
         left = np.diagonal(state.cov)[MOTION : MOTION + len(change)]
         walk = self._walk * (state.time - self._began) / 3600.0
-        prior = prior_sigma(self.estimated) ** 2 + walk
+        prior = self._declared_variance + walk
+        if self._borrowed_variance is None:  # also where a checkpoint brought it
+            own = (self._borrowed.get(b.name, np.zeros(len(b.sigma))) for b in self.estimated)
+            self._borrowed_variance = np.concatenate(list(own))
         # What was only considered moves the estimate, and its error with it: it is in both.
-        both = 2.0 * np.minimum(self._borrowed_variance(), left)
+        both = 2.0 * np.minimum(self._borrowed_variance, left)
         gained = np.maximum(prior - left + both, LEAST_GAIN * prior)
         scores, usual = np.abs(change) / np.sqrt(gained), np.maximum(prior, gained)
         of_site, found, inflation = self._of_site, [], 1.0
-        total, number = float(np.sum((change**2 / usual)[of_site])), int(np.sum(of_site))
-        for block in self.estimated if np.any(scores[of_site] > DOUBT) else ():
+        total = float((change**2 / usual)[of_site].sum())
+        number = int(np.count_nonzero(of_site))
+        for block in self.estimated if scores[of_site].max(initial=0.0) > DOUBT else ():
             score = float(np.max(scores[block.columns]))
             if not block.parameter.of_log and score > DOUBT:
                 text = (
@@ -327,9 +334,9 @@ class OnlineWitness:
         own = (b.parameter.walk_per_sqrt_hour(self.site) ** 2 for b in self.estimated)
         return np.repeat(list(own), [len(b.sigma) for b in self.estimated])
 
-    def _borrowed_variance(self) -> Array:
-        own = (self._borrowed.get(b.name, np.zeros(len(b.sigma))) for b in self.estimated)
-        return np.concatenate(list(own))
+    @cached_property
+    def _declared_variance(self) -> Array:
+        return np.asarray(prior_sigma(self.estimated) ** 2)
 
     def _of_gravity(self) -> Judgement:
         """Judge what is left of the mean specific force: no platform falls for seconds."""

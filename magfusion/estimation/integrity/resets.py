@@ -55,5 +55,5 @@ class Resets:
 def unexplained(predicted: State, state: State, before: Judgement) -> bool:
     """Tell whether a pose moved by more than it was known to, at one time."""
     step = predicted.pose.localCoordinates(state.pose)
-    cov = before.honest(predicted.cov)[:6, :6]
+    cov = before.honest(predicted.cov[:6, :6])
     return bool(step @ np.linalg.solve(cov, step) > UNEXPLAINED)

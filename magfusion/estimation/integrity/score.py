@@ -88,14 +88,14 @@ class Score:
             Of what they may be wrong by beyond what is declared.
         gradient : ndarray, shape (h,)
         """
-        taken = self._taken(np.concatenate([self.spread, self._tolerance()], axis=1))
+        taken = self._taken(np.concatenate([self.spread, tolerance_of(self.held)], axis=1))
         left = self.information - self.information @ taken @ self.information
         gradient = self.gradient - self.information @ (taken @ self.gradient)
         return 0.5 * (left + left.T), gradient
 
     def within_tolerance(self) -> Array:
         """Return the information of what is held while all have their tolerance, shape (h, h)."""
-        taken = self._taken(self._tolerance())
+        taken = self._taken(tolerance_of(self.held))
         left = self.information - self.information @ taken @ self.information
         return np.asarray(0.5 * (left + left.T))
 
@@ -103,14 +103,16 @@ class Score:
         """Return a step with what all else then moves by, as far as its declared sigma allows."""
         return step + self._taken(self.spread) @ (self.gradient - self.information @ step)
 
-    def _tolerance(self) -> Array:
-        own = [np.full(len(b.sigma), TOLERANCE.get(b.parameter, 0.0)) for b in self.held]
-        return np.diag(np.concatenate(own) / prior_sigma(self.held))
-
     def _taken(self, spread: Array) -> Array:
-        spread = spread[:, np.any(spread != 0.0, axis=0)]  # most of it is known
+        spread = spread[:, spread.any(axis=0)]  # most of it is known
         inner = np.eye(spread.shape[1]) + spread.T @ self.information @ spread
         return np.asarray(spread @ np.linalg.solve(inner, spread.T))
+
+
+def tolerance_of(held: tuple[Block, ...]) -> Array:
+    """Return a root of the covariance of what is held within its tolerance, in typical errors."""
+    own = [TOLERANCE.get(b.parameter, 0.0) / b.sigma for b in held]
+    return np.diag(np.concatenate(own))
 
 
 class Scores(NamedTuple):

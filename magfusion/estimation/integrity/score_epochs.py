@@ -16,6 +16,7 @@ from magfusion.estimation.measurements.earth import EarthField
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.measurement import Measurement, Rows, joined, kind_of
 from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
 from magfusion.estimation.state import MOTION, State, states_of
 from magfusion.model.parameters import Calibration
 from magfusion.model.samples import ImuSamples
@@ -84,9 +85,7 @@ def passed(before: State, after: State, transition: Array, imu: ImuSamples) -> P
     """Return what led to a prediction, of the inertial samples of the interval."""
     none = np.zeros(3)
     gyro, accel = (
-        (np.mean(imu.gyro_body, axis=0), np.mean(imu.accel_body, axis=0))
-        if len(imu)
-        else (none, none)
+        (imu.gyro_body.mean(axis=0), imu.accel_body.mean(axis=0)) if len(imu) else (none, none)
     )
     return Passed(transition, (before.world_from_body, after.world_from_body), gyro, accel)
 
@@ -101,10 +100,12 @@ def heard(sums: Sums, epochs: Sequence[Epoch], asked: Asked) -> Sums:
     innovation = across @ np.swapaxes(by_state, 1, 2) + noise
     alone = cov[:, own, own]
     if len(rest):
-        considered = cov[:, rest]
-        learnt = np.linalg.solve(considered[:, :, rest], considered[:, :, own])
-        alone = alone - np.swapaxes(considered[:, :, own], 1, 2) @ learnt
-    known = by_own @ alone @ np.swapaxes(by_own, 1, 2) + noise
+        across_own, known = cov[:, rest, own], cov[:, rest[:, None], rest]
+        # What is only considered stays as uncertain as it is, mostly.
+        alike = np.array_equal(known, np.broadcast_to(known[0], known.shape))
+        learnt = _solved(known[0], across_own) if alike else np.linalg.solve(known, across_own)
+        alone = alone - np.swapaxes(across_own, 1, 2) @ learnt
+    spread = by_own @ alone @ np.swapaxes(by_own, 1, 2) + noise
     gain = np.swapaxes(np.linalg.solve(innovation, across[..., own]), 1, 2)
     pushed, response = _pushed(epochs, asked), sums.response
     shown = np.empty((*error.shape, len(asked.unit)))
@@ -114,7 +115,7 @@ def heard(sums: Sums, epochs: Sequence[Epoch], asked: Asked) -> Sums:
             response[:9] -= pushed[k]
         shown[k] = by_own[k] @ response - by_held[k]
         response = response - gain[k] @ shown[k]
-    symmetric = 0.5 * (known + np.swapaxes(known, 1, 2))
+    symmetric = 0.5 * (spread + np.swapaxes(spread, 1, 2))
     solved = np.linalg.solve(symmetric, np.concatenate([shown, error[..., None]], axis=2))
     told = np.swapaxes(shown, 1, 2) @ solved
     time = np.maximum.accumulate([sums.time, *(epoch.predicted.time for epoch in epochs)])
@@ -126,6 +127,12 @@ def heard(sums: Sums, epochs: Sequence[Epoch], asked: Asked) -> Sums:
         response,
         float(time[-1]),
     )
+
+
+def _solved(matrix: Array, right: Array) -> Array:
+    """Return what solves one system for the right sides of several epochs, (epochs, n, k)."""
+    flat = np.linalg.solve(matrix, right.swapaxes(0, 1).reshape(len(matrix), -1))
+    return np.asarray(flat.reshape(len(matrix), len(right), -1).swapaxes(0, 1))
 
 
 def _pushed(epochs: Sequence[Epoch], asked: Asked) -> Array:
@@ -191,6 +198,8 @@ _OFFSET = (FieldPhasors, JointPhasors, EarthField)  # that know what offset the 
 
 def _alike(measurement: Measurement, calibration: Calibration, alone: tuple[int, int]) -> object:
     """Return what measurements have in common that can be linearised at once."""
+    if isinstance(measurement, ZeroVelocity):  # which no calibration changes
+        return kind_of(measurement)
     if not isinstance(measurement, _OFFSET):
         return alone
     own = (calibration.site, calibration.phase, calibration.drift, calibration.log_gain)

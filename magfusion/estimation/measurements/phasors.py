@@ -133,8 +133,9 @@ class FieldPhasors(Measurement):
         if by_blocks.shape[-1] < MANY_COLUMNS:
             return np.asarray(self.sqrt_information @ by_blocks)
         out, root = np.zeros_like(by_blocks), self.sqrt_information
+        felt = {name: _felt(blocks, name) for name in {name for name, _ in site.channels}}
         for k, (name, _) in enumerate(site.channels):
-            for begin, end in _felt(blocks, name):
+            for begin, end in felt[name]:
                 out[:, k, :, begin:end] = root[:, k] @ by_blocks[:, k, :, begin:end]
         return out
 

