@@ -386,11 +386,11 @@ class Arrivals:
         if abs(lag) < OFFSET_STALE:
             return 0.0
         by_state, run = np.zeros(len(state.cov)), state.time - state.calibration.imu_begin
-        for block in blocks:
-            if block.parameter in (TIME_OFFSET, CLOCK_RATE):
-                by_state[MOTION + block.columns.start] = (
-                    1.0 if block.parameter == TIME_OFFSET else run
-                )
+        for parameter, _, columns, _ in blocks:
+            if parameter.kind == TIME_OFFSET.kind and parameter == TIME_OFFSET:
+                by_state[MOTION + columns.start] = 1.0
+            elif parameter.kind == CLOCK_RATE.kind and parameter == CLOCK_RATE:
+                by_state[MOTION + columns.start] = run
         if not np.any(by_state):
             return 0.0
         sigma = float(np.sqrt(by_state @ state.cov @ by_state))

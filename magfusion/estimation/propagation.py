@@ -121,11 +121,13 @@ def propagate(
     cov[:MOTION, MOTION:], cov[MOTION:, :MOTION] = across[:, MOTION:], across[:, MOTION:].T
     cov += noise
     after = link.measurement.predict(before, bias)
+    pose = after.pose()
     later = altered(
         state,
         time=time,
-        world_from_body=after.pose().rotation().matrix(),
-        position_world=np.asarray(after.pose().translation()),
+        pose=pose,
+        world_from_body=pose.rotation().matrix(),
+        position_world=np.asarray(pose.translation()),
         velocity_world=np.asarray(after.velocity()),
         cov=cov,
     )

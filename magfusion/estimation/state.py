@@ -111,6 +111,7 @@ def moved_to(state: State, calibration: Calibration, step: Array) -> State:
     pose = state.pose.retract(step[:6])
     return altered(
         state,
+        pose=pose,
         world_from_body=pose.rotation().matrix(),
         position_world=np.asarray(pose.translation()),
         velocity_world=state.velocity_world + step[VELOCITY],

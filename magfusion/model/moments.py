@@ -4,7 +4,6 @@ An estimator moves them at every step.  What does not hang on moments is not wor
 """
 
 from collections.abc import Mapping
-from copy import copy
 from typing import Any, TypeVar
 
 from magfusion.model.coil_field import keep_sources
@@ -41,6 +40,6 @@ def _changed(beacon: Beacon, moments_beacon: Array) -> Beacon:
 
 def _altered(part: Part, **changes: Any) -> Part:
     """Return a part of the site with other values, and with all that it has worked out."""
-    other = copy(part)
-    vars(other).update(changes)
+    other = object.__new__(type(part))  # a third of what `copy.copy` takes
+    vars(other).update(vars(part), **changes)
     return other

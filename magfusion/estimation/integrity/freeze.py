@@ -40,7 +40,9 @@ class Freeze:
             return []
         same = np.empty(len(time), dtype=bool)
         same[0] = (samples[0] == self._sample).all()
-        np.logical_and.reduce(samples[1:] == samples[:-1], axis=1, out=same[1:])
+        np.equal(samples[1:, 0], samples[:-1, 0], out=same[1:])
+        if same[1:].any():
+            np.logical_and.reduce(samples[1:] == samples[:-1], axis=1, out=same[1:])
         self._sample = samples[-1].copy()
         if self._passed(time, same):
             return []

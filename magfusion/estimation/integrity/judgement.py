@@ -80,6 +80,8 @@ class Judgement:
 
     def estimators(self, cov: Array) -> Array:
         """Return the covariance that the estimator itself claims: the inverse of `honest`."""
+        if self.inflation == 1.0 and self.turn == 0.0 and self.shift == 0.0:
+            return cov
         narrow = cov.copy()
         narrow[ROTATION, ROTATION] -= self.turn**2 * np.eye(3)
         narrow[POSITION, POSITION] -= self.shift**2 * np.eye(3)

@@ -83,10 +83,10 @@ class Epoch(NamedTuple):
 
 def passed(before: State, after: State, transition: Array, imu: ImuSamples) -> Passed:
     """Return what led to a prediction, of the inertial samples of the interval."""
-    none = np.zeros(3)
-    gyro, accel = (
-        (imu.gyro_body.mean(axis=0), imu.accel_body.mean(axis=0)) if len(imu) else (none, none)
-    )
+    gyro = accel = np.zeros(3)
+    if len(imu):
+        share = np.full(len(imu), 1.0 / len(imu))
+        gyro, accel = share @ imu.gyro_body, share @ imu.accel_body
     return Passed(transition, (before.world_from_body, after.world_from_body), gyro, accel)
 
 

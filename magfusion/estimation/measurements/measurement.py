@@ -94,7 +94,7 @@ optional
 
     def weighed(self, loss: Loss | None) -> tuple["Rows", Array]:
         """Return rows that a robust loss has weighed, and the loss of each group."""
-        square = np.sum(self.error**2, axis=2)
+        square = (self.error**2).sum(axis=2)
         if loss is None:
             return self, square
         weight, rho = loss.weighed(square, self.error.shape[2])

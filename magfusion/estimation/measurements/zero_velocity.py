@@ -16,6 +16,7 @@ REST_GATE = 30.7  # chi square of three components, one in a million: days have 
 LONGEST_SILENCE = 0.1  # s; a gap looks quiet
 FEWEST_SAMPLES = 10
 REACH = 0.1  # s, beyond the span, that the samples should cover
+_EYE = np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,7 @@ class ZeroVelocity(Measurement):
         weight = 1.0 / self.sigma[:, None, None]
         return Rows(
             error=weight * states.velocity_world[:, None],
-            by_velocity=weight[..., None] * np.eye(3),
+            by_velocity=weight[..., None] * _EYE,
         )
 
 
@@ -66,7 +67,9 @@ def quiet_before(imu: ImuSamples, stamps: Array, motion: MotionModel) -> BoolArr
     first, last = np.minimum(first, count - 1), np.maximum(np.minimum(last, count), 1)
     covered = (time[first] <= stamps - span) & (time[last - 1] >= stamps - REACH)
     silent = np.zeros(count, dtype=np.int64)
-    np.cumsum(time[1:] - time[:-1] > LONGEST_SILENCE, out=silent[1:])
+    gap = time[1:] - time[:-1] > LONGEST_SILENCE
+    if gap.any():
+        gap.cumsum(out=silent[1:])
     middle = np.minimum(np.searchsorted(time, stamps - span / 2), count - 1)
     streams = time, imu.gyro_body, imu.accel_body
     still = resting(*streams, span - REACH, motion=motion, at=middle)
@@ -87,8 +90,9 @@ def may_stand(velocity_world: Array, cov: Array, motion: MotionModel) -> BoolArr
         Of it (m^2/s^2).
     """
     known = np.diagonal(cov, axis1=-2, axis2=-1).max(axis=-1) < motion.rest_known_speed**2
-    if not known.any():
-        return np.asarray(known)
-    cov = cov + motion.rest_speed_sigma**2 * np.eye(3)
+    slow = (velocity_world**2).sum(axis=-1) < REST_GATE * motion.rest_speed_sigma**2
+    if not known.any() or slow.all():  # of a velocity that is known exactly it would be so, too
+        return np.asarray(known & slow)
+    cov = cov + motion.rest_speed_sigma**2 * _EYE
     solved = np.linalg.solve(cov, velocity_world[..., None])[..., 0]
-    return known & (np.sum(velocity_world * solved, axis=-1) < REST_GATE)
+    return known & ((velocity_world * solved).sum(axis=-1) < REST_GATE)
