@@ -100,12 +100,10 @@ def heard(sums: Sums, epochs: Sequence[Epoch], asked: Asked) -> Sums:
     innovation = across @ np.swapaxes(by_state, 1, 2) + noise
     alone = cov[:, own, own]
     if len(rest):
-        across_own, known = cov[:, rest, own], cov[:, rest[:, None], rest]
-        # What is only considered stays as uncertain as it is, mostly.
-        alike = np.array_equal(known, np.broadcast_to(known[0], known.shape))
-        learnt = _solved(known[0], across_own) if alike else np.linalg.solve(known, across_own)
-        alone = alone - np.swapaxes(across_own, 1, 2) @ learnt
-    spread = by_own @ alone @ np.swapaxes(by_own, 1, 2) + noise
+        considered = cov[:, rest]
+        learnt = np.linalg.solve(considered[:, :, rest], considered[:, :, own])
+        alone = alone - np.swapaxes(considered[:, :, own], 1, 2) @ learnt
+    known = by_own @ alone @ np.swapaxes(by_own, 1, 2) + noise
     gain = np.swapaxes(np.linalg.solve(innovation, across[..., own]), 1, 2)
     pushed, response = _pushed(epochs, asked), sums.response
     shown = np.empty((*error.shape, len(asked.unit)))
@@ -115,24 +113,18 @@ def heard(sums: Sums, epochs: Sequence[Epoch], asked: Asked) -> Sums:
             response[:9] -= pushed[k]
         shown[k] = by_own[k] @ response - by_held[k]
         response = response - gain[k] @ shown[k]
-    symmetric = 0.5 * (spread + np.swapaxes(spread, 1, 2))
+    symmetric = 0.5 * (known + np.swapaxes(known, 1, 2))
     solved = np.linalg.solve(symmetric, np.concatenate([shown, error[..., None]], axis=2))
     told = np.swapaxes(shown, 1, 2) @ solved
     time = np.maximum.accumulate([sums.time, *(epoch.predicted.time for epoch in epochs)])
     kept = np.exp((time - time[-1]) / MEMORY)
-    whole = np.tensordot(kept[1:], told, axes=1)
+    whole = np.einsum("k,kij->ij", kept[1:], told)
     return Sums(
         kept[0] * sums.information + whole[:, :-1],
         kept[0] * sums.gradient + whole[:, -1],
         response,
         float(time[-1]),
     )
-
-
-def _solved(matrix: Array, right: Array) -> Array:
-    """Return what solves one system for the right sides of several epochs, (epochs, n, k)."""
-    flat = np.linalg.solve(matrix, right.swapaxes(0, 1).reshape(len(matrix), -1))
-    return np.asarray(flat.reshape(len(matrix), len(right), -1).swapaxes(0, 1))
 
 
 def _pushed(epochs: Sequence[Epoch], asked: Asked) -> Array:

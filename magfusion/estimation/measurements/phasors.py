@@ -133,7 +133,7 @@ class FieldPhasors(Measurement):
         if by_blocks.shape[-1] < MANY_COLUMNS:
             return np.asarray(self.sqrt_information @ by_blocks)
         out, root = np.zeros_like(by_blocks), self.sqrt_information
-        felt = {name: _felt(blocks, name) for name in {name for name, _ in site.channels}}
+        felt = _felt(blocks, {name for name, _ in site.channels})
         for k, (name, _) in enumerate(site.channels):
             for begin, end in felt[name]:
                 out[:, k, :, begin:end] = root[:, k] @ by_blocks[:, k, :, begin:end]
@@ -229,16 +229,15 @@ class FieldPhasors(Measurement):
         )
 
 
-def _felt(blocks: tuple[Block, ...], name: str) -> list[tuple[int, int]]:
-    """Return stretches of columns that the phasors of a beacon feel."""
-    found: list[tuple[int, int]] = []
-    for block in blocks:
-        if isinstance(block.parameter, BeaconParameter) and block.owner != name:
-            continue
-        begin, end = block.columns.start, block.columns.stop
-        if found and found[-1][1] == begin:
-            begin = found.pop()[0]
-        found.append((begin, end))
+def _felt(blocks: tuple[Block, ...], names: set[str]) -> dict[str, list[tuple[int, int]]]:
+    """Return stretches of columns that the phasors of each beacon feel."""
+    found: dict[str, list[tuple[int, int]]] = {name: [] for name in names}
+    every = list(found.values())
+    for parameter, owner, columns, _ in blocks:
+        alone = isinstance(parameter, BeaconParameter)
+        for own in [found[owner]] if alone and owner in found else () if alone else every:
+            begin = own.pop()[0] if own and own[-1][1] == columns.start else columns.start
+            own.append((begin, columns.stop))
     return found
 
 
