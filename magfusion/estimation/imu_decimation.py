@@ -13,14 +13,14 @@ from bisect import bisect_left
 from dataclasses import replace
 from functools import lru_cache
 from math import factorial
-from typing import NamedTuple
 
 import gtsam
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.preintegration import Increments, cut_at_epochs, preintegrate
 from magfusion.model.perturbation import skew
-from magfusion.model.quaternion import cross, matrices, product, turned, vectors
+from magfusion.model.quaternion import cross
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel
 from magfusion.receiver.admission import meets
@@ -40,8 +40,6 @@ _SERIES = np.array(
             (-1) ** k / factorial(2 * k + 2),
             (-1) ** k / factorial(2 * k + 3),
             (-1) ** k / factorial(2 * k + 4),
-            (-0.25) ** k / factorial(2 * k),
-            0.5 * (-0.25) ** k / factorial(2 * k + 1),
         ]
         for k in range(5)
     ]
@@ -167,8 +165,10 @@ def _with_joined(
         first = start[lo : lo + number]
         steps = every.take(within[..., None] + first, axis=1)
         both, gentle = _joined(steps, bias.take(owner[lo : lo + number], axis=1))
-        made.append(both[:, :, gentle])
-        begun.append(first[gentle])
+        if not gentle.all():
+            both, first = both[..., gentle], first[gentle]
+        made.append(both)
+        begun.append(first)
     first, both = np.concatenate(begun), np.concatenate(made, axis=2)
     kept = np.ones(len(increments.dt), dtype=bool)
     kept[within[1:, :, None] + first] = False
@@ -185,54 +185,44 @@ def _pairs(increments: Increments, joined: int, long: BoolArray) -> tuple[IntArr
     return increments.first[owner] + 2 * joined * within, owner
 
 
-class _Halves(NamedTuple):
-    """What the steps of two joined ones integrate to, each from rest at its own beginning.
+def _one_after_the_other(moved: Array) -> Array:
+    """Return the product of k matrices, (k, ..., 5, 5): of neighbours, and of these again."""
+    while len(moved) > 1:
+        even = len(moved) - len(moved) % 2
+        pairs = moved[0:even:2] @ moved[1:even:2]
+        moved = pairs if even == len(moved) else np.concatenate([pairs, moved[even:]])
+    return np.asarray(moved[0])
+
+
+def _of_steps(steps: Array, bias: Array) -> tuple[Array, Array]:
+    """Return the motion in single steps, and the angle that each turns through (rad).
 
     Parameters
     ----------
-    turn : ndarray, shape (4, 2, n)
-        Quaternion, scalar first.
-    velocity, position : ndarray, shape (3, 2, n)
-        Gained, in the axes of the beginning (m/s, m).
-    dt : ndarray, shape (2, n)
-        (s)
-    path : ndarray, shape (2, n)
-        Angle turned through, to and fro (rad).
+    steps, bias
+        As of `_joined`.
+
+    Returns
+    -------
+    moved : ndarray, shape (k, 2, n, 5, 5)
+        Turn, velocity and position from rest at the beginning of the step, its length: an element
+        of the Galilean group, of which GTSAM's integration is a product.
+    angle : ndarray, shape (k, 2, n)
     """
-
-    turn: Array
-    velocity: Array
-    position: Array
-    dt: Array
-    path: Array
-
-
-def _halves(steps: Array, bias: Array) -> _Halves:
     dt = steps[6]
     rotation, gained = (steps[:6] - bias[:, None, None]).reshape(2, 3, *dt.shape) * dt
     square = np.einsum("i...,i...->...", rotation, rotation)
-    b, c, d, cosine, sine = _coefficients(square)
+    b, c, d = _coefficients(square)
     once = cross(rotation, gained)
     twice = cross(rotation, once)
-    both = np.empty((3, 2, *dt.shape))  # velocity and position that each step gains
-    both[:, 0] = gained + b * once + c * twice
-    both[:, 1] = (0.5 * gained + c * once + d * twice) * dt
-    turn = np.empty((4, *dt.shape))  # of the first steps, one, two ... of them
-    turn[0] = cosine
-    np.multiply(sine, rotation, out=turn[1:])
-    reach = 1
-    while reach < len(dt):
-        turn[:, reach:] = product(turn[:, :-reach], turn[:, reach:])
-        reach *= 2
-    both[:, :, 1:] = turned(turn[:, None, :-1], both[:, :, 1:])
-    velocity = both[:, 0].cumsum(axis=1)
-    return _Halves(
-        turn=turn[:, -1],
-        velocity=velocity[:, -1],
-        position=both[:, 1].sum(axis=1) + (velocity[:, :-1] * dt[1:]).sum(axis=1),
-        dt=dt.sum(axis=0),
-        path=np.sqrt(square).sum(axis=0),
-    )
+    turn = Rotation.from_rotvec(rotation.reshape(3, -1).T).as_matrix()
+    moved = np.zeros((*dt.shape, 5, 5))
+    moved[..., :3, :3] = turn.reshape(*dt.shape, 3, 3)
+    moved[..., :3, 3] = (gained + b * once + c * twice).transpose(1, 2, 3, 0)
+    moved[..., :3, 4] = ((0.5 * gained + c * once + d * twice) * dt).transpose(1, 2, 3, 0)
+    moved[..., 3, 3] = moved[..., 4, 4] = 1.0
+    moved[..., 3, 4] = dt
+    return moved, np.sqrt(square)
 
 
 def _joined(steps: Array, bias: Array) -> tuple[Array, BoolArray]:
@@ -255,26 +245,32 @@ def _joined(steps: Array, bias: Array) -> tuple[Array, BoolArray]:
     gentle : ndarray of bool, shape (n,)
         Whether neither half turns far.
     """
-    halves = _halves(steps, bias)
-    rotation, after = vectors(halves.turn), matrices(halves.turn[:, 0])
-    first, second = halves.dt[..., None, None]
-    (v_1, v_2), (p_1, p_2) = (
-        each.transpose(1, 2, 0)[..., None] for each in (halves.velocity, halves.position)
-    )
-    whole = np.concatenate([v_1 + after @ v_2, p_1 + v_1 * second + after @ p_2], axis=1)
+    single, angle = _of_steps(steps, bias)
+    halves = _one_after_the_other(single)
+    whole = (halves[0] @ halves[1])[:, :3, 3:].swapaxes(1, 2).reshape(-1, 6, 1)
+    rotation, dt = _small_vectors(halves[..., :3, :3]), halves[..., 3, 4]
+    first, second = dt[..., None, None]
     by_1, by_2 = _by_force(rotation)
-    system = np.empty((len(after), 6, 6))
+    system = np.empty((len(whole), 6, 6))
     system[:, :3, :3] = by_1[..., :3] * first
     system[:, 3:, :3] = by_1[..., 3:] * first**2 + by_1[..., :3] * (first * second)
-    later = after @ by_2
+    later = halves[0, :, :3, :3] @ by_2
     system[:, :3, 3:] = later[..., :3] * second
     system[:, 3:, 3:] = later[..., 3:] * second**2
-    both = np.empty((7, *halves.dt.shape))
-    both[:3] = rotation / halves.dt
+    both = np.empty((7, *dt.shape))
+    both[:3] = rotation / dt
     both[3:6] = np.linalg.solve(system, whole).reshape(-1, 2, 3).T
     both[:6] += bias[:, None]
-    both[6] = halves.dt
-    return both, halves.path.max(axis=0) < MOST_TURN
+    both[6] = dt
+    return both, angle.sum(axis=0).max(axis=0) < MOST_TURN
+
+
+def _small_vectors(turn: Array) -> Array:
+    """Return the rotation vectors, (3, ...), of matrices of turns below a right angle (rad)."""
+    odd = 0.5 * (turn - turn.swapaxes(-1, -2))
+    axis = np.array([odd[..., 2, 1], odd[..., 0, 2], odd[..., 1, 0]])
+    sine = np.sqrt(np.einsum("i...,i...->...", axis, axis))
+    return np.asarray(axis / np.sinc(np.arcsin(np.minimum(sine, 1.0)) / np.pi))
 
 
 def _by_force(rotation: Array) -> Array:
@@ -293,7 +289,7 @@ def _by_force(rotation: Array) -> Array:
     once = skew(np.moveaxis(rotation, 0, -1))
     twice = once @ once
     factors = _coefficients(np.einsum("i...,i...->...", rotation, rotation))
-    b, c, d = factors[:3, ..., None, None]
+    b, c, d = factors[..., None, None]
     out = np.empty((*once.shape[:-1], 6))
     out[..., :3] = b * once + c * twice
     out[..., 3:] = c * once + d * twice
@@ -302,10 +298,9 @@ def _by_force(rotation: Array) -> Array:
 
 
 def _coefficients(square: Array) -> Array:
-    """Return functions of the angle x of a rotation from its square, a small one, shape (5, ...).
+    """Return functions of the angle x of a rotation from its square, a small one, shape (3, ...).
 
-    (1 - cos x) / x^2, (x - sin x) / x^3, (x^2 / 2 - 1 + cos x) / x^4, and of half the angle the
-    cosine and half of sin(x / 2) / (x / 2).
+    (1 - cos x) / x^2, (x - sin x) / x^3, (x^2 / 2 - 1 + cos x) / x^4.
     """
     last = 1 + bisect_left(_FEW_TERMS, square.max())
     terms = _SERIES.reshape(*_SERIES.shape, *(1,) * square.ndim)
