@@ -1,12 +1,12 @@
 """Fewer steps of an inertial stream between epochs far apart, that integrate to the same.
 
-GTSAM integrates one step a call.  Here the steps of a long interval are joined by eights, tens or
-twenties, two joined steps at a time: their rates make the turns of the two halves, their specific
-forces the velocity and the position gained over both, exactly as the Galilean group composes them
-of the single steps.  The noise's covariance and the derivatives by the biases are those of the
-longer steps.  GTSAM's scheme of the covariance is of first order: the sigmas differ by less than
-half a step's share of the interval.  The derivatives differ by a twelfth of the square of the turn
-in a step, of a change of bias that the next pass makes nothing.
+GTSAM integrates one step a call.  Here the steps of a long interval are joined by tens or more, two
+joined steps at a time: their rates make the turns of the two halves, their specific forces the
+velocity and the position gained over both, exactly as the Galilean group composes them of the
+single steps.  The noise's covariance and the derivatives by the biases are those of the longer
+steps.  GTSAM's scheme of the covariance is of first order: the sigmas differ by less than half a
+step's share of the interval.  The derivatives differ by a twelfth of the square of the turn in a
+step, of a change of bias that the next pass makes nothing.
 """
 
 from bisect import bisect_left

@@ -63,7 +63,7 @@ def cut_at_epochs(
     time = imu.time + time_offset
     known = float(np.median(np.diff(time))) if usual is None else usual
     edges, gap = _gaps(time, epochs, known)
-    if len(epochs) == 2 and not gap.any():
+    if len(epochs) == 2 and not gap.any() and (time[1:] > time[:-1]).all():
         return _one_interval(imu, time, epochs)
     # One long step would tie the position to the velocity: its noise would be singular.
     stamps = _filled(time, edges, np.flatnonzero(gap), epochs, known)
