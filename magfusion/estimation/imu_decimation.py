@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.preintegration import Increments, cut_at_epochs, preintegrate
-from magfusion.model.quaternion import cross, product, turned
+from magfusion.model.quaternion import cross, matrices, product, turned, unit, vectors
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel
 from magfusion.receiver.admission import meets
@@ -214,10 +213,8 @@ def _joined(halves: _Halves, bias: Array) -> Array:
     of the whole.
     """
     first, second = halves.dt[..., None, None]
-    quaternion = np.moveaxis(halves.turn, 0, 2)
-    turn = Rotation.from_quat(quaternion.reshape(-1, 4), scalar_first=True)
-    rotation = turn.as_rotvec().reshape(2, -1, 3)
-    after = turn.as_matrix().reshape(2, -1, 3, 3)[0]
+    rotation = np.moveaxis(vectors(halves.turn), 0, 2)
+    after = matrices(unit(halves.turn[:, 0]))
     (to_velocity, to_velocity_2), (to_position, to_position_2) = _by_force(rotation)
     v_1, v_2 = np.moveaxis(halves.velocity, 0, 2)[..., None]
     p_1, p_2 = np.moveaxis(halves.position, 0, 2)[..., None]

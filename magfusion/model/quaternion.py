@@ -5,10 +5,16 @@ so that each operation is one over all rotations.  Of few rotations it is the nu
 that costs, and all products of components are made in one: the result is the same to the last bit.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.units import Array
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 FEW = 8000  # numbers
 FEW_COMPONENTS = 1024  # of rotations whose matrices are made at once

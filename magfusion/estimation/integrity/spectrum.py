@@ -13,9 +13,10 @@ from scipy.ndimage import median_filter
 
 from magfusion.errors import InputError
 from magfusion.estimation.integrity.turning import field_body
+from magfusion.model.quaternion import turned
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
-from magfusion.model.strapdown import attitude_at, attitude_from_gyro
+from magfusion.model.strapdown import turn_at, turn_from_gyro
 from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.design import separable
 from magfusion.receiver.receivers import usual_lockin
@@ -98,9 +99,9 @@ def still_field(log: Log, site: Site | None) -> Array:
     if log.vectors is None or site is None or len(log.imu) < 2:
         return field
     imu, offset = log.imu, site.platform.imu.time_offset
-    turns = attitude_from_gyro(imu.time, imu.gyro_body)
-    at = attitude_at(turns, imu.time, imu.gyro_body, log.vectors.time - offset)
-    return np.asarray(at.apply(field))
+    turns = turn_from_gyro(imu.time, imu.gyro_body)
+    at = turn_at(turns, imu.time, imu.gyro_body, log.vectors.time - offset)
+    return np.ascontiguousarray(turned(at, field.T).T)
 
 
 def spectrum(log: Log, site: Site | None) -> Spectrum | None:
