@@ -279,8 +279,10 @@ def _read_parquet(path: Path, layout: Layout, span: Span) -> tuple[pa.Table, int
         own = [file.metadata.row_group(g) for g in groups]
         skipped = sum(file.metadata.row_group(g).num_rows for g in range(groups[0]))
         refuse_unfolding(file, names, own, path)
-        if sum(group.num_rows for group in own) <= MOST_ROWS:
-            return file.read_row_groups(list(groups), columns=names), skipped
+        count = sum(group.num_rows for group in own)
+        if count <= MOST_ROWS:
+            many = count > ROWS_PER_GROUP  # fewer are read sooner than threads are woken
+            return file.read_row_groups(list(groups), columns=names, use_threads=many), skipped
         return read_batches(file, names, groups, span.bounds_ns, path, skipped)
 
 
