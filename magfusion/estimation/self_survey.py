@@ -7,6 +7,7 @@ is smoothed with each, and the motion decides.
 
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,8 +50,7 @@ class Hypothesis:
     smoothed: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Placement:
+class Placement(NamedTuple):
     """What the log said of the place of one unknown beacon.
 
     Parameters

@@ -8,6 +8,7 @@ change from epoch to epoch, and both together have the declared size as their pr
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,8 +28,7 @@ NONE = 1e-4  # of a part that was not declared: as good as none
 KINDS = (slice(0, 1), slice(1, 3))
 
 
-@dataclass(frozen=True)
-class BeaconParts:
+class BeaconParts(NamedTuple):
     """What the residuals of one beacon are likeliest made of.
 
     Parameters

@@ -4,6 +4,7 @@ import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -72,8 +73,7 @@ class Span:
         return max(-LARGEST_TIME_NS, min(stamp, LARGEST_TIME_NS))
 
 
-@dataclass(frozen=True, eq=False)
-class Layout:
+class Layout(NamedTuple):
     """Columns of a table.
 
     Parameters

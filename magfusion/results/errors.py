@@ -1,6 +1,6 @@
 """Errors of an estimated trajectory against the truth, as evo computes them."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -11,8 +11,7 @@ from magfusion.model.trajectory import Trajectory, interpolate
 from magfusion.units import Array, BoolArray, IntArray
 
 
-@dataclass(frozen=True, eq=False)
-class RelativeErrors:
+class RelativeErrors(NamedTuple):
     """Relative pose errors (RPE) over pairs of epochs.
 
     Parameters
@@ -40,8 +39,7 @@ class RelativeErrors:
         return float(np.rad2deg(_rms(self.rotation)))
 
 
-@dataclass(frozen=True, eq=False)
-class TrajectoryErrors:
+class TrajectoryErrors(NamedTuple):
     """Estimate minus truth at each of the estimate's times for which there is a truth.
 
     Parameters

@@ -3,8 +3,8 @@
 import subprocess
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -304,8 +304,7 @@ def scene_view(site: Site, scale: Scale, name: str = "Scene") -> rrb.Spatial3DVi
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Drawn:
+class _Drawn(NamedTuple):
     """What is drawn beside the scene."""
 
     trajectory: Trajectory

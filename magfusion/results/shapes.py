@@ -1,6 +1,6 @@
 """Outlines to draw: coils, coverage, uncertainty, and the scale at which they can be seen."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,8 +10,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
 
-@dataclass(frozen=True, eq=False)
-class Scale:
+class Scale(NamedTuple):
     """Where the scene is, how large it is, and how much sigmas must be magnified to be seen.
 
     Parameters

@@ -8,8 +8,8 @@ the fix of a cycle to the slots in it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -45,8 +45,7 @@ if TYPE_CHECKING:
 LEAST_DETECTED = 10  # epochs at which a beacon is detected; fewer give no start
 
 
-@dataclass(frozen=True, eq=False)
-class OfflineStart:
+class OfflineStart(NamedTuple):
     """A start with the calibration that its drive phases suggest.
 
     Parameters

@@ -8,6 +8,7 @@ quarter turn of one instrument, or iron on the body show in the first seconds, w
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -324,8 +325,7 @@ def _dip_sigma(means: StillMeans, site: Site) -> float:
     return float(np.sqrt(np.sum(np.square(parts))))
 
 
-@dataclass(frozen=True, eq=False)
-class _InWorld:
+class _InWorld(NamedTuple):
     """Specific force and field by the attitudes of poses, world axes, shape (n, 3)."""
 
     up: Array

@@ -29,8 +29,7 @@ MISFIT = 1e-6  # probability of a larger residual, where what was false has been
 LEAST_HEARD = 3  # beacons; of two that contradict each other either may be false
 
 
-@dataclass(frozen=True, eq=False)
-class SeparatedFixes:
+class SeparatedFixes(NamedTuple):
     """Fixes after the false beacons were left out.
 
     Parameters

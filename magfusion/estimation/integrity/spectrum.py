@@ -6,7 +6,8 @@ amplitude ``1 / (pi |df| window)``, all of it where it is nearer.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -49,8 +50,7 @@ LONGER = 2.0  # times the usual window, by which a line is told from a tone
 SEPARATED = 1.5  # over the window, the least distance of a fitted line from a tone
 
 
-@dataclass(frozen=True, eq=False)
-class Spectrum:
+class Spectrum(NamedTuple):
     """Mean power of a field.
 
     Parameters
@@ -81,8 +81,7 @@ class Spectrum:
         return float(np.max(self.power[near], initial=1e-300))
 
 
-@dataclass(frozen=True)
-class Line:
+class Line(NamedTuple):
     """One line of a spectrum (Hz, T)."""
 
     frequency_hz: float

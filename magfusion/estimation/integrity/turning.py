@@ -7,10 +7,9 @@ and on real instruments the identity explains 87 to 99.9 % of db/dt.
 """
 
 import math
-from dataclasses import dataclass
 from functools import cache
 from itertools import permutations, product
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -32,8 +31,7 @@ for _i, _k, _j in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _EPSILON[_i, _k, _j], _EPSILON[_i, _j, _k] = 1.0, -1.0
 
 
-@dataclass(frozen=True, eq=False)
-class Turning:
+class Turning(NamedTuple):
     """How a field changes in the body, and what the gyroscope says to it.
 
     Parameters
