@@ -1,5 +1,6 @@
 """Errors of an estimated trajectory against the truth, as evo computes them."""
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import gtsam
@@ -39,7 +40,8 @@ class RelativeErrors(NamedTuple):
         return float(np.rad2deg(_rms(self.rotation)))
 
 
-class TrajectoryErrors(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class TrajectoryErrors:
     """Estimate minus truth at each of the estimate's times for which there is a truth.
 
     Parameters

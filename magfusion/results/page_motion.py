@@ -1,8 +1,8 @@
 """What a page shows of a motion: its path, its errors or sigmas in time, residuals by beacon."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from html import escape
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,8 @@ _FAR = 3.0  # of the path's size; beyond, a beacon would hide the path
 _GAP = 10.0  # times the usual step; a line across it would invent states
 
 
-class Motion(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Motion:
     """A trajectory with what is known of it; as `magfusion.results.recording.write_recording`.
 
     Parameters
