@@ -106,8 +106,8 @@ def test_a_site_keeps_what_it_says_of_the_place(tmp_path: Path) -> None:
     read = load_site(tmp_path / "site.yaml")
     assert read.bounds is not None
     assert site.bounds is not None
-    np.testing.assert_array_equal(read.bounds.normal_world, site.bounds.normal_world)
-    np.testing.assert_array_equal(read.bounds.offset, site.bounds.offset)
+    np.testing.assert_allclose(read.bounds.normal_world, site.bounds.normal_world, rtol=1e-14)
+    np.testing.assert_allclose(read.bounds.offset, site.bounds.offset, rtol=1e-14)
     assert read.bounds.names == site.bounds.names
     text = (tmp_path / "site.yaml").read_text()
     assert "null" in text

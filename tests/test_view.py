@@ -200,11 +200,10 @@ def test_ellipsoid_axes_rebuild_the_covariance() -> None:
     rng = np.random.default_rng(3)
     root = rng.standard_normal((5, 3, 3))
     cov_body = root @ np.swapaxes(root, 1, 2)
-    turn = Rotation.random(5, random_state=rng)
-    half, axes = ellipsoids(turn, cov_body)
-    world = axes.as_matrix()
+    turn = Rotation.random(5, random_state=rng).as_matrix()
+    half, world = ellipsoids(turn, cov_body)
     rebuilt = np.einsum("nik,nk,njk->nij", world, half**2, world)
-    expected = turn.as_matrix() @ cov_body @ np.swapaxes(turn.as_matrix(), 1, 2)
+    expected = turn @ cov_body @ np.swapaxes(turn, 1, 2)
     np.testing.assert_allclose(rebuilt, expected, atol=1e-12)
 
 

@@ -7,8 +7,9 @@ every place that is left over is refined by the one measurement model.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import minimum_filter
@@ -50,8 +51,7 @@ NO_PRIOR = (100.0, 10.0)  # m, rad; sigmas that are no information
 STEPS, SETTLED = 40, 1e-8  # of the refinement; relative decrease that ends it
 
 
-@dataclass(frozen=True, eq=False)
-class DetectedFields:
+class DetectedFields(NamedTuple):
     """One beacon as it was detected along a trajectory.
 
     Parameters

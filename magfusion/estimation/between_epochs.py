@@ -5,9 +5,8 @@ the inertial stream drives.  Its mean is `motion_at`; here is its covariance, co
 ends whose errors belong together.  Nothing is interpolated.
 """
 
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
@@ -71,8 +70,7 @@ def at_rate(result: Smoothed, log: Log, rate: Literal["imu"] | float) -> Traject
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Steps:
+class _Steps(NamedTuple):
     """Some intervals side by side, padded with steps of no length, world axes.
 
     Parameters

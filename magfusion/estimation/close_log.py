@@ -4,7 +4,8 @@ Samples count once.  The long windows, in which the tones are told apart, keep n
 estimate, but all that judges beacon by beacon looks at them.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,8 +33,7 @@ from magfusion.units import Array, BoolArray
 NO_SAY = 1e6  # times the variance: a window that is looked at, and does not count
 
 
-@dataclass(frozen=True, eq=False)
-class CloseLog:
+class CloseLog(NamedTuple):
     """The short windows of a log.
 
     Parameters

@@ -1,7 +1,8 @@
 """The samples of several magnetometers, each demodulated as if it were alone."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 from magfusion.errors import InputError
 from magfusion.estimation.demodulation import phasors
@@ -18,8 +19,7 @@ from magfusion.receiver.slots import has_schedule
 from magfusion.receiver.windows import LockinSettings
 
 
-@dataclass(frozen=True, eq=False)
-class Apart:
+class Apart(NamedTuple):
     """What several magnetometers recorded, demodulated.
 
     Parameters

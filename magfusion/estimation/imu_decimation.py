@@ -16,11 +16,10 @@ from math import factorial
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.preintegration import Increments, cut_at_epochs, preintegrate
 from magfusion.model.perturbation import skew
-from magfusion.model.quaternion import cross
+from magfusion.model.quaternion import cross, matrices, of_vectors
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel
 from magfusion.receiver.admission import meets
@@ -215,7 +214,7 @@ def _of_steps(steps: Array, bias: Array) -> tuple[Array, Array]:
     b, c, d = _coefficients(square)
     once = cross(rotation, gained)
     twice = cross(rotation, once)
-    turn = Rotation.from_rotvec(rotation.reshape(3, -1).T).as_matrix()
+    turn = matrices(of_vectors(rotation.reshape(3, -1)))
     moved = np.zeros((*dt.shape, 5, 5))
     moved[..., :3, :3] = turn.reshape(*dt.shape, 3, 3)
     moved[..., :3, 3] = (gained + b * once + c * twice).transpose(1, 2, 3, 0)

@@ -17,13 +17,11 @@ from magfusion.estimation.integrity.detection import (
     only,
 )
 from magfusion.estimation.measurements.earth import earth_measurement, unheld
-from magfusion.estimation.measurements.held_roll import held_roll
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
 from magfusion.estimation.measurements.pose_fix import pose_fixes
 from magfusion.estimation.measurements.signs import with_signs
-from magfusion.estimation.measurements.zero_rate import zero_rate
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.motion_compensation import MotionCompensated
 from magfusion.estimation.preintegration import low_passed_rate_at
@@ -138,6 +136,8 @@ class PreparedLog:
         offset = calibration.imu_offset(time[chosen])
         noise = self.declared.site.platform.imu.gyro_noise
         within = self.samples.rest_about(time[chosen])
+        from magfusion.estimation.measurements.zero_rate import zero_rate
+
         found = zero_rate(chosen, time[chosen], within, self.imu, offset, noise)
         return [] if found is None else [found]
 
@@ -169,6 +169,8 @@ def graph_of(
         for time, measurement in log.others
     ]
     if roll_is_open(log.declared.site):
+        from magfusion.estimation.measurements.held_roll import held_roll
+
         measurements.append(held_roll(log.declared.site, states))
     if standing is not None and np.any(standing):
         measurements.append(log.rests(standing))

@@ -5,7 +5,7 @@ between two states knows nothing of those farther away, but for the averages nea
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +18,7 @@ from magfusion.units import Array
 STRETCH = 1 << 17  # samples; a multiple of those that are predicted at once
 
 
-@dataclass(frozen=True, eq=False)
-class Stretch:
+class Stretch(NamedTuple):
     """Samples in a row.
 
     Parameters

@@ -1,6 +1,7 @@
 """A log made ready to be smoothed: demodulated, with a start that was found, or known before."""
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,8 +59,7 @@ class Begun:
     rival: Trajectory | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class _Demodulated:
+class _Demodulated(NamedTuple):
     """A log before it has a start, with the times at which states are made (s)."""
 
     log: Log

@@ -5,22 +5,27 @@ where an unknown one may be.  Where several places explain its field nearly as w
 is smoothed with each, and the motion decides.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.beacon_placement import DetectedFields, detected_along, places
 from magfusion.estimation.demodulation import phasors
 from magfusion.estimation.log_graph import overlap
-from magfusion.estimation.passes import PassFile
 from magfusion.model.parameters import Calibration
 from magfusion.model.progress import Report
 from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.site import Beacon, Site
 from magfusion.model.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from magfusion.estimation.beacon_placement import DetectedFields
+    from magfusion.estimation.passes import PassFile
 
 FEWEST_KNOWN = 2  # beacons; one alone leaves the trajectory its mirrors
 WIDE_POSITION = 1.0  # m; prior about a place that was found
@@ -49,8 +54,7 @@ class Hypothesis:
     smoothed: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Placement:
+class Placement(NamedTuple):
     """What the log said of the place of one unknown beacon.
 
     Parameters
@@ -89,6 +93,8 @@ def smooth_and_place(
     unknown = [beacon for beacon in site.beacons if beacon.unknown is not None]
     if not unknown:
         return smooth(log, site, settings, report, passes), ()
+    from magfusion.estimation.beacon_placement import detected_along
+
     _refuse(site, unknown, settings)
     samples, _ = phasors(log, site, settings.lockin)
     states, calibration = _by_the_known(log, site, samples, settings, report)
@@ -136,6 +142,8 @@ def _by_the_known(
 
 
 def _hypotheses(detected: DetectedFields) -> Placement:
+    from magfusion.estimation.beacon_placement import places
+
     found = places(detected)
     best, beacon = found[0][0], detected.beacon
     return Placement(

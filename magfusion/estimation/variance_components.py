@@ -8,6 +8,7 @@ change from epoch to epoch, and both together have the declared size as their pr
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,8 +28,7 @@ NONE = 1e-4  # of a part that was not declared: as good as none
 KINDS = (slice(0, 1), slice(1, 3))
 
 
-@dataclass(frozen=True)
-class BeaconParts:
+class BeaconParts(NamedTuple):
     """What the residuals of one beacon are likeliest made of.
 
     Parameters
@@ -271,35 +271,35 @@ def likeliest(
 
     scaled = gain * square
     reach, constant = scaled / STUDENT, width * scaled
-    diagonal = np.arange(count)
+    doubled = 2.0 * weight
+    # Which parts belong to each kind, and which belong together; of both kinds in one operation.
+    of_kind = np.zeros((count, len(kinds)))
+    for k, kind in enumerate(kinds):
+        of_kind[kind, k] = 1.0
+    together = of_kind @ of_kind.T
 
     def cost(log: Array) -> Array:
         squares = np.exp(2.0 * log)
         variance = (squares[:, None] @ parts)[:, 0] + fixed
-        bounded = width * np.log1p(reach / variance)
-        likelihood = 0.5 * np.einsum("km,km->k", weight, components * np.log(variance) + bounded)
-        for kind in kinds:
-            prior = np.log(np.sum(squares[:, kind], axis=1)) / PRIOR
-            likelihood = likelihood + 0.125 * prior**2
-        return np.asarray(likelihood)
+        bounded = width * np.log1p(reach / variance) + components * np.log(variance)
+        prior = np.log(squares @ of_kind) / PRIOR
+        return 0.5 * (weight * bounded).sum(axis=1) + 0.125 * (prior**2).sum(axis=1)
 
     def curved(log: Array) -> tuple[Array, Array]:
         squares = np.exp(2.0 * log)
         by = squares[:, :, None] * parts
-        variance = np.sum(by, axis=1) + fixed
+        variance = by.sum(axis=1) + fixed
         heavy = STUDENT * variance + scaled
         left = (components - constant / heavy) / variance
         bend = (STUDENT * constant / heavy**2 - left) / variance
-        slope = (by @ (weight * left)[:, :, None])[:, :, 0]
-        curvature = 2.0 * (by * (weight * bend)[:, None]) @ np.swapaxes(by, 1, 2)
-        curvature[:, diagonal, diagonal] += 2.0 * slope
-        for kind in kinds:
-            total = np.sum(squares[:, kind], axis=1, keepdims=True)
-            share, off = squares[:, kind] / total, 0.5 * np.log(total) / PRIOR**2
-            slope[:, kind] += off * share
-            curvature[:, diagonal[kind], diagonal[kind]] += 2.0 * off * share
-            outer = share[:, :, None] * share[:, None, :]
-            curvature[:, kind, kind] += (1.0 / PRIOR**2 - 2.0 * off)[:, :, None] * outer
+        curvature = (by * (doubled * bend)[:, None]) @ by.transpose(0, 2, 1)
+        total = squares @ of_kind
+        share = squares * ((1.0 / total) @ of_kind.T)
+        off = (0.5 / PRIOR**2 * np.log(total)) @ of_kind.T
+        slope = (by @ (weight * left)[:, :, None])[:, :, 0] + off * share
+        outer = ((1.0 / PRIOR**2 - 2.0 * off) * share)[:, :, None] * share[:, None]
+        curvature += together * outer
+        curvature.reshape(len(log), -1)[:, :: count + 1] += 2.0 * slope
         return slope, curvature
 
     start = np.tile(first, (len(parts), 1))

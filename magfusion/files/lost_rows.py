@@ -1,6 +1,6 @@
 """Rows of a recording that hold no sample: NaN, or the stamp of the row above."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,8 +10,7 @@ from magfusion.units import Array, BoolArray, IntArray
 MOST_MISSING, MOST_TWICE = 0.5, 0.1  # of the rows; more is a mistake of the recording
 
 
-@dataclass(frozen=True, eq=False)
-class LostRows:
+class LostRows(NamedTuple):
     """Which rows hold no sample, shape (n,): of a stamp that stands twice, the later ones."""
 
     twice: BoolArray

@@ -5,10 +5,10 @@ from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.files.site_motion import MILLION
 from magfusion.files.yaml_files import StrictModel
+from magfusion.model.rotation import rotations_of, vectors_of
 from magfusion.units import DEGREE, Array
 
 if TYPE_CHECKING:
@@ -19,7 +19,8 @@ Model = TypeVar("Model", bound="DataclassInstance")
 
 def rotation_of(rpy_deg: Array) -> Array:
     """Return the matrix of roll, pitch and yaw (degrees)."""
-    return Rotation.from_euler("xyz", rpy_deg, degrees=True).as_matrix()
+    roll, pitch, yaw = rotations_of(np.diag(rpy_deg) * DEGREE)
+    return np.asarray(yaw @ pitch @ roll)
 
 
 def model_of(model: type[Model], entry: StrictModel) -> Model:
@@ -60,8 +61,8 @@ def rpy_deg(matrix: Array) -> Any:
     """Return roll, pitch, yaw; Rotation.as_euler loses 1e-7 rad where the pitch is near 90 deg."""
     yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
     pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[0, 0], matrix[1, 0]))
-    rest = Rotation.from_euler("ZY", [yaw, pitch]).inv() * Rotation.from_matrix(matrix)
-    return degrees(np.array([rest.as_rotvec()[0], pitch, yaw]))
+    turned, raised = rotations_of(np.array([[0.0, 0.0, yaw], [0.0, pitch, 0.0]]))
+    return degrees(np.array([vectors_of((turned @ raised).T @ matrix)[0], pitch, yaw]))
 
 
 def sigma_entry(sigma: Array) -> Any:

@@ -1,6 +1,6 @@
 """What a site's file may hold: the keys, their types, ranges and defaults."""
 
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -52,7 +52,6 @@ from magfusion.files.site_values import (
 )
 from magfusion.files.site_warming import WarmingEntry
 from magfusion.files.yaml_files import StrictModel
-from magfusion.model.physics.winding import Winding, WoundCoil, wound_coil
 from magfusion.model.site import (
     Beacon,
     ClockModel,
@@ -61,6 +60,9 @@ from magfusion.model.site import (
     Site,
 )
 from magfusion.units import DEGREE, Array
+
+if TYPE_CHECKING:
+    from magfusion.model.physics.winding import WoundCoil
 
 _Share = Annotated[float, Field(ge=0.0, le=1.0)]
 _Positive = Annotated[AboveZero, between(1e-12, 1e6)]
@@ -153,8 +155,10 @@ class WindingEntry(StrictModel):
             raise refusal_at(("pitch_m",), self.pitch_m, remedy)
         return self
 
-    def coil(self) -> WoundCoil:
+    def coil(self) -> "WoundCoil":
         """Return the coil that stands for it."""
+        from magfusion.model.physics.winding import Winding, wound_coil
+
         pitch = self.wire_m if self.pitch_m is None else self.pitch_m
         size = (self.inner_radius_m, self.wire_m, pitch)
         return wound_coil(Winding(self.current_a, self.layers, self.rows, *size))

@@ -4,6 +4,7 @@ import csv
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -72,8 +73,7 @@ class Span:
         return max(-LARGEST_TIME_NS, min(stamp, LARGEST_TIME_NS))
 
 
-@dataclass(frozen=True, eq=False)
-class Layout:
+class Layout(NamedTuple):
     """Columns of a table.
 
     Parameters
@@ -279,8 +279,10 @@ def _read_parquet(path: Path, layout: Layout, span: Span) -> tuple[pa.Table, int
         own = [file.metadata.row_group(g) for g in groups]
         skipped = sum(file.metadata.row_group(g).num_rows for g in range(groups[0]))
         refuse_unfolding(file, names, own, path)
-        if sum(group.num_rows for group in own) <= MOST_ROWS:
-            return file.read_row_groups(list(groups), columns=names), skipped
+        count = sum(group.num_rows for group in own)
+        if count <= MOST_ROWS:
+            many = count > ROWS_PER_GROUP  # fewer are read sooner than threads are woken
+            return file.read_row_groups(list(groups), columns=names, use_threads=many), skipped
         return read_batches(file, names, groups, span.bounds_ns, path, skipped)
 
 

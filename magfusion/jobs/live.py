@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TextIO
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TextIO
 
 from magfusion.errors import InputError
 from magfusion.jobs.settings import FrameSettings, option
@@ -104,8 +104,7 @@ def _opened(settings: LiveSettings, site: Site, epoch_ns: int) -> Iterator[State
         yield _Viewer(open_live_view(site))
 
 
-@dataclass(frozen=True)
-class _Viewer:
+class _Viewer(NamedTuple):
     view: LiveView
 
     def take(self, state: JudgedState | None, told: Mapping[str, Any]) -> None:

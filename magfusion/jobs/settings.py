@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from magfusion.errors import InputError
 from magfusion.model.groups import GROUPS
@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from magfusion.receiver.windows import LockinSettings
 
 
-@dataclass(frozen=True)
-class Option:
+class Option(NamedTuple):
     """What a field is on the command line.
 
     Parameters
@@ -131,8 +130,7 @@ class Settings:
                 asked.check(asked.name or field.name.replace("_", "-"), value)
 
 
-@dataclass(frozen=True)
-class Command:
+class Command(NamedTuple):
     """How a job is called; its name and what it does are in `magfusion.jobs.JOBS`.
 
     Parameters

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.between_epochs import at_rate
 from magfusion.estimation.integrity.diagnosis import with_cause
 from magfusion.estimation.integrity.judge import judged
 from magfusion.estimation.integrity.open_roll import comparable, roll_findings, with_open_roll
@@ -146,6 +145,8 @@ def write_finished(whole: Path, log: Log, done: Finished, *, rate: Rate) -> None
     refined, innovations = result_site(result, log.name), _innovations(result)
     written = result.states
     if rate != "field":
+        from magfusion.estimation.between_epochs import at_rate
+
         written = with_open_roll(at_rate(done.result, log, rate), result.declared.site)
     if not log.inertial:
         written = replace(written, gyro_bias_body=None, accel_bias_body=None)

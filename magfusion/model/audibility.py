@@ -5,8 +5,9 @@ phasor for all of them: it is taken for that of the loudest, and nobody's where 
 beside it.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,8 +20,7 @@ DROWNED = 0.5  # of a beacon's field: what others on its frequency may add to it
 NEAREST = 0.1  # m; within which no field is foreseen
 
 
-@dataclass(frozen=True, eq=False)
-class Tones:
+class Tones(NamedTuple):
     """The frequencies that are sent, each once.
 
     Parameters
@@ -103,8 +103,7 @@ def unheard_by_each_other(a: Beacon, b: Beacon, sigma: float) -> bool:
     return 2.0 * MU0_OVER_4PI * moment / max(distance, NEAREST) ** 3 < sigma
 
 
-@dataclass(frozen=True, eq=False)
-class Owned:
+class Owned(NamedTuple):
     """Whose the phasors of a tone are.
 
     Parameters

@@ -3,7 +3,6 @@
 Every solver predicts through `observe`; the simulator does not.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -310,8 +309,7 @@ def _driven_coils(source: Sources, offset: Array, current: AnyArray, along: Arra
     return Driven(field, np.real(by))
 
 
-@dataclass(frozen=True, eq=False)
-class EarthObservation:
+class EarthObservation(NamedTuple):
     """Predicted steady field with its Jacobian blocks, by what is on the other side of each.
 
     Parameters

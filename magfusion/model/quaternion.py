@@ -5,10 +5,16 @@ so that each operation is one over all rotations.  Of few rotations it is the nu
 that costs, and all products of components are made in one: the result is the same to the last bit.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.units import Array
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 FEW = 8000  # numbers
 FEW_COMPONENTS = 1024  # of rotations whose matrices are made at once
@@ -93,15 +99,21 @@ def matrices(quaternion: Array) -> Array:
         sums += _ADDED
         return np.ascontiguousarray(sums.T).reshape(-1, 3, 3)
     w, x, y, z = quaternion
-    out = np.empty((len(w), 3, 3))
-    out[:, 0, 0], out[:, 1, 1], out[:, 2, 2] = (
-        1.0 - 2.0 * (y * y + z * z),
-        1.0 - 2.0 * (x * x + z * z),
-        1.0 - 2.0 * (x * x + y * y),
-    )
-    for i, j, product, turn in ((0, 1, x * y, w * z), (2, 0, x * z, w * y), (1, 2, y * z, w * x)):
-        out[:, i, j], out[:, j, i] = 2.0 * (product - turn), 2.0 * (product + turn)
-    return out
+    out = np.empty((9, len(w)))
+    twice_x, twice_y, twice_z = x + x, y + y, z + z
+    square_x, square_y, square_z = x * twice_x, y * twice_y, z * twice_z
+    np.add(square_y, square_z, out=out[0])
+    np.add(square_x, square_z, out=out[4])
+    np.add(square_x, square_y, out=out[8])
+    np.subtract(1.0, out[::4], out=out[::4])
+    for i, j, product, turn in (
+        (1, 3, x * twice_y, w * twice_z),
+        (6, 2, x * twice_z, w * twice_y),
+        (5, 7, y * twice_z, w * twice_x),
+    ):
+        np.subtract(product, turn, out=out[i])
+        np.add(product, turn, out=out[j])
+    return np.ascontiguousarray(out.T).reshape(-1, 3, 3)
 
 
 def of_matrices(rotation: Array) -> Array:

@@ -6,7 +6,7 @@ side open; what the user knows of the place decides it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -55,8 +55,7 @@ class _Source(Protocol):
     def hemisphere_beacon(self) -> Array | None: ...
 
 
-@dataclass(frozen=True, eq=False)
-class Bounds:
+class Bounds(NamedTuple):
     """Planes that the magnetometer does not cross.
 
     Parameters

@@ -1,11 +1,17 @@
 """Attitude and motion between samples from the inertial stream, without a loop over samples."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.model.quaternion import components, cross, of_vectors, product, unit
 from magfusion.model.site import MotionModel
 from magfusion.units import Array, BoolArray, IntArray
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 CHUNK = 65_536  # samples at a time: what is computed of them stays in the cache
 FEW = 256  # rotations
@@ -27,6 +33,8 @@ def rotation_increments(time: Array, gyro_body: Array) -> Rotation:
     Rotation
         n - 1 rotations ``body(k)_from_body(k+1)``; second-order coning included.
     """
+    from scipy.spatial.transform import Rotation  # which takes long to import
+
     return Rotation.from_rotvec(_increments(time, gyro_body))
 
 
@@ -72,6 +80,8 @@ def attitude_from_gyro(time: Array, gyro_body: Array) -> Rotation:
     Rotation
         n rotations, the first the identity.
     """
+    from scipy.spatial.transform import Rotation  # which takes long to import
+
     return Rotation.from_quat(turn_from_gyro(time, gyro_body).T, scalar_first=True)
 
 
@@ -106,6 +116,8 @@ def attitude_at(attitude: Rotation, time: Array, gyro_body: Array, wanted: Array
     Rotation
         m rotations.
     """
+    from scipy.spatial.transform import Rotation  # which takes long to import
+
     found = turn_at(components(attitude), time, gyro_body, wanted)
     return Rotation.from_quat(found.T, scalar_first=True)
 
@@ -138,6 +150,13 @@ def attitude_from_gyro_at(time: Array, gyro_body: Array, wanted: Array) -> Rotat
     Rotation
         m rotations, as of `attitude_at` on the chain of `attitude_from_gyro`.
     """
+    from scipy.spatial.transform import Rotation  # which takes long to import
+
+    return Rotation.from_quat(turn_from_gyro_at(time, gyro_body, wanted).T, scalar_first=True)
+
+
+def turn_from_gyro_at(time: Array, gyro_body: Array, wanted: Array) -> Array:
+    """Return `attitude_from_gyro_at` as quaternions, shape (4, m), scalar first."""
     index = _sample_before(time, wanted)
     quaternion = np.tile([[1.0], [0.0], [0.0], [0.0]], len(wanted))
     carried = quaternion[:, :1]
@@ -150,7 +169,7 @@ def attitude_from_gyro_at(time: Array, gyro_body: Array, wanted: Array) -> Rotat
         quaternion[:, here] = turned[:, :-1]
         carried = turned[:, -1:]
     since = _turn_since(index, time, gyro_body, wanted)
-    return Rotation.from_quat(product(quaternion, since).T, scalar_first=True)
+    return product(quaternion, since)
 
 
 def _products_of_first(quaternion: Array, count: IntArray) -> Array:

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
+from magfusion.model.rotation import slerp
 from magfusion.units import Array, BoolArray
 
 # Of one pose, by the name of each part.
@@ -123,5 +123,4 @@ def _slerp(known: Array, world_from_body: Array, wanted: Array) -> Array:
         return np.empty((0, 3, 3))
     if len(known) == 1:
         return world_from_body.copy()
-    turns = Slerp(known, Rotation.from_matrix(world_from_body))(wanted)
-    return turns.as_matrix()
+    return slerp(known, world_from_body, wanted)

@@ -6,7 +6,8 @@ do not ask for the attitude, nor for the phase of any drive; that they change be
 error.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import minimum_filter
@@ -35,8 +36,7 @@ AS_LIKELY = 16.0  # of chi square: a place that is worse by more is another's
 MARGIN = 2.0  # m; by which the way may be wrong
 
 
-@dataclass(frozen=True, eq=False)
-class Way:
+class Way(NamedTuple):
     """Where the magnetometer was, within a pitch of the grid or so.
 
     Parameters
@@ -59,8 +59,7 @@ class Way:
         return place, MARGIN + np.interp(time, self.time, self.spread)
 
 
-@dataclass(frozen=True, eq=False)
-class _Grid:
+class _Grid(NamedTuple):
     """Nodes, and the strength of every tone there."""
 
     axes: tuple[Array, Array, Array]

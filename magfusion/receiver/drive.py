@@ -7,7 +7,7 @@ predicted sample by sample.
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +25,7 @@ LEARNT = 0.02  # of what a window says of the noise
 SILENT = 0.2  # of the current; noise beyond is no reading
 
 
-@dataclass(frozen=True)
-class Channel:
+class Channel(NamedTuple):
     """A tone as its current's column shows it.
 
     Parameters

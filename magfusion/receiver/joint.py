@@ -8,6 +8,7 @@ the samples tell of the tones is lost, and none of them counts twice.
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -78,8 +79,7 @@ def _long(site: Site, asked: LockinSettings | None) -> LockinSettings | None:
     return None if usual.window <= LONGEST_APART else usual
 
 
-@dataclass(frozen=True, eq=False)
-class JointDesign:
+class JointDesign(NamedTuple):
     """What the samples of a window tell of tones together, whatever the tones are.
 
     Parameters

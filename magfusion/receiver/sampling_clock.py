@@ -5,7 +5,7 @@ evenly is found again under them: each sample is given its tick, lost ones leave
 smooth curve through stamps and ticks is the clock.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +25,7 @@ KNOT = 10.0  # s; a clock's rate changes more slowly
 FEWEST = 50  # samples
 
 
-@dataclass(frozen=True, eq=False)
-class SamplingClock:
+class SamplingClock(NamedTuple):
     """The even clock under a stream's stamps.
 
     Parameters

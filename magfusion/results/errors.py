@@ -1,19 +1,18 @@
 """Errors of an estimated trajectory against the truth, as evo computes them."""
 
-import warnings
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.model.rotation import angles_of, mean_rotation
 from magfusion.model.trajectory import Trajectory, interpolate
 from magfusion.units import Array, BoolArray, IntArray
 
 
-@dataclass(frozen=True, eq=False)
-class RelativeErrors:
+class RelativeErrors(NamedTuple):
     """Relative pose errors (RPE) over pairs of epochs.
 
     Parameters
@@ -227,17 +226,15 @@ def relative_errors(
     return RelativeErrors(
         pairs=pairs,
         translation=np.linalg.norm(shift - true_shift, axis=1),
-        rotation=(true_step.inv() * step).magnitude(),
+        rotation=angles_of(np.swapaxes(true_step, 1, 2) @ step),
     )
 
 
-def _motion(
-    world_from_body: Array, position_world: Array, pairs: IntArray
-) -> tuple[Rotation, Array]:
+def _motion(world_from_body: Array, position_world: Array, pairs: IntArray) -> tuple[Array, Array]:
     first, second = pairs.T
-    start = Rotation.from_matrix(world_from_body[first]).inv()
-    shift = start.apply(position_world[second] - position_world[first])
-    return start * Rotation.from_matrix(world_from_body[second]), shift
+    back = np.swapaxes(world_from_body[first], 1, 2)
+    shift = (back @ (position_world[second] - position_world[first])[..., None])[..., 0]
+    return back @ world_from_body[second], shift
 
 
 def _poses(world_from_body: Array, position_world: Array) -> list[gtsam.Pose3]:
@@ -248,16 +245,15 @@ def _poses(world_from_body: Array, position_world: Array) -> list[gtsam.Pose3]:
 
 def _align(position: Array, target: Array) -> Array:
     centre, target_centre = position.mean(axis=0), target.mean(axis=0)
-    with warnings.catch_warnings():
-        # Along a line, or at rest, many rotations fit equally well: the residual is theirs all.
-        warnings.filterwarnings("ignore", "Optimal rotation is not uniquely", UserWarning)
-        rotation, _ = Rotation.align_vectors(target - target_centre, position - centre)
-    return np.asarray(rotation.apply(position - centre) + target_centre)
+    # Along a line, or at rest, many rotations fit equally well: the residual is theirs all.
+    left, _, right = np.linalg.svd((target - target_centre).T @ (position - centre))
+    left[:, 2] *= np.linalg.det(left @ right)  # no reflection
+    return np.asarray((position - centre) @ (left @ right).T + target_centre)
 
 
 def _aligned_attitude(estimated: Array, true: Array) -> Array:
-    offset = Rotation.from_matrix(estimated) * Rotation.from_matrix(true).inv()
-    return np.asarray((offset.mean().inv() * offset).magnitude())
+    offset = estimated @ np.swapaxes(true, 1, 2)
+    return angles_of(mean_rotation(offset).T @ offset)
 
 
 def _nees(error: Array, cov: Array) -> Array:

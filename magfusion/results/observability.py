@@ -7,7 +7,6 @@ is, so that no log can determine them, and only a better survey helps.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -40,8 +39,7 @@ class Weakness(NamedTuple):
     direction: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Observability:
+class Observability(NamedTuple):
     """What a log determined of the calibration.
 
     Parameters

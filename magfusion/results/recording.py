@@ -3,16 +3,16 @@
 import subprocess
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.atomic import real
+from magfusion.model.rotation import quaternions_of
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import StateTrust, Trust
@@ -171,7 +171,7 @@ def log_beacons(recording: rr.RecordingStream, site: Site, scale: Scale) -> None
     for index, beacon in enumerate(site.beacons):
         colour = beacon_colour(index)
         place = _beacon_place(beacon.name)
-        turn = rr.Quaternion(xyzw=Rotation.from_matrix(beacon.world_from_beacon).as_quat())
+        turn = rr.Quaternion(xyzw=quaternions_of(beacon.world_from_beacon))
         pose = rr.Transform3D(translation=beacon.position_world, rotation=turn)
         recording.log(place, pose, rr.TransformAxes3D(0.05 * scale.size), static=True)
         centre = rr.Points3D(
@@ -223,7 +223,7 @@ def _log_beads(recording: rr.RecordingStream, truth: Trajectory, scale: Scale) -
 
 def _log_body(recording: rr.RecordingStream, trajectory: Trajectory, scale: Scale) -> None:
     rows = rows_of(len(trajectory), MOST_POSES)
-    turn = Rotation.from_matrix(trajectory.world_from_body[rows]).as_quat()
+    turn = quaternions_of(trajectory.world_from_body[rows])
     recording.send_columns(
         "world/estimate/body",
         [rr.TimeColumn(TIMELINE, duration=trajectory.time[rows])],
@@ -239,12 +239,12 @@ def _log_sigmas(recording: rr.RecordingStream, trajectory: Trajectory, scale: Sc
     if trajectory.pose_cov is None:
         return
     rows = rows_of(len(trajectory), ELLIPSOIDS)
-    turn = Rotation.from_matrix(trajectory.world_from_body[rows])
-    half_sizes, axes = ellipsoids(turn, trajectory.pose_cov[rows, 3:, 3:])
+    own = trajectory.world_from_body[rows], trajectory.pose_cov[rows, 3:, 3:]
+    half_sizes, axes = ellipsoids(*own)
     drawn = rr.Ellipsoids3D(
         half_sizes=3.0 * scale.sigma * half_sizes,
         centers=trajectory.position_world[rows],
-        quaternions=axes.as_quat(),
+        quaternions=quaternions_of(axes),
         colors=(*_ESTIMATE, 110),
         line_radii=rr.Radius.ui_points(0.5),
     )
@@ -304,8 +304,7 @@ def scene_view(site: Site, scale: Scale, name: str = "Scene") -> rrb.Spatial3DVi
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Drawn:
+class _Drawn(NamedTuple):
     """What is drawn beside the scene."""
 
     trajectory: Trajectory

@@ -3,10 +3,10 @@
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.estimation.state import POSITION, State
+from magfusion.model.rotation import quaternions_of
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.results.recording import log_beacons
@@ -51,18 +51,18 @@ class LiveView:
         """Draw a state, and how well each beacon's field is explained."""
         recording = self.recording
         recording.set_time(TIMELINE, duration=state.time)
-        turn = Rotation.from_matrix(state.world_from_body)
+        turn = quaternions_of(state.world_from_body)
         place = state.position_world
-        pose = rr.Transform3D(translation=place, quaternion=rr.Quaternion(xyzw=turn.as_quat()))
+        pose = rr.Transform3D(translation=place, quaternion=rr.Quaternion(xyzw=turn))
         recording.log("world/estimate/body", pose)
         self._extend(place.tolist())
         half_sizes, axes = ellipsoids(
-            Rotation.from_matrix(state.world_from_body[None]), state.cov[None, POSITION, POSITION]
+            state.world_from_body[None], state.cov[None, POSITION, POSITION]
         )
         sigma = rr.Ellipsoids3D(
             half_sizes=3.0 * half_sizes,
             centers=[place],
-            quaternions=axes.as_quat(),
+            quaternions=quaternions_of(axes),
             colors=(*_PATH, 110),
         )
         recording.log("world/estimate/three_sigma", sigma)

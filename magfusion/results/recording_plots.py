@@ -1,7 +1,7 @@
 """The series of a recording: position, errors with their sigmas, biases, innovations."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -70,8 +70,7 @@ def log_position(
             log_series(recording, place, truth.time, truth.position_world[:, i], pale)
 
 
-@dataclass(frozen=True)
-class ErrorPlot:
+class ErrorPlot(NamedTuple):
     """Plots of the components of an error, with what they are called."""
 
     place: str

@@ -1,6 +1,6 @@
 """What a recording shows of trust: the verdict above all, doubtful states, protection levels."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -17,8 +17,7 @@ _DOUBTFUL, _FAILED = (250, 190, 40), (235, 60, 60)
 _LEVEL = (250, 190, 40)
 
 
-@dataclass(frozen=True)
-class LevelPlot:
+class LevelPlot(NamedTuple):
     """A plot of the length of an error below its protection level."""
 
     place: str

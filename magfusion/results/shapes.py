@@ -1,9 +1,8 @@
 """Outlines to draw: coils, coverage, uncertainty, and the scale at which they can be seen."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.site import Beacon, Coil, Site
@@ -11,8 +10,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
 
-@dataclass(frozen=True, eq=False)
-class Scale:
+class Scale(NamedTuple):
     """Where the scene is, how large it is, and how much sigmas must be magnified to be seen.
 
     Parameters
@@ -69,11 +67,10 @@ def coverage_shell(beacon: Beacon, level: float) -> list[Array]:
         In beacon axes (m).
     """
     angle = np.linspace(0.0, 2.0 * np.pi, 73)
-    equator = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
-    meridian = Rotation.from_euler("x", 90.0, degrees=True).apply(equator)
-    across = Rotation.from_euler("z", 90.0, degrees=True).apply(meridian)
+    along, across, none = np.cos(angle), np.sin(angle), np.zeros_like(angle)
+    circles = (along, across, none), (along, none, across), (none, along, across)
     strips = []
-    for direction in (equator, meridian, across):
+    for direction in (np.stack(circle, axis=1) for circle in circles):
         fields = dipole_field(direction[:, None], beacon.moments_beacon)
         phasor = np.einsum("njx,jk->nxk", fields, beacon.excitation)
         at_one_metre = np.sqrt(0.5 * np.sum(np.abs(phasor) ** 2, axis=(1, 2)))
@@ -81,12 +78,12 @@ def coverage_shell(beacon: Beacon, level: float) -> list[Array]:
     return strips
 
 
-def ellipsoids(world_from_body: Rotation, position_cov_body: Array) -> tuple[Array, Rotation]:
-    """Return the half axes of one-sigma ellipsoids (m), shape (n, 3), and world_from_axes."""
+def ellipsoids(world_from_body: Array, position_cov_body: Array) -> tuple[Array, Array]:
+    """Return the half axes of one-sigma ellipsoids (m), (n, 3), and world_from_axes, (n, 3, 3)."""
     variance, axes_body = np.linalg.eigh(position_cov_body)
     axes_body[:, :, 0] *= np.linalg.det(axes_body)[:, None]
     half_sizes = np.sqrt(np.maximum(variance, 0.0))
-    return half_sizes, world_from_body * Rotation.from_matrix(axes_body)
+    return half_sizes, world_from_body @ axes_body
 
 
 def beads(position_world: Array, spacing: float) -> Array:

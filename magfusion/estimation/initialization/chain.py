@@ -3,14 +3,15 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.channel_effects import of_all_sensors
 from magfusion.model.parameters import Calibration
+from magfusion.model.quaternion import inverse, matrices, product
+from magfusion.model.rotation import angles_of
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
-from magfusion.model.strapdown import attitude_from_gyro_at, mean_about
+from magfusion.model.strapdown import mean_about, turn_from_gyro_at
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -67,11 +68,11 @@ def choose_chains(
         of a dipole, between which the motion must decide.
     """
     time = imu.time + time_offset
-    attitude = attitude_from_gyro_at(time, imu.gyro_body, fixes.time)
+    turn = turn_from_gyro_at(time, imu.gyro_body, fixes.time)
     unary = np.minimum(fixes.cost - np.min(fixes.cost, axis=1, keepdims=True), LEAP_COST)
     unary = unary + _gravity_cost(fixes, imu, time, site)
     unary = np.where(np.isfinite(fixes.cost), unary, np.inf)
-    link = _link_cost(fixes, attitude, site)
+    link = _link_cost(fixes, turn, site)
     chains: list[Start] = []
     left = unary.copy()
     for _ in range(fixes.cost.shape[1]):
@@ -115,13 +116,13 @@ def _gravity_cost(fixes: Fixes, imu: ImuSamples, time: Array, site: Site) -> Arr
     return np.minimum(np.sum(error**2, axis=-1) / motion.accel_sigma**2, LEAP_COST)
 
 
-def _link_cost(fixes: Fixes, attitude: Rotation, site: Site) -> Array:
+def _link_cost(fixes: Fixes, turn: Array, site: Site) -> Array:
     """Cost of going from hypothesis i to j between neighbouring epochs, shape (n-1, h, h)."""
     dt = np.diff(fixes.time)
-    turn = (attitude[:-1].inv() * attitude[1:]).as_matrix()
-    expected = fixes.world_from_body[:-1] @ turn[:, None]
+    step = matrices(product(inverse(turn[:, :-1]), turn[:, 1:]))
+    expected = fixes.world_from_body[:-1] @ step[:, None]
     between = np.swapaxes(expected[:, :, None], -1, -2) @ fixes.world_from_body[1:, None]
-    angle = Rotation.from_matrix(between.reshape(-1, 3, 3)).magnitude().reshape(between.shape[:3])
+    angle = angles_of(between)
     jump = fixes.position_world[1:, None] - fixes.position_world[:-1, :, None]
     spread = (site.platform.motion.speed_sigma * dt) ** 2 + POSITION_SIGMA**2
     turned = (site.platform.imu.gyro_bias_sigma * dt) ** 2 + ROTATION_SIGMA**2

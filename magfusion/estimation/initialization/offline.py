@@ -8,11 +8,10 @@ the fix of a cycle to the slots in it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.demodulation import fix_inputs
 from magfusion.estimation.initialization.chain import (
@@ -26,15 +25,16 @@ from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.one_axis import roll_is_open
 from magfusion.model.parameters import Calibration
+from magfusion.model.quaternion import inverse, matrices, of_matrices, product
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields
 from magfusion.model.site import Site
 from magfusion.model.strapdown import (
     attitude_at,
     attitude_from_gyro,
-    attitude_from_gyro_at,
     mean_about,
     resting,
     triad,
+    turn_from_gyro_at,
 )
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, IntArray
@@ -45,8 +45,7 @@ if TYPE_CHECKING:
 LEAST_DETECTED = 10  # epochs at which a beacon is detected; fewer give no start
 
 
-@dataclass(frozen=True, eq=False)
-class OfflineStart:
+class OfflineStart(NamedTuple):
     """A start with the calibration that its drive phases suggest.
 
     Parameters
@@ -210,12 +209,12 @@ def carried(known: Trajectory, imu: ImuSamples, time_offset: float, time: Array)
         return known
     nearest = _nearest(known.time, time)
     stamps = imu.time + time_offset
-    at_known, here = (attitude_from_gyro_at(stamps, imu.gyro_body, at) for at in (known.time, time))
-    turned = Rotation.from_matrix(known.world_from_body[nearest]) * at_known[nearest].inv() * here
+    at_known, here = (turn_from_gyro_at(stamps, imu.gyro_body, at) for at in (known.time, time))
+    before = product(of_matrices(known.world_from_body[nearest]), inverse(at_known[:, nearest]))
     position = np.stack([np.interp(time, known.time, p) for p in known.position_world.T], axis=1)
     return Trajectory(
         time=time,
-        world_from_body=turned.as_matrix(),
+        world_from_body=matrices(product(before, here)),
         position_world=position,
         velocity_world=np.gradient(position, time, axis=0),
     )

@@ -8,14 +8,16 @@ quarter turn of one instrument, or iron on the body show in the first seconds, w
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from magfusion.estimation.integrity.turning import agrees, axes, field_body
 from magfusion.model.platform_motion import A_HAND
+from magfusion.model.quaternion import inverse, matrices, turned
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
-from magfusion.model.strapdown import attitude_from_gyro
+from magfusion.model.strapdown import turn_from_gyro
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import DEGREE, STANDARD_GRAVITY, Array
@@ -75,13 +77,13 @@ def still_means(log: Log, site: Site | None, span: float = SPAN) -> StillMeans:
     nothing = StillMeans(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     if len(time) < 2 or not log.inertial:
         return nothing
-    still_from_body = attitude_from_gyro(imu.time, imu.gyro_body)
-    force = still_from_body.apply(imu.accel_body)
+    still_from_body = turn_from_gyro(imu.time, imu.gyro_body)
+    force = turned(still_from_body, imu.accel_body.T).T
     field = np.full_like(force, np.nan)
     if log.vectors is not None:
         known = field_body(log, site)
         body = [np.interp(time, log.vectors.time, c) for c in known.T]
-        field = still_from_body.apply(np.stack(body, axis=1))
+        field = turned(still_from_body, np.stack(body)).T
     number = np.floor((time - time[0]) / span).astype(np.int64)
     count = np.bincount(number)
     full = count > FULL * span / float(np.median(np.diff(time)))
@@ -89,13 +91,13 @@ def still_means(log: Log, site: Site | None, span: float = SPAN) -> StillMeans:
         return nothing
     middle = time[0] + span * (np.flatnonzero(full) + 0.5)
     nearest = np.clip(np.searchsorted(time, middle), 0, len(time) - 1)
-    body_from_still = still_from_body[nearest].inv()
+    still_from_body = still_from_body[:, nearest]
 
     def mean(value: Array) -> Array:
         total = np.stack([np.bincount(number, column) for column in value.T], axis=1)
-        return np.asarray(body_from_still.apply(total[full] / count[full, None]))
+        return turned(inverse(still_from_body), (total[full] / count[full, None]).T).T
 
-    return StillMeans(time[nearest], mean(force), mean(field), still_from_body[nearest].as_matrix())
+    return StillMeans(time[nearest], mean(force), mean(field), matrices(still_from_body))
 
 
 def _angle(a: Array, b: Array) -> Array:
@@ -323,8 +325,7 @@ def _dip_sigma(means: StillMeans, site: Site) -> float:
     return float(np.sqrt(np.sum(np.square(parts))))
 
 
-@dataclass(frozen=True, eq=False)
-class _InWorld:
+class _InWorld(NamedTuple):
     """Specific force and field by the attitudes of poses, world axes, shape (n, 3)."""
 
     up: Array

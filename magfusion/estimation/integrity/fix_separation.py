@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from magfusion.estimation.integrity.separation import (
@@ -20,6 +19,7 @@ from magfusion.estimation.snapshot.problem import GAIN_SIGMA, State, epochs_of
 from magfusion.estimation.snapshot.refine import joined, rows_at
 from magfusion.model.audibility import are_many
 from magfusion.model.parameters import Calibration, channels_of
+from magfusion.model.rotation import angles_of
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict
 from magfusion.units import DEGREE, Array, BoolArray, IntArray
@@ -29,8 +29,7 @@ MISFIT = 1e-6  # probability of a larger residual, where what was false has been
 LEAST_HEARD = 3  # beacons; of two that contradict each other either may be false
 
 
-@dataclass(frozen=True, eq=False)
-class SeparatedFixes:
+class SeparatedFixes(NamedTuple):
     """Fixes after the false beacons were left out.
 
     Parameters
@@ -277,7 +276,7 @@ def _levels(found: Separation, fixes: Fixes, risk: Risk, prior: Array) -> _Level
     weight = fixes.probability[:, 1:]
     way = np.linalg.norm(fixes.position_world[:, 1:] - fixes.position_world[:, :1], axis=2)
     turn = np.swapaxes(fixes.world_from_body[:, :1], 2, 3) @ fixes.world_from_body[:, 1:]
-    angle = Rotation.from_matrix(turn.reshape(-1, 3, 3)).magnitude().reshape(weight.shape) / DEGREE
+    angle = angles_of(turn) / DEGREE
     share = risk.mirrors * risk.total
     position = with_rivals(position, way, weight, share)
     degrees = with_rivals(degrees, angle, weight, share)

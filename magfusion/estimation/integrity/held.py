@@ -5,7 +5,6 @@ cost by more than chance does, and would move the poses beyond what their covari
 one that lowers it most names the cause; after it has moved, the next is asked.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -32,8 +31,7 @@ LEAST_SHARE = 0.03  # of the first cause's chi square; what is less may be its n
 UNCHECKED = 4.3**2  # chi square below which one of fifty suspects stays unnoticed
 
 
-@dataclass(frozen=True, eq=False)
-class Freed:
+class Freed(NamedTuple):
     """A suspect, freed.
 
     Parameters

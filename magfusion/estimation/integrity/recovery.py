@@ -3,8 +3,9 @@
 A fix that no choice of beacons makes agree is none to begin at again: it would be believed.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -25,8 +26,7 @@ FIRST_WAIT, LONGEST_WAIT = 0.1, 2.0  # s; between attempts at a fix, doubled fro
 BIAS_LIMIT = 6.0  # prior sigmas; a bias beyond is what a wrong pose has made of it
 
 
-@dataclass(frozen=True, eq=False)
-class AgreedFix:
+class AgreedFix(NamedTuple):
     """A fix of one epoch.
 
     Parameters

@@ -6,7 +6,7 @@ uncertain has moved as far as its declared sigma allows, and after the causes th
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,8 +38,7 @@ AXES = {0: "gyroscope, x", 1: "gyroscope, y", 2: "gyroscope, z"} | {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Misfit:
+class Misfit(NamedTuple):
     """Residuals of one kind in one stretch.
 
     Parameters

@@ -7,6 +7,7 @@ which is no saturation.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,8 +35,7 @@ BLOCK = 128  # samples in which the scatter is measured
 AXES = "xyz"
 
 
-@dataclass(frozen=True, eq=False)
-class Stream:
+class Stream(NamedTuple):
     """The axes of one instrument.
 
     Parameters

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -59,8 +60,7 @@ class Heard:
     passed_by: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class Detected:
+class Detected(NamedTuple):
     """Which beacons are told from noise in phasors that are freed of motion.
 
     Parameters

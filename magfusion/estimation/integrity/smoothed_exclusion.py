@@ -1,6 +1,7 @@
 """A smoothed trajectory without the stretches of time in which one beacon is false."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import binary_closing, binary_dilation
@@ -31,8 +32,7 @@ TOLD = 5  # field epochs of a beacon that are left out; fewer are outliers
 OF_A_LOG = 5e-4  # false alarms of a whole log
 
 
-@dataclass(frozen=True, eq=False)
-class SeparatedSmooth:
+class SeparatedSmooth(NamedTuple):
     """A smoothed trajectory after what is false was left out.
 
     Parameters

@@ -6,16 +6,18 @@ amplitude ``1 / (pi |df| window)``, all of it where it is nearer.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter
 
 from magfusion.errors import InputError
 from magfusion.estimation.integrity.turning import field_body
+from magfusion.model.quaternion import turned
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
-from magfusion.model.strapdown import attitude_at, attitude_from_gyro
+from magfusion.model.strapdown import turn_at, turn_from_gyro
 from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.design import separable
 from magfusion.receiver.receivers import usual_lockin
@@ -48,8 +50,7 @@ LONGER = 2.0  # times the usual window, by which a line is told from a tone
 SEPARATED = 1.5  # over the window, the least distance of a fitted line from a tone
 
 
-@dataclass(frozen=True, eq=False)
-class Spectrum:
+class Spectrum(NamedTuple):
     """Mean power of a field.
 
     Parameters
@@ -80,8 +81,7 @@ class Spectrum:
         return float(np.max(self.power[near], initial=1e-300))
 
 
-@dataclass(frozen=True)
-class Line:
+class Line(NamedTuple):
     """One line of a spectrum (Hz, T)."""
 
     frequency_hz: float
@@ -98,9 +98,9 @@ def still_field(log: Log, site: Site | None) -> Array:
     if log.vectors is None or site is None or len(log.imu) < 2:
         return field
     imu, offset = log.imu, site.platform.imu.time_offset
-    turns = attitude_from_gyro(imu.time, imu.gyro_body)
-    at = attitude_at(turns, imu.time, imu.gyro_body, log.vectors.time - offset)
-    return np.asarray(at.apply(field))
+    turns = turn_from_gyro(imu.time, imu.gyro_body)
+    at = turn_at(turns, imu.time, imu.gyro_body, log.vectors.time - offset)
+    return np.ascontiguousarray(turned(at, field.T).T)
 
 
 def spectrum(log: Log, site: Site | None) -> Spectrum | None:

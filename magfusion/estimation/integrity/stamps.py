@@ -1,7 +1,7 @@
 """What the stamps of the streams say: rates, gaps, samples lost, jitter, and how long both run."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,8 +21,7 @@ ROUNDING = 1e-6  # of a step
 LISTED = 3  # gaps that are named
 
 
-@dataclass(frozen=True, eq=False)
-class Timing:
+class Timing(NamedTuple):
     """Stamps of one stream.
 
     Parameters

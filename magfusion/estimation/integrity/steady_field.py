@@ -5,7 +5,7 @@ is a heading: the axes of the beacons' survey are not those of the declared fiel
 are turned with them, about the origin of the world.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,8 +20,7 @@ DOUBT = 5.0  # sigmas; of some fifty tests that are made for hours
 EXPLAINED = 0.2  # share of what is left that a turn about the vertical may leave
 
 
-@dataclass(frozen=True, eq=False)
-class OffEarth:
+class OffEarth(NamedTuple):
     """A steady field that is not the Earth's.
 
     Parameters

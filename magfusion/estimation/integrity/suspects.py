@@ -5,7 +5,6 @@ sensors: for those the score of `magfusion.estimation.integrity.score` is the on
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -178,8 +177,7 @@ CODE: dict[Parameter, str] = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Suspect:
+class Suspect(NamedTuple):
     """Parameters that one mistake would have wrong together.
 
     Parameters

@@ -1,6 +1,7 @@
 """What the witnesses of one result have before them, and what each of them says."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from magfusion.estimation.batch import Smoothed
 from magfusion.estimation.integrity.score import Score
@@ -9,8 +10,7 @@ from magfusion.model.trust import Finding, Unverified
 from magfusion.units import Array
 
 
-@dataclass(frozen=True, eq=False)
-class Case:
+class Case(NamedTuple):
     """A result that is judged.
 
     Parameters

@@ -6,13 +6,12 @@ are low-passed alike, below every tone, so that the fit is linear in M and exact
 and on real instruments the identity explains 87 to 99.9 % of db/dt.
 """
 
-from dataclasses import dataclass
+import math
 from functools import cache
 from itertools import permutations, product
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
 
 from magfusion.model.quaternion import cross
 from magfusion.model.samples import ImuSamples, Log
@@ -32,8 +31,7 @@ for _i, _k, _j in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _EPSILON[_i, _k, _j], _EPSILON[_i, _j, _k] = 1.0, -1.0
 
 
-@dataclass(frozen=True, eq=False)
-class Turning:
+class Turning(NamedTuple):
     """How a field changes in the body, and what the gyroscope says to it.
 
     Parameters
@@ -194,11 +192,16 @@ def convolved(value: Array, kernel: Array, mode: Literal["valid", "same"]) -> Ar
         Whether only what the kernel fits into is returned, or as many as there are values.
     """
     whole = len(value) + len(kernel) - 1
-    size = next_fast_len(whole, real=True)
-    spectrum = rfft(value, size, axis=0) * rfft(kernel, size)[:, None]
+    size = _fast(whole)
+    spectrum = np.fft.rfft(value, size, axis=0) * np.fft.rfft(kernel, size)[:, None]
     first = len(kernel) - 1 if mode == "valid" else (len(kernel) - 1) // 2
     count = len(value) - len(kernel) + 1 if mode == "valid" else len(value)
-    return np.asarray(irfft(spectrum, size, axis=0)[first : first + count])
+    return np.asarray(np.fft.irfft(spectrum, size, axis=0)[first : first + count])
+
+
+def _fast(least: int) -> int:
+    """Return a size of a fast transform: small factors alone."""
+    return min(k * 2 ** max(0, math.ceil(math.log2(least / k))) for k in (1, 3, 5, 9, 15))
 
 
 def _products(vectors: Array) -> Array:

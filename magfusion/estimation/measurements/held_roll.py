@@ -3,13 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.measurements.measurement import Measurement, Rows
 from magfusion.estimation.snapshot.axis_starts import least_turn
 from magfusion.estimation.state import States
 from magfusion.model.one_axis import axis_of, coil_lever
 from magfusion.model.parameters import Block, Calibration
+from magfusion.model.quaternion import matrices, of_matrices
+from magfusion.model.rotation import vectors_of
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
@@ -35,7 +36,7 @@ class HeldRoll(Measurement):
     ) -> Rows:
         """Return the rows at an estimate, one group of one."""
         turn = np.swapaxes(self.world_from_body, 1, 2) @ states.world_from_body
-        about = np.sum(Rotation.from_matrix(turn).as_rotvec() * self.axis_body, axis=1)
+        about = np.sum(vectors_of(turn) * self.axis_body, axis=1)
         by_pose = np.zeros((len(turn), 1, 1, 6))
         # At a turn of which the rest is small.
         by_pose[..., :3] = self.axis_body[:, None, None] / SIGMA
@@ -72,5 +73,5 @@ def without_roll(states: Trajectory, site: Site, *, signed: bool = True) -> Traj
     for k, step in enumerate(least_turn(towards[:-1], towards[1:])):
         turns[k + 1] = step @ turns[k]
     place = states.position_world + (states.world_from_body - turns) @ lever
-    whole = Rotation.from_matrix(turns).as_matrix()  # rounding adds up over many
+    whole = matrices(of_matrices(turns))  # rounding adds up over many
     return Trajectory(**vars(states) | {"world_from_body": whole, "position_world": place})

@@ -9,7 +9,6 @@ and lie to one another, as those of the receiver do.
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.snapshot.candidates import wahba
 from magfusion.estimation.snapshot.coil_starts import (
@@ -25,6 +24,7 @@ from magfusion.estimation.snapshot.coil_starts import (
 )
 from magfusion.estimation.snapshot.problem import Problem, State
 from magfusion.model.parameters import predict_channels
+from magfusion.model.rotation import rotations_of
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 KEPT = 24  # places of the grid that are refined roughly
@@ -106,8 +106,7 @@ def least_turn(from_vector: Array, to_vector: Array) -> Array:
     other = np.cross(start, smallest)  # any axis across, for the opposite direction
     other = other / np.linalg.norm(other, axis=-1, keepdims=True)
     about = np.where(sine > 1e-12, across / np.maximum(sine, 1e-300), other)
-    turn = Rotation.from_rotvec((about * angle).reshape(-1, 3))
-    return np.asarray(turn.as_matrix().reshape(*to_vector.shape, 3))
+    return rotations_of(about * angle)
 
 
 def phases_of(problem: Problem, state: State, free: BoolArray) -> Array:

@@ -6,6 +6,7 @@ known.  So a grid of places about the beacons is asked in closed form.
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -161,8 +162,7 @@ def grid_about(site: Site) -> Array:
     return places
 
 
-@dataclass(frozen=True, eq=False)
-class Grid:
+class Grid(NamedTuple):
     """Places, and what a coil at each would measure of every axis, or pair of axes.
 
     Parameters

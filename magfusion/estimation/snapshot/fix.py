@@ -1,6 +1,7 @@
 """What a fix is: for each epoch the poses that explain it, best first; and what may help it."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -8,8 +9,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
 
-@dataclass(frozen=True, eq=False)
-class Gravity:
+class Gravity(NamedTuple):
     """Direction of the specific force, where the platform is at rest or nearly so.
 
     Parameters

@@ -137,8 +137,7 @@ class Problem:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Epochs:
+class Epochs(NamedTuple):
     """A row for each epoch, and what its weights come from."""
 
     problem: Problem

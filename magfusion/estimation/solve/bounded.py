@@ -79,26 +79,28 @@ def minimise_curved(
         Least and greatest value of each unknown.
     """
     low, high = limits.T
-    at = np.clip(start, low, high)
+    at = np.minimum(np.maximum(start, low), high)
     here, going = cost(at), np.ones(len(at), dtype=bool)
     for _ in range(MOST_STEPS):
         slope, curvature = curved(at)
         free = ~((at <= low) & (slope > 0.0) | (at >= high) & (slope < 0.0))
-        going &= np.any(free, axis=1)
-        if not np.any(going):
+        going &= free.any(axis=1)
+        if not going.any():
             break
-        step = _downhill(free * slope, curvature * (free[:, :, None] & free[:, None, :])) * free
-        step *= (LONGEST / np.maximum(np.max(np.abs(step), axis=1), LONGEST))[:, None]
-        promised = -0.5 * np.einsum("kn,kn->k", slope, step)
+        step = _downhill(free * slope, curvature * (free[:, :, None] & free[:, None])) * free
+        step *= LONGEST / np.maximum(np.abs(step).max(axis=1, keepdims=True), LONGEST)
+        promised = -0.5 * (slope * step).sum(axis=1)
         last = promised < DECREASE_CURVED * np.maximum(np.abs(here), 1.0)
         # By the logarithm of a variance that comes to nothing a step is a half, again and again.
         # Before the others are found it may yet be wanted, and does not come back from there.
         falling = free & (slope > 0.0)
-        diagonal = np.einsum("knn->kn", curvature)
+        diagonal = curvature.reshape(len(at), -1)[:, :: at.shape[1] + 1]
         falling &= np.abs(diagonal - 2.0 * slope) < LINEAR * slope
-        fallen = np.any(falling, axis=1) & np.all(falling | (np.abs(step) < FOUND), axis=1)
-        step = np.where(falling & fallen[:, None], low - at, step)
-        last &= ~fallen
+        fallen = falling.any(axis=1)
+        if fallen.any():
+            fallen &= (falling | (np.abs(step) < FOUND)).all(axis=1)
+            step = np.where(falling & fallen[:, None], low - at, step)
+            last &= ~fallen
         at, here, going = _gone(cost, at, here, step, slope, low, high, going)
         going &= ~last
     return at
@@ -117,12 +119,12 @@ def _gone(
     """Return where searches are after so much of a step as goes down, the cost, and which went."""
     left, gone = going.copy(), np.zeros(len(at), dtype=bool)
     while True:
-        left &= np.any(np.abs(step) > SHORTEST, axis=1)
-        if not np.any(left):
+        left &= (np.abs(step) > SHORTEST).any(axis=1)
+        if not left.any():
             return at, here, gone
-        tried = np.clip(at + step, low, high)
+        tried = np.minimum(np.maximum(at + step, low), high)
         there = cost(tried)
-        promised = SUFFICIENT * np.minimum(np.einsum("kn,kn->k", slope, step), 0.0)
+        promised = SUFFICIENT * np.minimum((slope * step).sum(axis=1), 0.0)
         found = left & (there <= here + promised)
         at, here = np.where(found[:, None], tried, at), np.where(found, there, here)
         left, gone, step = left & ~found, gone | found, 0.5 * step
@@ -132,10 +134,10 @@ def _downhill(slope: Array, curvature: Array) -> Array:
     """Return Newton's steps with the absolute eigenvalues of curvatures."""
     size, axes = np.linalg.eigh(curvature)
     size = np.abs(size)
-    floor = np.max(size, axis=1, keepdims=True) * FLATTEST
+    floor = size.max(axis=1, keepdims=True) * FLATTEST
     size = np.maximum(size, np.where(floor > 0.0, floor, 1.0))
-    along = np.einsum("kij,ki->kj", axes, slope) / size
-    return np.asarray(-np.einsum("kij,kj->ki", axes, along))
+    along = (slope[:, None] @ axes)[:, 0] / size
+    return np.asarray(-(axes @ along[:, :, None])[:, :, 0])
 
 
 def minimise_between(

@@ -5,7 +5,6 @@ solved in one sweep, with the covariance of every state.  Block elimination alon
 border last; the covariance by the recursion of the selected inverse.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,8 +14,7 @@ from magfusion.units import Array
 STRETCH = 256  # states that are multiplied at once
 
 
-@dataclass(frozen=True, eq=False)
-class Chain:
+class Chain(NamedTuple):
     """Normal equations of variants h of a chain of n states of size s with a border of size c.
 
     Parameters
