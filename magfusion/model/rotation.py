@@ -4,6 +4,7 @@ SciPy's `Rotation` does the same, but it lies beside Delaunay's triangles and tr
 to import it is a twentieth of every start.
 """
 
+import gtsam
 import numpy as np
 
 from magfusion.model.quaternion import matrices, of_matrices, of_vectors, vectors
@@ -41,9 +42,8 @@ def of_quaternions(quaternion: Array) -> Array:
 
 
 def mean_rotation(rotation: Array) -> Array:
-    """Return the matrix to which those of shape (n, 3, 3) are nearest, by their quaternions."""
-    quaternion = of_matrices(rotation)
-    return np.asarray(matrices(np.linalg.eigh(quaternion @ quaternion.T)[1][:, -1:])[0])
+    """Return the matrix to which those of shape (n, 3, 3) are nearest, element by element."""
+    return np.asarray(gtsam.Rot3.ClosestTo(rotation.sum(axis=0)).matrix())
 
 
 def slerp(time: Array, rotation: Array, wanted: Array) -> Array:

@@ -246,9 +246,8 @@ def _poses(world_from_body: Array, position_world: Array) -> list[gtsam.Pose3]:
 def _align(position: Array, target: Array) -> Array:
     centre, target_centre = position.mean(axis=0), target.mean(axis=0)
     # Along a line, or at rest, many rotations fit equally well: the residual is theirs all.
-    left, _, right = np.linalg.svd((target - target_centre).T @ (position - centre))
-    left[:, 2] *= np.linalg.det(left @ right)  # no reflection
-    return np.asarray((position - centre) @ (left @ right).T + target_centre)
+    turn = gtsam.Rot3.ClosestTo((target - target_centre).T @ (position - centre)).matrix()
+    return np.asarray((position - centre) @ turn.T + target_centre)
 
 
 def _aligned_attitude(estimated: Array, true: Array) -> Array:
