@@ -1,15 +1,17 @@
-"""SciPy's notes on other array libraries, which it adds to its documentation when imported.
+"""SciPy's notes on other array libraries, stacks of matrices and what is deprecated.
 
-For that it parses and prints three hundred docstrings: a twentieth of every start that no command
-shows to anybody.
+It adds them to its documentation when imported.  For that it parses and prints four hundred
+docstrings: a twentieth of every start that no command shows to anybody.
 """
 
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from importlib import import_module
 from typing import Any
 
 ARRAYS = "scipy._lib._array_api"
+NOTING = (ARRAYS, "scipy._lib._util", "scipy._lib.deprecation")
 
 
 class _AsWritten:
@@ -21,6 +23,9 @@ class _AsWritten:
     def __getitem__(self, section: str) -> list[str]:
         return []
 
+    def __setitem__(self, section: str, lines: list[str]) -> None:
+        return
+
     def __str__(self) -> str:
         return f"\n{self._of.__doc__ or ''}"  # a signature comes first
 
@@ -31,13 +36,15 @@ def leave_notes_out() -> None:
         return
     try:
         import scipy._lib._docscrape as docstrings
-    except ImportError:  # it is SciPy's own, and may be elsewhere in another SciPy
+    except ImportError:  # all these are SciPy's own, and may be elsewhere in another SciPy
         return
     known = getattr(docstrings, "FunctionDoc", None)
     if known is None:
         return
     docstrings.FunctionDoc = _AsWritten
     try:
-        import_module(ARRAYS)
+        for module in NOTING:
+            with suppress(ImportError):
+                import_module(module)
     finally:
         docstrings.FunctionDoc = known
