@@ -70,3 +70,5 @@ def test_rest_is_told_of_some_samples_as_of_all() -> None:
     assert not np.all(whole[at])
     some = resting(time, gyro, accel, 1.0, motion=MotionModel(), at=at)
     assert np.array_equal(some, whole[at])
+    alone = [resting(time, gyro, accel, 1.0, motion=MotionModel(), at=at[[k]]) for k in range(5)]
+    assert np.array_equal(np.concatenate(alone), whole[at])

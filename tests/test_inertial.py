@@ -130,6 +130,20 @@ def test_steps_never_straddle_an_epoch_and_fill_every_interval() -> None:
     assert not np.any(increments.bridged)
 
 
+@pytest.mark.parametrize("ends", [(5.0011, 9.9993), (5.0, 10.0), (-0.4, 2.0), (38.0, 40.3)])
+def test_one_interval_is_cut_as_one_among_several(ends: tuple[float, float]) -> None:
+    imu = recorded(moving(4))
+    # An epoch at a sample's stamp cuts nothing.
+    stamp = imu.time[np.searchsorted(imu.time, np.mean(ends))]
+    alone = cut_at_epochs(imu, 0.0, np.array(ends), 0.005)
+    among = cut_at_epochs(imu, 0.0, np.array([ends[0], stamp, ends[1]]), 0.005)
+    np.testing.assert_array_equal(alone.dt, among.dt)
+    np.testing.assert_array_equal(alone.gyro_body, among.gyro_body)
+    np.testing.assert_array_equal(alone.accel_body, among.accel_body)
+    assert alone.first[-1] == among.first[-1]
+    assert alone.bridged[0] == among.bridged.any()
+
+
 def without(imu: ImuSamples, start: float, end: float) -> ImuSamples:
     kept = (imu.time <= start) | (imu.time >= end)
     return ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept])
