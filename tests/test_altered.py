@@ -8,6 +8,8 @@ from magfusion.model.altered import altered
 
 @dataclass(frozen=True)
 class Square:
+    """A record that works something out."""
+
     side: float
     colour: str = "red"
 
@@ -18,6 +20,8 @@ class Square:
 
 @dataclass(frozen=True)
 class Box(Square):
+    """A record of another kind, with more values."""
+
     height: float = 1.0
 
 
