@@ -27,6 +27,7 @@ from magfusion.files.standard_streams import binary_output, occupy_closed, quick
 from magfusion.files.without_pandas import without_pandas
 from magfusion.jobs import GROUPS, JOBS
 from magfusion.jobs.settings import Command, Option, Settings, options
+from magfusion.model.blas_threads import use_one_thread
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figures
 from magfusion.results.provenance import Run, recorded_as
@@ -57,6 +58,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         if arguments is None:
             os.environ.setdefault(NO_PLUGINS, "__all__")
+            use_one_thread(given)
         alone = without_pandas() if arguments is None else nullcontext()
         with _terminated_as_interrupted(), until_closed(), alone:
             status = application()(

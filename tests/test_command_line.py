@@ -246,6 +246,37 @@ assert callable(np.ctypeslib.as_array)
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize(
+    ("command", "given", "threads"),
+    [
+        ("smooth", {}, "1"),
+        ("smooth", {"OPENBLAS_NUM_THREADS": "2"}, "2"),
+        ("smooth", {"OMP_NUM_THREADS": "2"}, None),
+        ("calibrate fieldmap", {}, None),
+    ],
+)
+def test_blas_has_one_thread_unless_more_are_asked_for_or_help(
+    command: str, given: dict[str, str], threads: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    for name, number in given.items():
+        monkeypatch.setenv(name, number)
+    told = f"""
+import os, sys
+import magfusion.cli
+assert "numpy" not in sys.modules
+sys.argv = ["magfusion", *{command.split()!r}, "nowhere", "--debug"]
+try:
+    magfusion.cli.main()
+except SystemExit:
+    pass
+assert os.environ.get("OPENBLAS_NUM_THREADS") == {threads!r}
+"""
+    done = _child("-c", told)
+    assert done.returncode == 0, done.stderr
+
+
 def test_functions_of_scipy_are_as_they_were_written() -> None:
     told = """
 import numpy as np

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.model.blas_threads import OF_ALL, THREADS
 
 Input = TypeVar("Input")
 Output = TypeVar("Output")
@@ -19,7 +20,7 @@ Report = Callable[[str, int, int], None]  # stage, done, total
 
 CONNECT_S = 10.0  # patience with a cluster, s
 # A worker has one core: threads of its linear algebra would only fight each other for it.
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_ONE_THREAD = (OF_ALL, *THREADS)
 
 
 def run_many(
