@@ -23,11 +23,11 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from magfusion.errors import EstimationError, InputError, InputErrors
+from magfusion.files.blas_threads import use_one_thread
 from magfusion.files.standard_streams import binary_output, occupy_closed, quick_exit, until_closed
 from magfusion.files.without_pandas import without_pandas
 from magfusion.jobs import GROUPS, JOBS
 from magfusion.jobs.settings import Command, Option, Settings, options
-from magfusion.model.blas_threads import use_one_thread
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figures
 from magfusion.results.provenance import Run, recorded_as

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.model.blas_threads import OF_ALL, THREADS
+from magfusion.files.blas_threads import OF_ALL, THREADS
 
 Input = TypeVar("Input")
 Output = TypeVar("Output")
