@@ -58,7 +58,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         if arguments is None:
             os.environ.setdefault(NO_PLUGINS, "__all__")
-            use_one_thread(given)
+            use_one_thread()
         alone = without_pandas() if arguments is None else nullcontext()
         with _terminated_as_interrupted(), until_closed(), alone:
             status = application()(
