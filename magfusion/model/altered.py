@@ -1,8 +1,14 @@
 """Frozen records with other values, as an estimator makes them many times a state."""
 
-from typing import Any, TypeVar
+from dataclasses import Field
+from typing import Any, ClassVar, Protocol, TypeVar
 
-Record = TypeVar("Record")
+
+class _Dataclass(Protocol):
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+
+Record = TypeVar("Record", bound=_Dataclass)
 
 
 def altered(record: Record, **changes: Any) -> Record:
@@ -13,7 +19,7 @@ def altered(record: Record, **changes: Any) -> Record:
     """
     other = object.__new__(type(record))
     known, own = vars(record), vars(other)
-    for name in type(record).__dataclass_fields__:  # type: ignore[attr-defined]
+    for name in type(record).__dataclass_fields__:
         own[name] = known[name]
     own.update(changes)
     return other
