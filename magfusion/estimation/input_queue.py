@@ -387,9 +387,9 @@ class Arrivals:
             return 0.0
         by_state, run = np.zeros(len(state.cov)), state.time - state.calibration.imu_begin
         for parameter, _, columns, _ in blocks:
-            if parameter.kind == TIME_OFFSET.kind and parameter == TIME_OFFSET:
+            if parameter == TIME_OFFSET:
                 by_state[MOTION + columns.start] = 1.0
-            elif parameter.kind == CLOCK_RATE.kind and parameter == CLOCK_RATE:
+            elif parameter == CLOCK_RATE:
                 by_state[MOTION + columns.start] = run
         if not np.any(by_state):
             return 0.0

@@ -90,8 +90,11 @@ def propagate(
             increments = replace(increments, bridged=np.ones_like(increments.bridged))
         return Steps(thinned(increments, accel[None], gyro[None]), accel, gyro)
 
-    def values(found: list[Preintegrated]) -> gtsam.Values:
-        both = before, found[0].predict(before, bias)
+    def predicted(measurement: Preintegrated) -> gtsam.NavState:
+        return measurement.predict(before, bias)
+
+    def values(after: gtsam.NavState) -> gtsam.Values:
+        both = before, after
         velocities = [at.velocity() for at in both]
         return values_from([at.pose() for at in both], velocities, [bias.vector()] * 2)
 
@@ -102,10 +105,11 @@ def propagate(
         ],
         state.calibration,
         blocks,
-        values,
+        lambda found: values(predicted(found[0])),
     )
+    after = predicted(link.measurement)
     factor = inertial_factor(0, link.measurement)
-    rows, _ = factor.linearize(values([link.measurement])).jacobian()
+    rows, _ = factor.linearize(values(after)).jacobian()
     root = np.linalg.inv(rows[:, _AFTER])
     transition = np.eye(len(state.cov))
     transition[:MOTION, :MOTION] = -root @ rows[:, _BEFORE]
@@ -120,7 +124,6 @@ def propagate(
     cov[:MOTION, :MOTION] = across @ motion.T
     cov[:MOTION, MOTION:], cov[MOTION:, :MOTION] = across[:, MOTION:], across[:, MOTION:].T
     cov += noise
-    after = link.measurement.predict(before, bias)
     pose = after.pose()
     later = altered(
         state,

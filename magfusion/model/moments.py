@@ -25,20 +25,20 @@ def with_moments(site: Site, moments_beacon: Mapping[str, Array]) -> Site:
         _changed(beacon, moments_beacon[beacon.name]) if beacon.name in moments_beacon else beacon
         for beacon in site.beacons
     )
-    other = _altered(site, beacons=beacons)
+    other = _keeping_known(site, beacons=beacons)
     keep_sources(site, other)
     return other
 
 
 def _changed(beacon: Beacon, moments_beacon: Array) -> Beacon:
     pairs = zip(beacon.coils, moments_beacon, strict=True)
-    coils = tuple(_altered(coil, moment_beacon=moment) for coil, moment in pairs)
-    other = _altered(beacon, coils=coils, moments_beacon=moments_beacon)
+    coils = tuple(_keeping_known(coil, moment_beacon=moment) for coil, moment in pairs)
+    other = _keeping_known(beacon, coils=coils, moments_beacon=moments_beacon)
     vars(other).pop("tone_moments", None)
     return other
 
 
-def _altered(part: Part, **changes: Any) -> Part:
+def _keeping_known(part: Part, **changes: Any) -> Part:
     """Return a part of the site with other values, and with all that it has worked out."""
     other = object.__new__(type(part))  # a third of what `copy.copy` takes
     vars(other).update(vars(part), **changes)

@@ -6,7 +6,6 @@ are low-passed alike, below every tone, so that the fit is linear in M and exact
 and on real instruments the identity explains 87 to 99.9 % of db/dt.
 """
 
-import math
 from functools import cache
 from itertools import permutations, product
 from typing import Literal, NamedTuple
@@ -191,17 +190,14 @@ def convolved(value: Array, kernel: Array, mode: Literal["valid", "same"]) -> Ar
     mode : 'valid' or 'same'
         Whether only what the kernel fits into is returned, or as many as there are values.
     """
+    from scipy.fft import irfft, next_fast_len, rfft  # not for every command
+
     whole = len(value) + len(kernel) - 1
-    size = _fast(whole)
-    spectrum = np.fft.rfft(value, size, axis=0) * np.fft.rfft(kernel, size)[:, None]
+    size = next_fast_len(whole, real=True)
+    spectrum = rfft(value, size, axis=0) * rfft(kernel, size)[:, None]
     first = len(kernel) - 1 if mode == "valid" else (len(kernel) - 1) // 2
     count = len(value) - len(kernel) + 1 if mode == "valid" else len(value)
-    return np.asarray(np.fft.irfft(spectrum, size, axis=0)[first : first + count])
-
-
-def _fast(least: int) -> int:
-    """Return a size of a fast transform: small factors alone."""
-    return min(k * 2 ** max(0, math.ceil(math.log2(least / k))) for k in (1, 3, 5, 9, 15))
+    return np.asarray(irfft(spectrum, size, axis=0)[first : first + count])
 
 
 def _products(vectors: Array) -> Array:

@@ -91,7 +91,7 @@ def may_stand(velocity_world: Array, cov: Array, motion: MotionModel) -> BoolArr
     """
     known = np.diagonal(cov, axis1=-2, axis2=-1).max(axis=-1) < motion.rest_known_speed**2
     slow = (velocity_world**2).sum(axis=-1) < REST_GATE * motion.rest_speed_sigma**2
-    if not known.any() or slow.all():  # of a velocity that is known exactly it would be so, too
+    if not known.any() or slow.all():  # a covariance makes the distance only smaller
         return np.asarray(known & slow)
     cov = cov + motion.rest_speed_sigma**2 * _EYE
     solved = np.linalg.solve(cov, velocity_world[..., None])[..., 0]
