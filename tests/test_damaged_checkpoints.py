@@ -17,7 +17,7 @@ from online_log import online_log
 from test_navigate_stream import records
 
 from magfusion.errors import InputError
-from magfusion.estimation.navigator import NavigatorSettings
+from magfusion.estimation.online.navigator import NavigatorSettings
 from magfusion.files.checkpoint import MAGIC, read_checkpoint, write_checkpoint
 from magfusion.files.log import write_log
 from magfusion.files.plain_data import from_plain

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import X
 
-from magfusion.estimation.batch import SmootherSettings, smooth, solved_again
+from magfusion.estimation.batch.batch import SmootherSettings, smooth, solved_again
+from magfusion.estimation.graph.state import states_in
 from magfusion.estimation.measurements.field_error import modes_in_place
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.state import states_in
 from magfusion.model.noise import stacked
 from magfusion.model.parameters.parameter import PhasorView
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site

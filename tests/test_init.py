@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.cli import main
 from magfusion.errors import InputError
-from magfusion.estimation.integrity.tones import transmitted
+from magfusion.estimation.data_checks.tones import transmitted
 from magfusion.files.instruments import imus, magnetometers, named_imu, named_magnetometer
 from magfusion.files.log import write_log
 from magfusion.files.site import load_site

@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-from magfusion.estimation.integrity.fix_separation import separate_fixes, separation_trust
 from magfusion.estimation.integrity.separation import (
     Separation,
     linear_separation,
@@ -15,6 +14,7 @@ from magfusion.estimation.integrity.separation import (
     radii,
     with_rivals,
 )
+from magfusion.estimation.snapshot.fix_separation import separate_fixes, separation_trust
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.trajectory import Trajectory

@@ -12,8 +12,8 @@ import pytest
 from test_several_magnetometers import two_magnetometers
 
 from magfusion.errors import InputError
-from magfusion.estimation.demodulated_apart import demodulated_apart
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.demodulation.demodulated_apart import demodulated_apart
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.fields import by_own_clocks
 from magfusion.files.log import write_log
 from magfusion.files.open import open_log

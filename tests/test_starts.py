@@ -8,8 +8,8 @@ import random_starts
 from random_starts import Case, lone, recorded
 from scipy.stats import binom, chi2
 
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.demodulation import first_fixes
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.demodulation.demodulation import first_fixes
 from magfusion.estimation.initialization.chain import choose_chains
 from magfusion.estimation.initialization.search import differ, search, thinned
 from magfusion.model.parameters import initial_calibration

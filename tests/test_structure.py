@@ -112,7 +112,7 @@ def test_only_the_plots_import_matplotlib() -> None:
 
 
 def test_only_the_ekf_imports_filterpy() -> None:
-    assert _importers("filterpy") <= {"magfusion/estimation/ekf.py"}
+    assert _importers("filterpy") <= {"magfusion/estimation/online/ekf.py"}
 
 
 def test_no_file_of_the_package_can_hold_code() -> None:

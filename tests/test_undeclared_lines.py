@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magfusion.estimation.batch import SmootherSettings
-from magfusion.estimation.demodulation import phasors
-from magfusion.estimation.integrity.recording import BRIDGED, recorded
-from magfusion.estimation.integrity.spectrum import beside_lines
+from magfusion.estimation.batch.batch import SmootherSettings
+from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.estimation.data_checks.spectrum import beside_lines
+from magfusion.estimation.demodulation.demodulation import phasors
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.jobs.inputs import Job

@@ -12,7 +12,7 @@ from magfusion.jobs.settings import Command, TopicSettings, option
 from magfusion.results.figures import Figure, Figures, Section, heading
 
 if TYPE_CHECKING:
-    from magfusion.estimation.integrity.tones import Tone, Transmitted
+    from magfusion.estimation.data_checks.tones import Tone, Transmitted
     from magfusion.files.site_draft import BeaconDraft
     from magfusion.files.site_text import SiteDraft
     from magfusion.model.site import Site
@@ -92,8 +92,8 @@ def _heard(settings: InitSettings) -> Transmitted | None:
     """Return what transmits in the recording, if there is one."""
     if settings.log is None:
         return None
-    from magfusion.estimation.integrity.mending import mended
-    from magfusion.estimation.integrity.tones import transmitted
+    from magfusion.estimation.data_checks.mending import mended
+    from magfusion.estimation.data_checks.tones import transmitted
     from magfusion.files.open import open_log
     from magfusion.jobs.inputs import topics_option
 

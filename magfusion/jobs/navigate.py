@@ -29,8 +29,8 @@ from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Site
 
 if TYPE_CHECKING:
-    from magfusion.estimation.integrity.judgement import JudgedState
-    from magfusion.estimation.navigator import Navigator, NavigatorSettings
+    from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+    from magfusion.estimation.online_integrity.judgement import JudgedState
     from magfusion.jobs.inputs import Job
     from magfusion.jobs.live import StateSink
     from magfusion.jobs.navigate_results import NavigateResults
@@ -101,7 +101,7 @@ class NavigateSettings(
 
     def navigator(self, job: Job) -> NavigatorSettings:
         """Return the settings of the estimator."""
-        from magfusion.estimation.navigator import NavigatorSettings
+        from magfusion.estimation.online.navigator import NavigatorSettings
 
         return NavigatorSettings(
             estimator=self.estimator,
@@ -190,7 +190,7 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
     EstimationError
         Where the log leads to no state.
     """
-    from magfusion.estimation.integrity.spectrum import beside_lines
+    from magfusion.estimation.data_checks.spectrum import beside_lines
     from magfusion.files.checkpoint import claim_checkpoint
     from magfusion.files.row_file import claim_rows
     from magfusion.jobs.inputs import CHECKPOINT, claim, found_in, named, read_job, refuse_failed
@@ -259,8 +259,8 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
 
 def _results(run: NavigateRun) -> tuple[Figures, Trust, NavigateResults | None]:
     """Return figures and verdict of a run, and its results where it led to a state."""
+    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
     from magfusion.estimation.integrity.diagnosis import with_cause
-    from magfusion.estimation.integrity.recording import BRIDGED, recorded
     from magfusion.jobs.navigate_results import navigated, no_start
     from magfusion.jobs.replay import PIECE
     from magfusion.model.trust import Trust

@@ -4,11 +4,11 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from magfusion.estimation.batch import Smoothed
-from magfusion.estimation.factors import CALIBRATION_KEY
-from magfusion.estimation.graph import Estimate
+from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.graph.factors import CALIBRATION_KEY
+from magfusion.estimation.graph.graph import Estimate
+from magfusion.estimation.graph.state import State
 from magfusion.estimation.solve.bordered import eliminate_partial
-from magfusion.estimation.state import State
 from magfusion.model.parameters import Block, dimension, placed
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.units import Array

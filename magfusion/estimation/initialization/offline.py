@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.demodulation import fix_inputs
+from magfusion.estimation.demodulation.demodulation import fix_inputs
 from magfusion.estimation.initialization.chain import (
     Start,
     choose_chains,
     start_of,
     start_phases,
 )
-from magfusion.estimation.integrity.fix_separation import separate_fixes
 from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.estimation.snapshot.fix_separation import separate_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.one_axis import roll_is_open
 from magfusion.model.parameters import Calibration

@@ -7,16 +7,16 @@ from dataclasses import fields as fields_of
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.demodulated_apart import each_alone
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
+from magfusion.estimation.batch.settings import EstimatorSettings
+from magfusion.estimation.data_checks.spectrum import beside_lines
+from magfusion.estimation.demodulation.demodulated_apart import each_alone
+from magfusion.estimation.graph.state import POSITION, ROTATION, State
 from magfusion.estimation.initialization.handover import last_state
 from magfusion.estimation.integrity.judge import judged_with_score
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.spectrum import beside_lines
-from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
-from magfusion.estimation.settings import EstimatorSettings
-from magfusion.estimation.state import POSITION, ROTATION, State
-from magfusion.estimation.stream_buffer import Buffer
+from magfusion.estimation.online.stream_buffer import Buffer
 from magfusion.model.audibility import are_many
 from magfusion.model.marks import Marks
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
@@ -145,7 +145,7 @@ def find_online_start(
     heard = log
     try:
         if several and are_many(site):  # by what is heard they are chosen
-            from magfusion.estimation.several_demodulation import demodulated_several
+            from magfusion.estimation.demodulation.several_demodulation import demodulated_several
 
             log = replace(log, fields=demodulated_several(log, site, settings.lockin).fields)
         if log.waveform is not None and has_schedule(site) and joins(site, log.waveform.marks):
@@ -214,7 +214,7 @@ def _among_all(
 
 def _lines_of_each(log: Log, site: Site, given: LockinSettings | None) -> dict[str, LockinSettings]:
     """Return how the receivers of several magnetometers go on that have lines to be fitted."""
-    from magfusion.estimation.several_demodulation import same_windows
+    from magfusion.estimation.demodulation.several_demodulation import same_windows
 
     lockin, found = same_windows(site, given), dict[str, LockinSettings]()
     for name, own, alone in each_alone(log, site):

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.estimation.preintegration import GAP_SAMPLES
+from magfusion.estimation.graph.preintegration import GAP_SAMPLES
 from magfusion.model.hermite import hermite
 from magfusion.model.samples import ImuSamples
 from magfusion.model.strapdown import attitude_at, attitude_from_gyro

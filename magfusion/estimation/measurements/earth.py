@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.estimation.graph.state import State, States, states_of
 from magfusion.estimation.measurements.measurement import (
     Loss,
     Measurement,
@@ -24,7 +25,6 @@ from magfusion.estimation.measurements.measurement import (
 )
 from magfusion.estimation.measurements.pose_fix import PoseFix
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
-from magfusion.estimation.state import State, States, states_of
 from magfusion.model.field import observe_earth
 from magfusion.model.noise import whitening
 from magfusion.model.parameters import Block, Calibration, SteadyView

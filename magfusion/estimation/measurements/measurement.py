@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from magfusion.estimation.state import MOTION, States
+from magfusion.estimation.graph.state import MOTION, States
 from magfusion.model.parameters import Block, Calibration, dimension
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -83,7 +83,8 @@ class Rows:
         Predicted minus measured.
     by_pose, by_velocity, by_bias, by_calibration : ndarray, shape (n, groups, components, k), \
 optional
-        In the tangent of `magfusion.estimation.state`: k is 6, 3, 6 and the calibration's size.
+        In the tangent of `magfusion.estimation.graph.state`: k is 6, 3, 6 and the calibration's
+        size.
     """
 
     error: Array

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.graph.state import State, States, states_of
 from magfusion.estimation.measurements.measurement import (
     Loss,
     Measurement,
@@ -14,7 +15,6 @@ from magfusion.estimation.measurements.measurement import (
     group_distances,
 )
 from magfusion.estimation.measurements.signs import whitened_along
-from magfusion.estimation.state import State, States, states_of
 from magfusion.model.audibility import are_many
 from magfusion.model.field import skew
 from magfusion.model.noise import (
@@ -316,7 +316,7 @@ def field_phasors(
     repeats : float
         How many epochs hold each sample of overlapping windows: that must not count twice.
     by_time_offset : complex ndarray, shape (n, channels, 3), optional
-        As of `magfusion.estimation.motion_compensation.WaveFields`.
+        As of `magfusion.estimation.demodulation.motion_compensation.WaveFields`.
     alike : ndarray, shape (n,), or float
         How many epochs have the same model error; no fewer than windows hold a sample.
     standing : bool ndarray, shape (n,), optional

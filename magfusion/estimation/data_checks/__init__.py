@@ -1,0 +1,1 @@
+"""What the samples alone say of themselves, before any estimator has them."""

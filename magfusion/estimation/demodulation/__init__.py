@@ -1,0 +1,1 @@
+"""From samples of the sensor to the phasors of each beacon in each epoch."""

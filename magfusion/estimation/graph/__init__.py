@@ -1,0 +1,1 @@
+"""The factor graph: its states, its factors, and the inertial data between epochs."""

@@ -1,0 +1,1 @@
+"""As the data arrive: navigator, filter, fixed lag, and what a checkpoint holds."""

@@ -1,0 +1,1 @@
+"""What a solved graph says beside its states: marginals, residuals, noise."""

@@ -1,0 +1,1 @@
+"""Magnetometer and inertial data of a platform that stands still."""
