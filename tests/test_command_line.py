@@ -344,7 +344,7 @@ def test_what_a_command_says_that_it_imports_is_there() -> None:
 def test_a_command_imports_nothing_that_only_other_runs_ask(job: str) -> None:
     """Of a mistake, bags, slots, the pipe and doubtful starts others know, when they are asked."""
     others = {
-        "magfusion.estimation.initialization.search",
+        "magfusion.estimation.batch.search",
         "magfusion.estimation.integrity.likely_cause",
         "magfusion.estimation.online.several_arrivals",
         "magfusion.files.bag",

@@ -10,7 +10,7 @@ from conftest import run_command
 from tracker_site import body_poses, in_beacon, tracker_site
 
 from magfusion.errors import InputError
-from magfusion.estimation.online_integrity.place_witness import of_place
+from magfusion.estimation.integrity.place_witness import of_place
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.files.log import write_log

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, State
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.estimation.online.navigator import Navigator
 from magfusion.estimation.online.navigator_settings import NavigatorSettings

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-from magfusion.estimation.integrity.separation import (
+from magfusion.estimation.posterior.separation import (
     Separation,
     linear_separation,
     protection_levels,

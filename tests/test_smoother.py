@@ -16,8 +16,8 @@ from magfusion.errors import EstimationError
 from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.graph.factors import CALIBRATION_KEY
 from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate, read_states
+from magfusion.estimation.graph.measurement import robust_weight
 from magfusion.estimation.graph.state import states_in
-from magfusion.estimation.measurements.measurement import robust_weight
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.posterior.marginals import marginals
 from magfusion.estimation.solve.bordered import optimise

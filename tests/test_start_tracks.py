@@ -8,10 +8,8 @@ from derivatives import central_difference, relative_to_group
 from online_log import SIGMA, surveyed_site
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.graph.propagation import propagate
-from magfusion.estimation.graph.state import State
-from magfusion.estimation.initialization.strides import strides_between
-from magfusion.estimation.initialization.tracks import (
+from magfusion.estimation.batch.strides import strides_between
+from magfusion.estimation.batch.tracks import (
     MOTION,
     Heard,
     Tracks,
@@ -21,6 +19,8 @@ from magfusion.estimation.initialization.tracks import (
     rows_at,
     updated,
 )
+from magfusion.estimation.graph.propagation import propagate
+from magfusion.estimation.graph.state import State
 from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.estimation.online.ekf import ErrorStateFilter
 from magfusion.model.parameters import initial_calibration

@@ -131,7 +131,7 @@ def run_fix(
 
     from magfusion.estimation.data_checks.recording import BRIDGED, recorded
     from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
-    from magfusion.estimation.online_integrity.place_witness import of_place
+    from magfusion.estimation.integrity.place_witness import of_place
     from magfusion.estimation.snapshot.explained_fixes import explained_fixes
     from magfusion.estimation.snapshot.fix_magnetometers import contradicting_magnetometers
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed

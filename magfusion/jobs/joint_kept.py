@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.batch.chain import Start
 from magfusion.estimation.batch.joint import Said
 from magfusion.estimation.batch.joint_log import OfLog
 from magfusion.estimation.batch.prepared import Begun
-from magfusion.estimation.initialization.chain import Start
 from magfusion.estimation.posterior.condensed import Condensed
 from magfusion.estimation.posterior.noise_tuning import Tuned
 from magfusion.files.kept import Kept, load_kept, save_kept

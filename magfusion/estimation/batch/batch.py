@@ -10,21 +10,21 @@ import numpy as np
 from gtsam.symbol_shorthand import V
 
 from magfusion.errors import InputError
+from magfusion.estimation.batch.chain import Start
 from magfusion.estimation.batch.log_graph import PreparedLog, graph_of
+from magfusion.estimation.batch.on_new_clock import on_new_clock
 from magfusion.estimation.batch.prepared import prepared
 from magfusion.estimation.batch.settings import SmootherSettings as SmootherSettings
 from magfusion.estimation.data_checks.mending import mended
 from magfusion.estimation.demodulation.hearing import heard_site
 from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate, read_states
-from magfusion.estimation.initialization.chain import Start
+from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.measurements.earth import EarthField, check_earth, disturbed
 from magfusion.estimation.measurements.field_error import field_errors
-from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors, alone
 from magfusion.estimation.measurements.pose_fix import survey_response
 from magfusion.estimation.measurements.signs import count_open
 from magfusion.estimation.measurements.zero_velocity import may_stand, quiet_before
-from magfusion.estimation.online.on_new_clock import on_new_clock
 from magfusion.estimation.posterior.convergence import last_move, refuse_open, settled_at
 from magfusion.estimation.posterior.marginals import marginals
 from magfusion.estimation.posterior.noise_tuning import (

@@ -14,8 +14,8 @@ from gtsam.symbol_shorthand import B, V, X
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.demodulation.motion_shape import motion_at
 from magfusion.estimation.graph.preintegration import GAP_SAMPLES
+from magfusion.estimation.graph.reckoning_error import step_noise, step_transitions
 from magfusion.estimation.graph.state import MOTION
-from magfusion.estimation.online.reckoning_error import step_noise, step_transitions
 from magfusion.estimation.solve.bordered import eliminate
 from magfusion.model.parameters import corrected_imu
 from magfusion.model.samples import ImuSamples, Log

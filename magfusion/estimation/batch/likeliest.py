@@ -28,7 +28,7 @@ def likeliest(starts: list[PreparedLog]) -> PreparedLog:
     """
     if len(starts) == 1:
         return starts[0]
-    from magfusion.estimation.initialization.search import differ, thinned
+    from magfusion.estimation.batch.search import differ, thinned
 
     kept = thinned(starts[0].samples)
     found, paths = [], []

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from magfusion.estimation.batch.chain import Start
 from magfusion.estimation.data_checks.detection import (
     DETECTION_CHI_SQUARE_ONLINE,
     above_noise,
@@ -16,11 +17,10 @@ from magfusion.estimation.graph.drift_segments import segments_of
 from magfusion.estimation.graph.graph import Graph, initial_estimate
 from magfusion.estimation.graph.imu_decimation import preintegrate_stream
 from magfusion.estimation.graph.inertial import Link, Preintegrated, inertial_graph, links_between
+from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.preintegration import low_passed_rate_at
-from magfusion.estimation.initialization.chain import Start
 from magfusion.estimation.measurements.earth import earth_measurement, unheld
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
-from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
 from magfusion.estimation.measurements.pose_fix import pose_fixes
 from magfusion.estimation.measurements.signs import with_signs

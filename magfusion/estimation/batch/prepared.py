@@ -7,18 +7,13 @@ import numpy as np
 
 from magfusion.errors import EstimationError
 from magfusion.estimation.batch.bridged_log import bridged
+from magfusion.estimation.batch.chain import Start
 from magfusion.estimation.batch.likeliest import likeliest
 from magfusion.estimation.batch.log_graph import PreparedLog
+from magfusion.estimation.batch.offline import begin, carried, unbiased, with_rest_bias
 from magfusion.estimation.batch.settings import SmootherSettings
 from magfusion.estimation.data_checks.detection import detected, only
 from magfusion.estimation.demodulation.demodulation import Demodulation, demodulated
-from magfusion.estimation.initialization.chain import Start
-from magfusion.estimation.initialization.offline import (
-    begin,
-    carried,
-    unbiased,
-    with_rest_bias,
-)
 from magfusion.estimation.measurements.zero_velocity import quiet_before
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.one_axis import roll_is_open

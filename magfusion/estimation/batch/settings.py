@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from magfusion.estimation.measurements.measurement import Measurement
+from magfusion.estimation.graph.measurement import Measurement
 from magfusion.model.parameters import (
     PARAMETERS,
     Block,

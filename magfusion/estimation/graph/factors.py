@@ -13,8 +13,8 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
+from magfusion.estimation.graph.measurement import Measurement, Rows
 from magfusion.estimation.graph.state import States
-from magfusion.estimation.measurements.measurement import Measurement, Rows
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.model.parameters import Block, Calibration
 from magfusion.units import Array, IntArray

@@ -18,9 +18,9 @@ from magfusion.estimation.graph.factors import (
     empty_factor,
 )
 from magfusion.estimation.graph.inertial import ROWS, Link
+from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.prior_factor import PriorShift, prior_factor
 from magfusion.estimation.graph.state import states_in, values_from
-from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.solve.ordering import nested_dissection
 from magfusion.model.parameters import (
     Block,

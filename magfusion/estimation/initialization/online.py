@@ -11,12 +11,12 @@ from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.batch.settings import EstimatorSettings
 from magfusion.estimation.data_checks.spectrum import beside_lines
+from magfusion.estimation.data_checks.stream_buffer import Buffer
 from magfusion.estimation.demodulation.demodulated_apart import each_alone
 from magfusion.estimation.graph.state import POSITION, ROTATION, State
 from magfusion.estimation.initialization.handover import last_state
 from magfusion.estimation.integrity.judge import judged_with_score
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.online.stream_buffer import Buffer
 from magfusion.model.audibility import are_many
 from magfusion.model.marks import Marks
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform

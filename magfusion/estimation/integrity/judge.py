@@ -18,6 +18,7 @@ from magfusion.estimation.integrity.close_residuals import together
 from magfusion.estimation.integrity.held import held
 from magfusion.estimation.integrity.midway import changed, steps_asked
 from magfusion.estimation.integrity.outcome import convergence, geometry, rivals
+from magfusion.estimation.integrity.place_witness import of_place
 from magfusion.estimation.integrity.priors_of_log import bias_change, calibration_change
 from magfusion.estimation.integrity.residual_blocks import fields, fixes, inertial
 from magfusion.estimation.integrity.score import (
@@ -28,7 +29,6 @@ from magfusion.estimation.integrity.score import (
 )
 from magfusion.estimation.integrity.smoothed_compass import compass
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
-from magfusion.estimation.online_integrity.place_witness import of_place
 from magfusion.estimation.posterior.tuned_noise import tuned_noise
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.model.samples import Log

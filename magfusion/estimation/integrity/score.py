@@ -18,6 +18,7 @@ from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.graph.considered import steps_of_others
 from magfusion.estimation.graph.factors import CALIBRATION_KEY, CONSIDERED_KEY, NUISANCE_KEY
 from magfusion.estimation.graph.graph import Estimate
+from magfusion.estimation.graph.measurement import Rows
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.integrity.held_columns import InertialColumns, inertial_columns
 from magfusion.estimation.integrity.score_chain import (
@@ -28,7 +29,6 @@ from magfusion.estimation.integrity.score_chain import (
 )
 from magfusion.estimation.integrity.suspects import TOLERANCE, held_blocks
 from magfusion.estimation.measurements.earth import EarthField
-from magfusion.estimation.measurements.measurement import Rows
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.posterior.marginals import is_chain
 from magfusion.estimation.posterior.native_rows import NativeRows

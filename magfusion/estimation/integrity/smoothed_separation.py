@@ -7,13 +7,13 @@ import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.graph.state import MOTION
-from magfusion.estimation.integrity.separation import Separation
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.posterior import chain_system as chains
 from magfusion.estimation.posterior.chain_parts import Parts, parts_of
 from magfusion.estimation.posterior.chain_system import Piece, chain_system, column_groups
 from magfusion.estimation.posterior.convergence import OPEN_ROTATION
+from magfusion.estimation.posterior.separation import Separation
 from magfusion.estimation.solve.chain import STRETCH, inverses, solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.units import Array, BoolArray

@@ -14,8 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.estimation.graph.state import State, States, states_of
-from magfusion.estimation.measurements.measurement import (
+from magfusion.estimation.graph.measurement import (
     Loss,
     Measurement,
     Rows,
@@ -23,6 +22,7 @@ from magfusion.estimation.measurements.measurement import (
     group_distances,
     robust_weight,
 )
+from magfusion.estimation.graph.state import State, States, states_of
 from magfusion.estimation.measurements.pose_fix import PoseFix
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.model.field import observe_earth

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magfusion.estimation.graph.measurement import Measurement, Rows
 from magfusion.estimation.graph.state import States
-from magfusion.estimation.measurements.measurement import Measurement, Rows
 from magfusion.estimation.snapshot.axis_starts import least_turn
 from magfusion.model.one_axis import axis_of, coil_lever
 from magfusion.model.parameters import Block, Calibration

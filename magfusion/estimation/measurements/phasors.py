@@ -7,13 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.graph.measurement import Loss, Measurement, Rows, group_distances
 from magfusion.estimation.graph.state import State, States, states_of
-from magfusion.estimation.measurements.measurement import (
-    Loss,
-    Measurement,
-    Rows,
-    group_distances,
-)
 from magfusion.estimation.measurements.signs import whitened_along
 from magfusion.model.audibility import are_many
 from magfusion.model.field import skew

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from magfusion.estimation.graph.measurement import Loss, Measurement, Rows
 from magfusion.estimation.graph.state import States
-from magfusion.estimation.measurements.measurement import Loss, Measurement, Rows
 from magfusion.estimation.snapshot.problem import nuisance_blocks
 from magfusion.estimation.snapshot.survey_error import survey_jacobians
 from magfusion.model.noise import measurement_cov, sensor_positions, whitening

@@ -11,8 +11,8 @@ import numpy as np
 from magfusion.estimation.graph.inertial import STEP
 from magfusion.estimation.graph.preintegration import in_gap
 from magfusion.estimation.graph.process_noise import ProcessNoise
+from magfusion.estimation.graph.reckoning_error import step_noise, step_transitions
 from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, VELOCITY, State
-from magfusion.estimation.online.reckoning_error import step_noise, step_transitions
 from magfusion.model.parameters import Block, corrected_imu, inertial_blocks, retract
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
@@ -64,7 +64,7 @@ class Passage:
         There, without bias (rad/s, m/s^2).
     transition : ndarray, shape (n, 15, 15 or 15 + calibration)
         From the tangent of the epoch's state to errors as
-        `magfusion.estimation.online.reckoning_error` has them.
+        `magfusion.estimation.graph.reckoning_error` has them.
     noise : ndarray, shape (n, 15, 15)
         Of such errors, since the epoch.
     """

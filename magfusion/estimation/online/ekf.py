@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from magfusion.errors import EstimationError
+from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.propagation import Propagated
 from magfusion.estimation.graph.state import (
     MOTION,
@@ -17,7 +18,6 @@ from magfusion.estimation.graph.state import (
     moved,
     states_of,
 )
-from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import leaves_out
 from magfusion.estimation.posterior.without_statistics import without_statistics
 from magfusion.model.altered import altered

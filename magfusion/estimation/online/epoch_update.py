@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 
 from magfusion.errors import EstimationError
+from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.propagation import Propagated
 from magfusion.estimation.graph.state import POSITION, ROTATION, State
 from magfusion.estimation.initialization.online import OnlineStart
+from magfusion.estimation.integrity.place_witness import of_place
 from magfusion.estimation.measurements.earth import EarthField, EarthWeight, speed_sigma
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
-from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.online.ekf import ErrorStateFilter
@@ -24,7 +25,6 @@ from magfusion.estimation.online_integrity.magnetometer_watch import Magnetomete
 from magfusion.estimation.online_integrity.near_metal import NearMetal
 from magfusion.estimation.online_integrity.online import Heard, OnlineWitness
 from magfusion.estimation.online_integrity.open_roll import roll_findings
-from magfusion.estimation.online_integrity.place_witness import of_place
 from magfusion.estimation.online_integrity.reckoned import Reckoned
 from magfusion.estimation.online_integrity.recovery import (
     AgreedFix,

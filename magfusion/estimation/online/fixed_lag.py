@@ -16,6 +16,7 @@ from magfusion.errors import EstimationError
 from magfusion.estimation.graph.factors import CALIBRATION_KEY, empty_factor
 from magfusion.estimation.graph.graph import Estimate, Graph
 from magfusion.estimation.graph.inertial import Link, inertial_factor
+from magfusion.estimation.graph.measurement import Measurement, joined
 from magfusion.estimation.graph.process_noise import ProcessNoise
 from magfusion.estimation.graph.propagation import Propagated
 from magfusion.estimation.graph.state import (
@@ -26,7 +27,6 @@ from magfusion.estimation.graph.state import (
     moved_to,
     values_of,
 )
-from magfusion.estimation.measurements.measurement import Measurement, joined
 from magfusion.estimation.solve.bordered import eliminate_partial
 from magfusion.model.parameters import Block, dimension, retract
 from magfusion.units import Array

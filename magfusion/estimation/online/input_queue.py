@@ -12,15 +12,16 @@ from magfusion.errors import InputError
 from magfusion.estimation.batch.settings import EstimatorSettings
 from magfusion.estimation.data_checks.detection import DetectionFilter
 from magfusion.estimation.data_checks.freeze import Freeze
+from magfusion.estimation.data_checks.stream_buffer import Buffer, check_clock
 from magfusion.estimation.demodulation.motion_compensation import (
     MotionCompensated,
     demodulate_predicted,
 )
+from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.preintegration import RATE_SPAN
 from magfusion.estimation.graph.state import MOTION, VELOCITY, State, as_trajectory
 from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
 from magfusion.estimation.measurements.earth import earth_measurement
-from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.model_error import alike_at
 from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.estimation.measurements.signs import OPEN_SIGN, count_open, with_signs
@@ -32,7 +33,6 @@ from magfusion.estimation.measurements.zero_velocity import (
 from magfusion.estimation.online.measured import Measured
 from magfusion.estimation.online.short_windows import ShortWindows
 from magfusion.estimation.online.stand_in import StandIn
-from magfusion.estimation.online.stream_buffer import Buffer, check_clock
 from magfusion.files.named_records import magnetometer_number
 from magfusion.model.marks import Marks
 from magfusion.model.parameters import CLOCK_RATE, TIME_OFFSET, Block

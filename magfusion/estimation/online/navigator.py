@@ -15,13 +15,13 @@ from magfusion.estimation.data_checks.freeze import imu_remarks
 from magfusion.estimation.data_checks.inertial_noise import measured_noise, with_white_noise
 from magfusion.estimation.demodulation.as_heard import fields_heard, samples_heard
 from magfusion.estimation.demodulation.drive_reference import drive_findings
+from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.process_noise import calibration_process_noise
 from magfusion.estimation.graph.propagation import Propagated, propagate
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.initialization.early import first_try, is_clear, next_try, open_start
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
 from magfusion.estimation.measurements.earth import check_earth
-from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.online.arrivals import arrivals_of
 from magfusion.estimation.online.carried import Departure
 from magfusion.estimation.online.ekf import ErrorStateFilter

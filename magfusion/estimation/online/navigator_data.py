@@ -13,16 +13,16 @@ import numpy as np
 
 from magfusion.estimation.batch.calibration_data import calibration_rules
 from magfusion.estimation.data_checks.running import Running
+from magfusion.estimation.data_checks.stream_buffer import Buffer
 from magfusion.estimation.graph.inertial import ROWS, Link, Steps
+from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, State, states_of
 from magfusion.estimation.measurements.earth import EarthField
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
-from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors, Predictions
 from magfusion.estimation.measurements.pose_fix import PoseFix
 from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
 from magfusion.estimation.online.fixed_lag import Node, Prior, SlidingWindow
-from magfusion.estimation.online.stream_buffer import Buffer
 from magfusion.estimation.online_integrity.bank import SubsetBank
 from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
 from magfusion.estimation.online_integrity.levels import Levels

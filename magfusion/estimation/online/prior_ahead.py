@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from magfusion.estimation.graph.reckoning_error import step_noise, step_transitions
 from magfusion.estimation.online.carried import Passage
-from magfusion.estimation.online.reckoning_error import step_noise, step_transitions
 from magfusion.model.platform_motion import ImuModel
 from magfusion.model.strapdown_steps import steps_of
 from magfusion.model.without_imu import LONGEST_STEP

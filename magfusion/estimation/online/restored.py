@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.estimation.measurements.measurement import Measurement
+from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.online.navigator import Navigator
 from magfusion.estimation.online.navigator_data import navigator_rules
 from magfusion.estimation.online.navigator_settings import NavigatorSettings

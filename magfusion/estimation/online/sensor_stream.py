@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from magfusion.estimation.data_checks.stream_buffer import Buffer
 from magfusion.estimation.demodulation.motion_compensation import (
     MotionCompensated,
     demodulate_predicted,
 )
 from magfusion.estimation.graph.state import State
-from magfusion.estimation.online.stream_buffer import Buffer
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.lockin_receiver import LockinReceiver

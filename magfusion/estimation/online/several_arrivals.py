@@ -11,6 +11,7 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.settings import EstimatorSettings
+from magfusion.estimation.data_checks.stream_buffer import check_clock
 from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
 from magfusion.estimation.demodulation.several_demodulation import same_windows
 from magfusion.estimation.demodulation.warming import refuse_warm
@@ -19,7 +20,6 @@ from magfusion.estimation.initialization.online import NoStart, OnlineStart, fin
 from magfusion.estimation.online.input_queue import LONGEST_WAIT, MARGIN, Arrivals
 from magfusion.estimation.online.measured import Measured
 from magfusion.estimation.online.sensor_stream import SensorStream
-from magfusion.estimation.online.stream_buffer import check_clock
 from magfusion.files.fields import SAME_TIME, side_by_side
 from magfusion.files.named_records import magnetometer_number
 from magfusion.model.marks import Marks

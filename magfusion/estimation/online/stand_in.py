@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from magfusion.estimation.data_checks.stream_buffer import Buffer
 from magfusion.estimation.graph.state import State
-from magfusion.estimation.online.stream_buffer import Buffer
 from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.receiver.admission import Admission, longest_step, silences
 from magfusion.units import Array

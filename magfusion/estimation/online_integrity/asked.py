@@ -6,11 +6,11 @@ from functools import cached_property
 
 import numpy as np
 
+from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.integrity.held import gains
 from magfusion.estimation.integrity.suspects import Suspect, held_blocks, suspects
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
-from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.model.parameters import BeaconParameter, Block, dimension, prior_sigma
 from magfusion.model.prior import prior_sqrt_covariance

@@ -10,11 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.graph.measurement import Measurement, Rows, joined, kind_of
 from magfusion.estimation.graph.state import MOTION, State, states_of
 from magfusion.estimation.integrity.suspects import Inertial, Stream
 from magfusion.estimation.measurements.earth import EarthField
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
-from magfusion.estimation.measurements.measurement import Measurement, Rows, joined, kind_of
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
 from magfusion.estimation.online_integrity.asked import Asked

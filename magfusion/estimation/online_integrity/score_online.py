@@ -12,10 +12,10 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from magfusion.estimation.data_checks.statistics import SURE
+from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.state import MOTION, State, states_of
 from magfusion.estimation.integrity.held import COVERED, Freed, finding_of, freed_by
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.online_integrity.asked import Asked, heard_in, of_beacons_named
 from magfusion.estimation.online_integrity.judgement import Judgement

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.estimation.data_checks.stream_buffer import Buffer, check_clock
 from magfusion.estimation.demodulation.demodulation import gravity_at_rest
-from magfusion.estimation.online.stream_buffer import Buffer, check_clock
 from magfusion.estimation.rests.at_rest import (
     Rest,
     believed,

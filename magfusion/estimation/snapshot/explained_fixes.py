@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.estimation.integrity.gain_witness import gains_of
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
 from magfusion.estimation.snapshot.fix_separation import separate_fixes, separation_trust
 from magfusion.estimation.snapshot.fix_witness import judged_fixes
 from magfusion.estimation.snapshot.gain_spread import FEWEST, gain_spread
+from magfusion.estimation.snapshot.gain_witness import gains_of
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA
 from magfusion.model.parameters import Calibration

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from magfusion.estimation.integrity.separation import (
+from magfusion.estimation.posterior.separation import (
     Separation,
     linear_separation,
     protection_levels,

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.batch.strides import Strides
 from magfusion.estimation.graph.preintegration import BRIDGE_ACCEL_NOISE, BRIDGE_GYRO_NOISE
-from magfusion.estimation.initialization.strides import Strides
 from magfusion.estimation.snapshot.problem import nuisance_blocks
 from magfusion.estimation.snapshot.survey_error import whitened
 from magfusion.model.channel_effects import of_all_sensors

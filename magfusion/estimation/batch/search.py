@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.estimation.initialization.strides import Strides, strides_between
-from magfusion.estimation.initialization.tracks import (
+from magfusion.estimation.batch.strides import Strides, strides_between
+from magfusion.estimation.batch.tracks import (
     MOTION,
     Heard,
     Tracks,

@@ -13,13 +13,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.batch.chain import Start, choose_chains, start_of, start_phases
 from magfusion.estimation.demodulation.demodulation import fix_inputs
-from magfusion.estimation.initialization.chain import (
-    Start,
-    choose_chains,
-    start_of,
-    start_phases,
-)
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.fix_separation import separate_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
@@ -40,7 +35,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, IntArray
 
 if TYPE_CHECKING:
-    from magfusion.estimation.initialization.search import Found
+    from magfusion.estimation.batch.search import Found
 
 LEAST_DETECTED = 10  # epochs at which a beacon is detected; fewer give no start
 
@@ -100,7 +95,7 @@ def begin(
     tracked = epochs.signed and not roll_is_open(calibration.site)
     if not tracked or not _doubtful(chains):
         return out
-    from magfusion.estimation.initialization.search import can_search, search
+    from magfusion.estimation.batch.search import can_search, search
 
     if can_search(epochs):
         still = replace(imu, gyro_body=imu.gyro_body - _rest_bias(imu, calibration))
