@@ -11,7 +11,7 @@ from gtsam.symbol_shorthand import V
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.chain import Start
-from magfusion.estimation.batch.log_graph import PreparedLog, graph_of
+from magfusion.estimation.batch.log_graph import PreparedLog, graph_of, noise_of
 from magfusion.estimation.batch.on_new_clock import on_new_clock
 from magfusion.estimation.batch.prepared import prepared
 from magfusion.estimation.batch.settings import SmootherSettings as SmootherSettings
@@ -22,7 +22,6 @@ from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.measurements.earth import EarthField, check_earth, disturbed
 from magfusion.estimation.measurements.field_error import field_errors
 from magfusion.estimation.measurements.phasors import FieldPhasors, alone
-from magfusion.estimation.measurements.pose_fix import survey_response
 from magfusion.estimation.measurements.signs import count_open
 from magfusion.estimation.measurements.zero_velocity import may_stand, quiet_before
 from magfusion.estimation.posterior.convergence import last_move, refuse_open, settled_at
@@ -30,12 +29,12 @@ from magfusion.estimation.posterior.marginals import marginals
 from magfusion.estimation.posterior.noise_tuning import (
     Tuned,
     as_declared,
-    noise_of,
     plausible,
     with_noise,
 )
 from magfusion.estimation.posterior.noise_tuning import settled as same_noise
 from magfusion.estimation.posterior.relaxation import Step, part_of_the_way
+from magfusion.estimation.snapshot.survey_error import survey_response
 from magfusion.estimation.solve.bordered import Optimised, eliminate, marginal, optimise
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.model.parameters import Block, Calibration, placed

@@ -13,6 +13,7 @@ from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.demodulation.motion_shape import motion_at
+from magfusion.estimation.graph.considered import responses
 from magfusion.estimation.graph.preintegration import GAP_SAMPLES
 from magfusion.estimation.graph.reckoning_error import step_noise, step_transitions
 from magfusion.estimation.graph.state import MOTION
@@ -155,7 +156,7 @@ def _joint_cov(result: Smoothed) -> Array:
         response = np.zeros((len(keys), MOTION, result.fix_response.shape[2]))
         response[:, :6] = result.fix_response
     else:
-        steps = result.graph.responses(estimate, result.uncertain)
+        steps = responses(result.graph, estimate, result.uncertain)
         flat = [key for own in keys for key in own]
         parts = [step.vector(flat).reshape(-1, MOTION) for step in steps]
         response = np.stack(parts, axis=2) if parts else np.zeros((len(keys), MOTION, 0))

@@ -14,21 +14,24 @@ from magfusion.estimation.demodulation.close_log import looked_at, without_silen
 from magfusion.estimation.demodulation.demodulation import Demodulation
 from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
 from magfusion.estimation.graph.drift_segments import segments_of
-from magfusion.estimation.graph.graph import Graph, initial_estimate
+from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate
 from magfusion.estimation.graph.imu_decimation import preintegrate_stream
 from magfusion.estimation.graph.inertial import Link, Preintegrated, inertial_graph, links_between
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.preintegration import low_passed_rate_at
 from magfusion.estimation.measurements.earth import earth_measurement, unheld
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
+from magfusion.estimation.measurements.model_error import alike_in_batch
 from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
 from magfusion.estimation.measurements.pose_fix import pose_fixes
 from magfusion.estimation.measurements.signs import with_signs
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
+from magfusion.estimation.posterior.noise_tuning import Tuned, tune
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.one_axis import roll_is_open
 from magfusion.model.parameters import Block, Calibration, corrected_imu, dimension, placed
 from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields
+from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -297,3 +300,19 @@ def overlap(samples: FieldSamples) -> float:
 
 def _step(samples: FieldSamples) -> float:
     return float(np.median(np.diff(samples.time)))
+
+
+def noise_of(
+    log: PreparedLog,
+    graph: Graph,
+    estimate: Estimate,
+    states: Trajectory,
+    wave: MotionCompensated | None,
+    declared: Site,
+) -> tuple[Tuned, ...]:
+    """Return the noise of a log whose graph was solved with some phasors; see `tune`."""
+    samples, here = log.samples if wave is None else wave.fields, log.at_fields(states)
+    alike = alike_in_batch(here.position_world, declared.model_error_length)
+    blind = log.demodulation.blind
+    windows, held = overlap(samples), log.considered
+    return tune(graph, estimate, samples, here, declared, windows, alike, blind, held)

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.measurements.earth import AMBIENT_SHARE
 from magfusion.model.once import once_a_site
 from magfusion.model.perturbation import skew
+from magfusion.model.physics.earth import AMBIENT_SHARE
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding
 from magfusion.units import DEGREE, Array

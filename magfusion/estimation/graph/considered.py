@@ -1,23 +1,18 @@
 """What parameters that are held do to everything that a graph estimates."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
 
 from magfusion.estimation.graph.factors import CONSIDERED_KEY
+from magfusion.estimation.graph.graph import Estimate, Graph
 from magfusion.estimation.graph.prior_factor import prior_factor
 from magfusion.estimation.solve.bordered import eliminate_partial
 from magfusion.model.parameters import Block
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.units import Array
-
-if TYPE_CHECKING:
-    from magfusion.estimation.graph.graph import Estimate, Graph
 
 AT_ONCE = 2e8  # bytes; parameters that are held are taken in groups of so much
 PER_COLUMN = 400.0  # bytes that one of them takes of each state, in the graph and eliminated

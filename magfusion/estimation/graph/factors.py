@@ -15,7 +15,6 @@ from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.estimation.graph.measurement import Measurement, Rows
 from magfusion.estimation.graph.state import States
-from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.model.parameters import Block, Calibration
 from magfusion.units import Array, IntArray
 
@@ -123,12 +122,11 @@ class Factors:
 
     @cached_property
     def told(self) -> list[slice | IntArray]:
-        """Rows of each epoch's factor: all, or of many beacons those that are heard."""
-        epochs, measured = len(self.measurement.epoch), self.measurement
-        heard = measured.heard if isinstance(measured, FieldPhasors) else None
-        if heard is None:
-            return [slice(None)] * epochs
-        return [np.flatnonzero(np.repeat(own, 6)) for own in heard]
+        """Rows of each epoch's factor: all, or of many beacons those that are predicted."""
+        predicted = self.measurement.predicted_groups()
+        if predicted is None:
+            return [slice(None)] * len(self.measurement.epoch)
+        return [np.flatnonzero(np.repeat(own, 6)) for own in predicted]
 
     def pieces(self) -> Iterator["Factors"]:
         """Yield the factors of some epochs after the other: derivatives of all take much memory."""

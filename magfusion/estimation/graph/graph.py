@@ -7,7 +7,6 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from magfusion.estimation.graph.considered import responses
 from magfusion.estimation.graph.drift_segments import ONE_SEGMENT, Segments
 from magfusion.estimation.graph.factors import (
     CALIBRATION_KEY,
@@ -293,15 +292,6 @@ class Graph:
                 )
             )
         return graph
-
-    def responses(
-        self, estimate: Estimate, considered: tuple[Block, ...]
-    ) -> Iterator[gtsam.VectorValues]:
-        """Yield the steps that considered parameters cause.
-
-        As of `magfusion.estimation.graph.considered`.
-        """
-        return responses(self, estimate, considered)
 
 
 def initial_estimate(

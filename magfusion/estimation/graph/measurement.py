@@ -5,7 +5,7 @@ dataclass with these methods; nothing else changes.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import repeat
@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from magfusion.estimation.graph.state import MOTION, States
+from magfusion.estimation.graph.state import MOTION, State, States, states_of
 from magfusion.model.parameters import Block, Calibration, dimension
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -152,6 +152,10 @@ class Measurement(ABC):
         """Robust loss of each group of rows."""
         return None
 
+    def predicted_groups(self) -> BoolArray | None:
+        """Return which groups of rows are predicted, shape (n, groups); None for all."""
+        return None
+
     def rows(self, kept: BoolArray | slice) -> Self:
         """Return the measurement at some of its epochs."""
         return replace(
@@ -222,3 +226,16 @@ def group_distances(rows: Rows, cov: Array) -> Array:
 def calibration_rows(shape: tuple[int, ...], blocks: tuple[Block, ...]) -> Array:
     """Return derivatives by a calibration that are zero, to be filled."""
     return np.zeros((*shape, dimension(blocks)))
+
+
+def measured_rows(
+    measurements: Sequence[Measurement], state: State, blocks: tuple[Block, ...]
+) -> tuple[Array, Array]:
+    """Return whitened error (m,) and Jacobian (m, 15 + calibration) of what one epoch measured."""
+    size, errors, jacobians = len(state.cov), [np.zeros(0)], [np.zeros((0, len(state.cov)))]
+    for measurement in measurements:
+        rows = measurement.linearize(states_of([state]), state.calibration, blocks)
+        rows, _ = rows.weighed(measurement.loss)
+        errors.append(rows.error.reshape(-1))
+        jacobians.append(rows.jacobian(size - MOTION).reshape(-1, size))
+    return np.concatenate(errors), np.concatenate(jacobians)

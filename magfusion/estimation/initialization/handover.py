@@ -5,6 +5,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.graph.considered import responses
 from magfusion.estimation.graph.factors import CALIBRATION_KEY
 from magfusion.estimation.graph.graph import Estimate
 from magfusion.estimation.graph.state import State
@@ -63,7 +64,7 @@ def _with_considered(
         return cov
     last, size = len(result.states) - 1, dimension(considered)
     columns = []
-    for step in result.graph.responses(estimate, uncertain):
+    for step in responses(result.graph, estimate, uncertain):
         own = [step.at(X(last)), step.at(V(last)), step.at(B(last))]
         own += [step.at(CALIBRATION_KEY)] if result.blocks else []
         columns.append(np.concatenate(own))

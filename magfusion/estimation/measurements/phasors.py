@@ -91,6 +91,10 @@ class FieldPhasors(Measurement):
             return None
         return Loss(self.robust, 1.0 if self.excess is None else self.excess)
 
+    def predicted_groups(self) -> BoolArray | None:
+        """Return which channels are predicted, shape (n, channels); None for all."""
+        return self.heard
+
     def alone(self) -> "FieldPhasors":
         """Return the measurement whitened as if no other epoch had the same model error."""
         if self.excess is None:

@@ -8,34 +8,19 @@ from typing import Any
 import numpy as np
 
 from magfusion.errors import EstimationError
-from magfusion.estimation.graph.measurement import Measurement
+from magfusion.estimation.graph.measurement import Measurement, measured_rows
 from magfusion.estimation.graph.propagation import Propagated
 from magfusion.estimation.graph.state import (
-    MOTION,
     State,
     between,
     consider_update,
     moved,
-    states_of,
 )
 from magfusion.estimation.measurements.phasors import leaves_out
 from magfusion.estimation.posterior.without_statistics import without_statistics
 from magfusion.model.altered import altered
 from magfusion.model.parameters import Block
 from magfusion.units import Array
-
-
-def measured_rows(
-    measurements: Sequence[Measurement], state: State, blocks: tuple[Block, ...]
-) -> tuple[Array, Array]:
-    """Return whitened error (m,) and Jacobian (m, 15 + calibration) of what one epoch measured."""
-    size, errors, jacobians = len(state.cov), [np.zeros(0)], [np.zeros((0, len(state.cov)))]
-    for measurement in measurements:
-        rows = measurement.linearize(states_of([state]), state.calibration, blocks)
-        rows, _ = rows.weighed(measurement.loss)
-        errors.append(rows.error.reshape(-1))
-        jacobians.append(rows.jacobian(size - MOTION).reshape(-1, size))
-    return np.concatenate(errors), np.concatenate(jacobians)
 
 
 def telling_rows(

@@ -10,12 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.estimation.graph.measurement import Measurement
+from magfusion.estimation.graph.measurement import Measurement, measured_rows
 from magfusion.estimation.graph.propagation import Propagated
 from magfusion.estimation.graph.state import MOTION, State, between
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors, leaves_out
-from magfusion.estimation.online.ekf import measured_rows
 from magfusion.estimation.online_integrity.judgement import Judgement
 from magfusion.estimation.online_integrity.levels import Asked, Levels
 from magfusion.estimation.posterior.separation import LEAST, Separation, radii

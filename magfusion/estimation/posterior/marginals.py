@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from gtsam.symbol_shorthand import X
 
+from magfusion.estimation.graph.considered import responses
 from magfusion.estimation.graph.factors import CALIBRATION_KEY
 from magfusion.estimation.graph.graph import Estimate, Graph
 from magfusion.estimation.graph.state import MOTION
@@ -90,7 +91,7 @@ def marginals(
     del tree, linear
     if considered and graph.measurements:
         keys, by_pose, by_calibration = [X(i) for i in range(graph.epochs)], [], []
-        for step in graph.responses(estimate, considered):
+        for step in responses(graph, estimate, considered):
             by_pose.append(step.vector(keys).reshape(-1, 6))
             if graph.blocks:
                 by_calibration.append(step.at(CALIBRATION_KEY))

@@ -14,10 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from magfusion.estimation.batch.log_graph import PreparedLog, overlap
-from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
 from magfusion.estimation.graph.graph import Estimate, Graph
-from magfusion.estimation.measurements.model_error import alike_in_batch
 from magfusion.estimation.posterior.residual_shares import ChannelErrors, Leavings
 from magfusion.estimation.posterior.variance_components import BeaconErrors, likeliest, parts_of
 from magfusion.model.parameters import Block, Calibration
@@ -99,22 +96,6 @@ def settled(before: Sequence[Tuned], after: Sequence[Tuned]) -> bool:
     return all(
         abs(np.log(t.found / old.get((t.owner, t.key), t.declared))) < SETTLED for t in after
     )
-
-
-def noise_of(
-    log: PreparedLog,
-    graph: Graph,
-    estimate: Estimate,
-    states: Trajectory,
-    wave: MotionCompensated | None,
-    declared: Site,
-) -> tuple[Tuned, ...]:
-    """Return the noise of a log whose graph was solved with some phasors; see `tune`."""
-    samples, here = log.samples if wave is None else wave.fields, log.at_fields(states)
-    alike = alike_in_batch(here.position_world, declared.model_error_length)
-    blind = log.demodulation.blind
-    windows, held = overlap(samples), log.considered
-    return tune(graph, estimate, samples, here, declared, windows, alike, blind, held)
 
 
 def tune(
