@@ -21,7 +21,7 @@ from magfusion.estimation.online.navigator import NavigatorSettings
 from magfusion.jobs import JOBS
 from magfusion.jobs.calibrate_log import LogCalibrationSettings, run_calibrate_log
 from magfusion.jobs.inputs import Job, read_estimate
-from magfusion.jobs.navigate import NavigateSettings
+from magfusion.jobs.navigate_settings import NavigateSettings
 from magfusion.jobs.settings import Command, Settings, argument, option, options, required
 from magfusion.jobs.smooth import SmoothSettings, run_smooth
 from magfusion.model.groups import GROUPS

@@ -20,7 +20,8 @@ from magfusion.files.open import open_log
 from magfusion.files.site import save_site
 from magfusion.files.stream import json_line
 from magfusion.files.trajectory_table import read_trajectory
-from magfusion.jobs.navigate import NavigateSettings, run_navigate
+from magfusion.jobs.navigate import run_navigate
+from magfusion.jobs.navigate_settings import NavigateSettings
 from magfusion.jobs.replay import Replay, feed, run_replay
 from magfusion.jobs.stream import StreamSettings, run_stream
 from magfusion.model.samples import Log

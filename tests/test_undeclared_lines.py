@@ -13,7 +13,8 @@ from magfusion.estimation.demodulation.demodulation import phasors
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.jobs.inputs import Job
-from magfusion.jobs.navigate import NavigateSettings, run_navigate
+from magfusion.jobs.navigate import run_navigate
+from magfusion.jobs.navigate_settings import NavigateSettings
 from magfusion.jobs.smooth import run_smooth
 from magfusion.model.site import Site
 from magfusion.model.trust import Verdict

@@ -29,7 +29,7 @@ from magfusion.files.site import load_site
 from magfusion.files.trajectory_table import read_trajectory
 from magfusion.files.tum import read_tum
 from magfusion.jobs.receiver_axes import check_axes
-from magfusion.jobs.region import ANYWHERE, Where
+from magfusion.jobs.region_option import ANYWHERE, Where
 from magfusion.jobs.rotor_inputs import check_rotors, is_for_ranging
 from magfusion.jobs.written import CHECKPOINT as CHECKPOINT
 from magfusion.jobs.written import KEPT as KEPT

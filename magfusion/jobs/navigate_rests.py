@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from magfusion.estimation.rests.rest_stream import RestNavigator, RestState
     from magfusion.files.stream import Format, Record
     from magfusion.jobs.inputs import Job
-    from magfusion.jobs.navigate import NavigateSettings
+    from magfusion.jobs.navigate_settings import NavigateSettings
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
     from magfusion.model.trust import Risk, Trust

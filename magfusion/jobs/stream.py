@@ -29,7 +29,7 @@ from magfusion.files.stream import (
 )
 from magfusion.jobs.checkpoint import begin, save
 from magfusion.jobs.live import LiveSettings, StateSink, state_sinks
-from magfusion.jobs.region import ANYWHERE, Where
+from magfusion.jobs.region_option import ANYWHERE, Where
 from magfusion.jobs.rotor_inputs import AwaitedAngles, check_streamed_rotors
 from magfusion.model.marks import Marks
 from magfusion.model.quaternion import of_matrices
