@@ -1,56 +1,52 @@
 """The whole offline estimate of one log: start, passes over the waveform, posterior."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
-from gtsam.symbol_shorthand import V
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.chain import Start
-from magfusion.estimation.batch.log_graph import PreparedLog, graph_of, noise_of
-from magfusion.estimation.batch.on_new_clock import on_new_clock
+from magfusion.estimation.batch.log_graph import PreparedLog, noise_of
+from magfusion.estimation.batch.outer_iteration import (
+    advance,
+    begin_passes,
+    demodulate_about,
+    nothing_moved,
+    plan_pass,
+    relax,
+    retune,
+    solve_about,
+)
+from magfusion.estimation.batch.passes import PassFile
 from magfusion.estimation.batch.prepared import prepared
 from magfusion.estimation.batch.settings import SmootherSettings as SmootherSettings
 from magfusion.estimation.data_checks.mending import mended
 from magfusion.estimation.demodulation.hearing import heard_site
-from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate, read_states
+from magfusion.estimation.graph.graph import Estimate, Graph, read_states
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.measurements.earth import EarthField, check_earth, disturbed
 from magfusion.estimation.measurements.field_error import field_errors
 from magfusion.estimation.measurements.phasors import FieldPhasors, alone
 from magfusion.estimation.measurements.signs import count_open
-from magfusion.estimation.measurements.zero_velocity import may_stand, quiet_before
-from magfusion.estimation.posterior.convergence import last_move, refuse_open, settled_at
+from magfusion.estimation.measurements.zero_velocity import quiet_before
+from magfusion.estimation.posterior.convergence import last_move, refuse_open
 from magfusion.estimation.posterior.marginals import marginals
 from magfusion.estimation.posterior.noise_tuning import (
     Tuned,
-    as_declared,
-    plausible,
-    with_noise,
 )
-from magfusion.estimation.posterior.noise_tuning import settled as same_noise
-from magfusion.estimation.posterior.relaxation import Step, part_of_the_way
 from magfusion.estimation.snapshot.survey_error import survey_response
-from magfusion.estimation.solve.bordered import Optimised, eliminate, marginal, optimise
+from magfusion.estimation.solve.bordered import Optimised, optimise
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.model.parameters import Block, Calibration, placed
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import FieldSamples, Log
-from magfusion.model.site import MotionModel, Site
+from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.without_imu import logged, require_motion_prior
 from magfusion.units import Array, BoolArray, IntArray
 
-if TYPE_CHECKING:
-    from magfusion.estimation.batch.passes import PassFile
-
 QUIET = 0.3  # sigmas; a last pass that moved the poses by less has converged all the same
-ON_THE_WAY, CONVERGED = 1e-4, 1e-6  # relative decrease of the cost at which a pass ends
-TUNINGS = 3  # passes after which the noise is found anew; then it stays as it is
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,105 +188,52 @@ def smooth(
 def _solved(
     log: PreparedLog, settings: SmootherSettings, report: Report, passes: PassFile | None = None
 ) -> Smoothed:
-    states, calibration, wave = log.states, log.declared, None
-    segments: tuple[Calibration, ...] = ()
-    declared = log.declared.site
-    tuning = settings.tune and log.fixes is None and log.samples.signed
-    time, motion = states.time, log.declared.site.platform.motion
-    calm = quiet_before(log.imu, time - calibration.imu_offset(time), motion)
-    standing = log.samples.at_rest(time)
-    by_waveform = log.fixes is None and log.demodulation.anew
-    iterations, done, settled = 0, 0, False
-    tuned: tuple[Tuned, ...] = ()
-    step: Step | None = None
-    first = log.declared
+    """Solve a log, pass by pass until nothing moves, and return its posterior."""
+    first, time, steps = log.declared, log.states.time, settings.passes + 3
+    calm = quiet_before(log.imu, time - first.imu_offset(time), first.site.platform.motion)
     known = None if passes is None else passes.begun(log)
-    if known is not None:
-        log = replace(log, declared=known.declared)
-        states, calibration, segments = known.states, known.calibration, known.segments
-        standing, tuned, tuning, step = known.standing, known.tuned, known.tuning, known.step
-        iterations, done = known.iterations, known.done
-    while done < settings.passes and not settled:
-        report(f"pass {done + 1}", done + 2, settings.passes + 3)
-        if done > 0 and by_waveform:
-            wave = log.compensated(calibration, states)
+    now = begin_passes(log, settings) if known is None else known
+    log = replace(log, declared=now.declared)
+    while True:
+        report(f"pass {now.done + 1}", now.done + 2, steps)
+        plan, wave = plan_pass(log, now, settings), demodulate_about(log, now)
+        solved = solve_about(log, now, wave, calm, plan)
+        before, now = now, advance(now, solved)
+        settled = nothing_moved(before, now, solved)
+        if plan.finds_noise:
             give_back_memory()
-        elif not log.samples.signed:
-            wave = log.with_signs(calibration, states, first=done == 0)
-        # Another pass is sure to come.
-        short = (done == 0 or tuning) and done + 1 < settings.passes
-        tolerance = ON_THE_WAY if short else CONVERGED
-        # The noise that stays is told from the residuals by the sigmas as they are.
-        finds = tuning and (done > 0 or not by_waveform)
-        roughly = short and not (finds and done >= TUNINGS)
-        graph, gaps = graph_of(log, states, calibration, wave, standing, roughly=roughly)
-        begun = initial_estimate(states, calibration, segments)
-        found = optimise(graph, begun, tolerance=tolerance)
-        after = read_states(found.estimate.values, time)
-        stood = _at_rest(graph, found.estimate, after, calm & ~standing, motion)
-        if np.any(stood):  # at once: it costs no preintegration
-            graph = replace(graph, measurements=(*graph.measurements, log.rests(stood)))
-            iterations += found.iterations
-            found = optimise(graph, found.estimate, tolerance=tolerance)
-            after = read_states(found.estimate.values, time)
-        settled = (
-            done > 0
-            and not np.any(stood)
-            and settled_at(states, after, calibration, found.estimate.calibration)
-        )
-        before, states = states, after
-        old, calibration = calibration, found.estimate.calibration
-        standing = standing | stood
-        segments = found.estimate.segments
-        if finds:
-            give_back_memory()
-            latest = noise_of(log, graph, found.estimate, states, wave, declared)
-            again = roughly or (done < TUNINGS and not same_noise(tuned, latest))
-            tuning = again and plausible(latest)
-            tuned, settled = latest if plausible(latest) else as_declared(latest), False
-            log = replace(log, declared=with_noise(log.declared, tuned))
-            calibration = with_noise(calibration, tuned)
-            segments = tuple(with_noise(segment, tuned) for segment in segments)
-        iterations, done = iterations + found.iterations, done + 1
-        if not settled and done < settings.passes:
-            step = Step.of(step, before, states, old, calibration)
-            moved = before, states, old, calibration
-            states, calibration = part_of_the_way(*moved, graph.blocks, step.share)
-            states = on_new_clock(log, states, old, calibration, standing)
-            del graph, found  # of a long log they are most of what there is
-            give_back_memory()
-            if passes is not None:
-                from magfusion.estimation.batch.passes import Passed
-
-                passed = Passed(
-                    done=done,
-                    iterations=iterations,
-                    tuning=tuning,
-                    states=states,
-                    declared=log.declared,
-                    calibration=calibration,
-                    segments=segments,
-                    standing=standing,
-                    tuned=tuned,
-                    step=step,
-                )
-                passes.keep(passed, first, log.blocks)
-    report("posterior", settings.passes + 2, settings.passes + 3)
+            latest = noise_of(
+                log, solved.graph, solved.found.estimate, now.states, wave, first.site
+            )
+            now, settled = retune(before, now, latest, plan), False
+            log = replace(log, declared=now.declared)
+        if settled or now.done >= settings.passes:
+            break
+        now = relax(log, before, now, solved.graph.blocks)
+        del solved  # of a long log it is most of what there is
+        give_back_memory()
+        if passes is not None:
+            passes.keep(now, first, log.blocks)
+    report("posterior", steps - 1, steps)
     # What the receiver keeps for another pass is not needed any more.
     log = replace(log, demodulation=replace(log.demodulation, receiver=None))
     give_back_memory()
-    fields = log.samples if wave is None else wave.fields
-    result = posterior(log, graph, found, fields, gaps)
-    report("done", settings.passes + 3, settings.passes + 3)
+    found, fields = solved.found, log.samples if wave is None else wave.fields
+    result = posterior(log, solved.graph, found, fields, solved.gaps)
+    report("done", steps, steps)
     refuse_open(result.states)
-    move = (
-        0.0
-        if settled and found.converged
-        else last_move(before, result.states, None if found.converged else (graph, found.estimate))
-    )
-    result = replace(result, noise=tuned, standing=standing)
+    move = 0.0
+    if not (settled and found.converged):
+        unfinished = None if found.converged else (solved.graph, found.estimate)
+        move = last_move(before.states, result.states, unfinished)
     return replace(
-        result, passes=done, iterations=iterations, converged=move < QUIET, last_move=move
+        result,
+        noise=now.tuned,
+        standing=now.standing,
+        passes=now.done,
+        iterations=now.iterations,
+        converged=move < QUIET,
+        last_move=move,
     )
 
 
@@ -321,20 +264,6 @@ def solved_again(result: Smoothed, measurements: tuple[Measurement, ...]) -> Smo
         cost=found.cost,
         iterations=result.iterations + found.iterations,
     )
-
-
-def _at_rest(
-    graph: Graph, estimate: Estimate, states: Trajectory, asked: BoolArray, motion: MotionModel
-) -> BoolArray:
-    """Return at which of some epochs with a quiet IMU the platform is at rest."""
-    out = np.zeros(len(asked), dtype=bool)
-    if np.any(asked):
-        assert states.velocity_world is not None
-        tree = eliminate(graph.linearized(estimate), graph.ordering)
-        rows = np.flatnonzero(asked)
-        cov = np.array([marginal(tree, V(i), 3) for i in rows.tolist()])
-        out[rows] = may_stand(states.velocity_world[rows], cov, motion)
-    return out
 
 
 def posterior(
