@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -137,7 +138,6 @@ def _with_tones(
 ) -> tuple[list[BeaconDraft], list[Finding]]:
     """Return the beacons with the tones of the recording, and what the two say of each other."""
     from magfusion.files.site_draft import BeaconDraft
-    from magfusion.model.trust import Finding
 
     silent = [beacon.name for beacon in beacons if beacon.frequency_hz is None]
     if heard is None:
@@ -147,19 +147,9 @@ def _with_tones(
                 " --log, in which to find it"
             )
         return beacons, []
-    declared = [f for beacon in beacons for f in beacon.frequency_hz or ()]
-    free = [t for t in heard.tones if all(abs(t.frequency_hz - f) > NEAR_HZ for f in declared)]
-    findings = [
-        Finding(
-            "silent_beacon",
-            f"beacon {beacon.name} is not heard at {f:g} Hz in the recording: it is switched off,"
-            f" far away, or its frequency is another ({_listed(free) or 'no other stands out'}).",
-        )
-        for beacon in beacons
-        for f in beacon.frequency_hz or ()
-        if all(abs(tone.frequency_hz - f) > NEAR_HZ for tone in heard.tones)
-    ]
-    if silent and (len(silent) > 1 or len(free) != 1):
+    free = _free_tones(beacons, heard.tones)
+    findings = _switched_off(beacons, heard.tones, free)
+    if len(silent) > 1 or (silent and len(free) != 1):
         raise InputError(
             f"--beacon {silent[0]}: frequency_hz is missing, and the recording does not tell it:"
             f" {_listed(free) or 'no other tone'} stands out; give frequency_hz"
@@ -169,14 +159,49 @@ def _with_tones(
         return [_of_tone(BeaconDraft(name), tone) for name, tone in tones], findings
     if silent:
         return [_of_tone(b, free[0]) if b.frequency_hz is None else b for b in beacons], findings
-    findings += [
+    return beacons, findings + _undeclared(free)
+
+
+def _near(tone: Tone, frequencies_hz: Iterable[float]) -> bool:
+    """Tell whether a tone is at one of some frequencies."""
+    return any(abs(tone.frequency_hz - f) <= NEAR_HZ for f in frequencies_hz)
+
+
+def _free_tones(beacons: list[BeaconDraft], tones: Iterable[Tone]) -> list[Tone]:
+    """Return the tones that are at no beacon's frequency."""
+    declared = [f for beacon in beacons for f in beacon.frequency_hz or ()]
+    return [tone for tone in tones if not _near(tone, declared)]
+
+
+def _switched_off(
+    beacons: list[BeaconDraft], tones: Iterable[Tone], free: list[Tone]
+) -> list[Finding]:
+    """Return which frequencies of beacons are not in a recording, and what else is."""
+    from magfusion.model.trust import Finding
+
+    return [
+        Finding(
+            "silent_beacon",
+            f"beacon {beacon.name} is not heard at {f:g} Hz in the recording: it is switched off,"
+            f" far away, or its frequency is another ({_listed(free) or 'no other stands out'}).",
+        )
+        for beacon in beacons
+        for f in beacon.frequency_hz or ()
+        if not any(_near(tone, (f,)) for tone in tones)
+    ]
+
+
+def _undeclared(tones: Iterable[Tone]) -> list[Finding]:
+    """Return that some tones of a recording are of no beacon."""
+    from magfusion.model.trust import Finding
+
+    return [
         Finding(
             "undeclared_line",
             f"{_listed([tone])} transmits in the recording, and no --beacon has this frequency.",
         )
-        for tone in free
+        for tone in tones
     ]
-    return beacons, findings
 
 
 def _names() -> list[str]:
