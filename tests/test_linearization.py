@@ -8,13 +8,13 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.ekf import ErrorStateFilter
-from magfusion.estimation.fixed_lag import SlidingWindow
+from magfusion.estimation.graph.process_noise import ProcessNoise
+from magfusion.estimation.graph.propagation import Propagated, propagate
+from magfusion.estimation.graph.state import MOTION, State, between, states_of
 from magfusion.estimation.measurements.linearization import is_curved, relinearized
 from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
-from magfusion.estimation.process_noise import ProcessNoise
-from magfusion.estimation.propagation import Propagated, propagate
-from magfusion.estimation.state import MOTION, State, between, states_of
+from magfusion.estimation.online.ekf import ErrorStateFilter
+from magfusion.estimation.online.fixed_lag import SlidingWindow
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, State, states_of
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.state import MOTION, POSITION, ROTATION, State, states_of
 from magfusion.model.parameters import Block
 from magfusion.units import Array
 

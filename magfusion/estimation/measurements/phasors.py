@@ -7,14 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.measurements.measurement import (
-    Loss,
-    Measurement,
-    Rows,
-    group_distances,
-)
+from magfusion.estimation.graph.measurement import Loss, Measurement, Rows, group_distances
+from magfusion.estimation.graph.state import State, States, pose_steps, states_of
 from magfusion.estimation.measurements.signs import whitened_along
-from magfusion.estimation.state import State, States, pose_steps, states_of
 from magfusion.model.audibility import are_many
 from magfusion.model.field import skew
 from magfusion.model.noise import (
@@ -99,6 +94,10 @@ class FieldPhasors(Measurement):
         if self.robust is None:
             return None
         return Loss(self.robust, 1.0 if self.excess is None else self.excess)
+
+    def predicted_groups(self) -> BoolArray | None:
+        """Return which channels are predicted, shape (n, channels); None for all."""
+        return self.heard
 
     def alone(self) -> "FieldPhasors":
         """Return the measurement whitened as if no other epoch had the same model error."""
@@ -338,7 +337,7 @@ def field_phasors(
     repeats : float
         How many epochs hold each sample of overlapping windows: that must not count twice.
     by_time_offset : complex ndarray, shape (n, channels, 3), optional
-        As of `magfusion.estimation.motion_compensation.WaveFields`.
+        As of `magfusion.estimation.demodulation.motion_compensation.WaveFields`.
     alike : ndarray, shape (n,), or float
         How many epochs have the same model error; no fewer than windows hold a sample.
     standing : bool ndarray, shape (n,), optional
