@@ -28,11 +28,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from magfusion.errors import EstimationError as EstimationError
     from magfusion.errors import InputError as InputError
-    from magfusion.estimation.batch import SmootherSettings as SmootherSettings
-    from magfusion.estimation.batch import smooth as smooth
+    from magfusion.estimation.batch.batch import SmootherSettings as SmootherSettings
+    from magfusion.estimation.batch.batch import smooth as smooth
     from magfusion.estimation.integrity.judge import judged as judged
-    from magfusion.estimation.navigator import Navigator as Navigator
-    from magfusion.estimation.navigator import NavigatorSettings as NavigatorSettings
+    from magfusion.estimation.online.navigator import Navigator as Navigator
+    from magfusion.estimation.online.navigator import NavigatorSettings as NavigatorSettings
     from magfusion.estimation.snapshot.likelihood import fix_epochs as fix_epochs
     from magfusion.files.open import open_log as open_log
     from magfusion.files.site import load_site as load_site
@@ -48,10 +48,10 @@ _HOMES = {
     "EstimationError": "errors",
     "InputError": "errors",
     "Log": "model.samples",
-    "Navigator": "estimation.navigator",
-    "NavigatorSettings": "estimation.navigator",
+    "Navigator": "estimation.online.navigator",
+    "NavigatorSettings": "estimation.online.navigator",
     "Site": "model.site",
-    "SmootherSettings": "estimation.batch",
+    "SmootherSettings": "estimation.batch.batch",
     "Trajectory": "model.trajectory",
     "fix_epochs": "estimation.snapshot.likelihood",
     "judged": "estimation.integrity.judge",
@@ -59,7 +59,7 @@ _HOMES = {
     "open_log": "files.open",
     "save_site": "files.site",
     "simulate_log": "simulation.log",
-    "smooth": "estimation.batch",
+    "smooth": "estimation.batch.batch",
     "trajectory_errors": "results.errors",
 }
 __all__ = list(_HOMES)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.fieldmap import MapPoints, learn_field_map
-from magfusion.estimation.integrity.explained_fixes import explained_fixes
+from magfusion.estimation.snapshot.explained_fixes import explained_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.files.survey import Survey
 from magfusion.model.parameters import initial_calibration

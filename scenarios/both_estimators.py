@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from harness import rms
 
-from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.graph.state import as_trajectory
 from magfusion.estimation.integrity.judge import judged
-from magfusion.estimation.integrity.judgement import JudgedState
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import as_trajectory
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.jobs.replay import Replay, feed
 from magfusion.model.samples import Log
 from magfusion.model.site import Site

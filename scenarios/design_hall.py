@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from harness import conclude, scenario_parser
 
-from magfusion.estimation.integrity.fix_separation import separate_fixes
+from magfusion.estimation.snapshot.fix_separation import separate_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.hall import Hall, Mounts, Prism, mounting_places, points_of_use
 from magfusion.model.parameters import initial_calibration

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from harness import conclude, scenario_parser
 
-from magfusion.estimation.batch import smooth
+from magfusion.estimation.batch.batch import smooth
 from magfusion.jobs.drift_world import STRETCH, WorldTask, draw_task
 from magfusion.model.samples import FieldSamples, ImuSamples, Log
 from magfusion.model.site import Site

@@ -15,7 +15,7 @@ import numpy as np
 from both_estimators import Row, rows_of, table
 from harness import conclude, scenario_parser
 
-from magfusion.estimation.drive_reference import with_drives
+from magfusion.estimation.demodulation.drive_reference import with_drives
 from magfusion.model.drive import DriveSamples
 from magfusion.model.samples import Log
 from magfusion.model.site import Beacon, Site

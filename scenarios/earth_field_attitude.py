@@ -26,10 +26,10 @@ from harness import conclude, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.calibration.magnetometer_log import calibrate_log
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.demodulation import demodulated
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import as_trajectory
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.demodulation.demodulation import demodulated
+from magfusion.estimation.graph.state import as_trajectory
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site
 from magfusion.model.parameters import initial_calibration

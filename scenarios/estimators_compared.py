@@ -28,10 +28,10 @@ from typing import Literal
 import numpy as np
 from harness import blank_figure, conclude, save_picture, scenario_parser
 
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.demodulation import first_fixes, phasors
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import State, as_trajectory
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.demodulation.demodulation import first_fixes, phasors
+from magfusion.estimation.graph.state import State, as_trajectory
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site
 from magfusion.model.parameters import initial_calibration

@@ -17,8 +17,8 @@ import numpy as np
 from harness import conclude, rms, scenario_parser
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.at_rest import AtRest, at_rest
-from magfusion.estimation.demodulation import first_fixes
+from magfusion.estimation.demodulation.demodulation import first_fixes
+from magfusion.estimation.rests.at_rest import AtRest, at_rest
 from magfusion.model.ground import in_ground
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import Log

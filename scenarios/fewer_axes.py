@@ -18,12 +18,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from harness import conclude, rms, scenario_parser
 
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.demodulation import demodulated
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.demodulation.demodulation import demodulated
+from magfusion.estimation.graph.state import as_trajectory
 from magfusion.estimation.integrity.judge import judged
-from magfusion.estimation.integrity.judgement import JudgedState
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import as_trajectory
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.jobs.fix_coil import find_coil
 from magfusion.jobs.replay import Replay, feed
 from magfusion.model.progress import quiet

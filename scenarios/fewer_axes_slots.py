@@ -16,8 +16,8 @@ from fewer_axes import INSIDE, MOST, Row, filtered, row_of, smoothed, with_axes
 from harness import conclude, scenario_parser
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import as_trajectory
+from magfusion.estimation.graph.state import as_trajectory
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.jobs.replay import Replay, feed
 from magfusion.model.region import HalfSpace, Region
 from magfusion.model.samples import Log

@@ -22,9 +22,9 @@ from harness import Scale, chosen_scale, conclude, scenario_parser
 from integrity import SIGMA, room, upper_limit
 from integrity import Config as Room
 
-from magfusion.estimation.integrity.judgement import JudgedState
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import POSITION
+from magfusion.estimation.graph.state import POSITION
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.jobs.replay import Replay, feed
 from magfusion.model.samples import FieldSamples, Log
 from magfusion.model.trust import Risk, Verdict

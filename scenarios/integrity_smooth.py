@@ -22,7 +22,7 @@ from integrity_runs import Config as Walk
 from integrity_runs import simulated
 
 from magfusion.errors import EstimationError
-from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.jobs.smooth_result import finished
 from magfusion.model.samples import Log
 from magfusion.model.trajectory import Trajectory

@@ -23,7 +23,7 @@ from harness import conclude, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.integrity.mending import mended
+from magfusion.estimation.data_checks.mending import mended
 from magfusion.jobs.calibrate_magnetometer import calibrated, estimates_of
 from magfusion.model.platform_motion import NO_IMU
 from magfusion.model.samples import ImuSamples, Log, Waveform

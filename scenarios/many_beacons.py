@@ -25,9 +25,9 @@ import numpy as np
 from harness import conclude, rms, scenario_parser
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.batch import smooth
-from magfusion.estimation.navigator import Navigator
-from magfusion.estimation.navigator_settings import NavigatorSettings
+from magfusion.estimation.batch.batch import smooth
+from magfusion.estimation.online.navigator import Navigator
+from magfusion.estimation.online.navigator_settings import NavigatorSettings
 from magfusion.model.audibility import largest_fields, phasor_sigma
 from magfusion.model.samples import Log
 from magfusion.model.site import Beacon, BeaconSigma, Coil, Site

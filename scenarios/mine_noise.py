@@ -12,7 +12,7 @@ import numpy as np
 from far_and_weak import far_site
 from harness import conclude, scenario_parser
 
-from magfusion.estimation.at_rest import at_rest
+from magfusion.estimation.rests.at_rest import at_rest
 from magfusion.model.ground import in_ground
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import Site

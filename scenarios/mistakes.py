@@ -158,10 +158,11 @@ def _run_job(estimator: str, log: Path, output: Path) -> None:
 
         smooth.run(smooth.SmoothSettings(log=log), output)
         return
-    from magfusion.jobs import navigate
+    from magfusion.jobs.navigate import run_navigate
+    from magfusion.jobs.navigate_settings import NavigateSettings
 
-    settings = navigate.NavigateSettings(log=log, estimator=estimator)
-    navigate.run_navigate(settings, output)
+    settings = NavigateSettings(log=log, estimator=estimator)
+    run_navigate(settings, output)
 
 
 def _row(task: Task, estimator: str, code: int, report: dict, said: str, seconds: float) -> Row:

@@ -21,7 +21,7 @@ from harness import conclude, rms, scenario_parser
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.integrity.judge import judged
 from magfusion.jobs.calibrate_log import against_site, grown
 from magfusion.model.parameters import (

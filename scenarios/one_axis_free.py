@@ -16,7 +16,11 @@ from fewer_axes import Row, filtered, row_of, smoothed
 from harness import conclude, scenario_parser
 from unsigned_amplitudes import BOX, SIGMA, floor
 
-from magfusion.estimation.integrity.open_roll import comparable, roll_findings, with_open_roll
+from magfusion.estimation.online_integrity.open_roll import (
+    comparable,
+    roll_findings,
+    with_open_roll,
+)
 from magfusion.model.one_axis import axis_of
 from magfusion.model.platform_motion import NO_IMU, MotionPrior
 from magfusion.model.samples import ImuSamples, Log

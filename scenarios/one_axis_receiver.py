@@ -27,7 +27,7 @@ from tracker_coils import loop_field
 
 from magfusion.jobs.fix import run_fix
 from magfusion.jobs.inputs import Job
-from magfusion.jobs.region import Where
+from magfusion.jobs.region_option import Where
 from magfusion.units import Array
 
 PITCH, ACROSS = 0.1, 4  # m; coils stand in a square

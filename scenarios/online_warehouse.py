@@ -15,8 +15,8 @@ from typing import Literal
 import numpy as np
 from harness import blank_figure, conclude, save_picture, scenario_parser
 
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import State, as_trajectory
+from magfusion.estimation.graph.state import State, as_trajectory
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Coil, Site
 from magfusion.model.trajectory import Trajectory

@@ -24,9 +24,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom, chi2
 
 from magfusion.errors import EstimationError
-from magfusion.estimation.batch import smooth
-from magfusion.estimation.demodulation import phasors
-from magfusion.estimation.initialization.offline import OfflineStart, begin
+from magfusion.estimation.batch.batch import smooth
+from magfusion.estimation.batch.offline import OfflineStart, begin
+from magfusion.estimation.demodulation.demodulation import phasors
 from magfusion.estimation.integrity.judge import judged
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples

@@ -29,8 +29,8 @@ from mine_noise import KINDS, RATE_HZ, SIGMA, Interference, mine_log
 from mine_noise import Config as MineConfig
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.at_rest import AtRest, at_rest
-from magfusion.estimation.rest_stream import RestNavigator, RestState
+from magfusion.estimation.rests.at_rest import AtRest, at_rest
+from magfusion.estimation.rests.rest_stream import RestNavigator, RestState
 from magfusion.jobs.navigate_rests import replayed
 from magfusion.model.samples import FieldSamples, Log, Waveform
 from magfusion.model.site import Site

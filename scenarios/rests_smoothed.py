@@ -22,11 +22,11 @@ from harness import conclude, rms, scenario_parser
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.at_rest import at_rest
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.demodulation import first_fixes
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.demodulation.demodulation import first_fixes
 from magfusion.estimation.integrity.judge import judged
-from magfusion.estimation.rest_stream import RestNavigator
+from magfusion.estimation.rests.at_rest import at_rest
+from magfusion.estimation.rests.rest_stream import RestNavigator
 from magfusion.jobs.navigate_rests import replayed
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import Log

@@ -29,10 +29,10 @@ import gtsam
 import numpy as np
 from harness import conclude, rms, scenario_parser
 
-from magfusion.estimation.ranging import Ranged, find_range
-from magfusion.estimation.ranging_data import SHARE, RangingWindows
-from magfusion.estimation.ranging_windows import DepthErrors, ranging_log
-from magfusion.estimation.relative_wells import Wells
+from magfusion.estimation.ranging.ranging import Ranged, find_range
+from magfusion.estimation.ranging.ranging_data import SHARE, RangingWindows
+from magfusion.estimation.ranging.ranging_windows import DepthErrors, ranging_log
+from magfusion.estimation.ranging.relative_wells import Wells
 from magfusion.model.physics.casing import Casing
 from magfusion.model.rotor import Rotor
 from magfusion.model.samples import Log

@@ -18,8 +18,8 @@ import numpy as np
 from harness import blank_figure, chosen_scale, conclude, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.batch import SmootherSettings
-from magfusion.estimation.self_survey import smooth_and_place
+from magfusion.estimation.batch.batch import SmootherSettings
+from magfusion.estimation.batch.self_survey import smooth_and_place
 from magfusion.model.parameters import Block
 from magfusion.model.progress import quiet
 from magfusion.model.site import Beacon, Site, Unknown

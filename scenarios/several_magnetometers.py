@@ -17,12 +17,12 @@ from scipy.spatial.transform import Rotation
 from several_piped import raw_errors
 from several_piped import walked as walked_raw
 
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.data_checks.magnetometers import of_sensors
+from magfusion.estimation.graph.state import as_trajectory
 from magfusion.estimation.integrity.magnetometer_exclusion import agreed
-from magfusion.estimation.integrity.magnetometers import of_sensors
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.estimation.snapshot.likelihood import fix_epochs
-from magfusion.estimation.state import as_trajectory
 from magfusion.files.fields import on_log_clock, side_by_side
 from magfusion.jobs.replay import Replay, feed
 from magfusion.model.parameters import initial_calibration

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from magfusion.estimation.batch import smooth
-from magfusion.estimation.demodulated_apart import demodulated_apart
-from magfusion.estimation.integrity.magnetometers import without_magnetometer
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import as_trajectory
+from magfusion.estimation.batch.batch import smooth
+from magfusion.estimation.data_checks.magnetometers import without_magnetometer
+from magfusion.estimation.demodulation.demodulated_apart import demodulated_apart
+from magfusion.estimation.graph.state import as_trajectory
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.fields import by_own_clocks
 from magfusion.files.site import save_site
 from magfusion.jobs.replay import Replay, feed, run_replay

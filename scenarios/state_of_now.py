@@ -19,9 +19,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from harness import conclude, scenario_parser
 
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import as_trajectory
-from magfusion.estimation.state_of_now import CarriedState
+from magfusion.estimation.graph.state import as_trajectory
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.state_of_now import CarriedState
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site, save_site
 from magfusion.files.stream import json_line

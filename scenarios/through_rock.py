@@ -18,7 +18,7 @@ import numpy as np
 from harness import conclude, rms, scenario_parser
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.integrity.judge import judged
 from magfusion.model.ground import conductivity_of, in_ground
 from magfusion.model.parameters import CONDUCTIVITY

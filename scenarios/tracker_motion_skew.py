@@ -20,9 +20,9 @@ from harness import blank_figure, conclude, rms, save_picture, scenario_parser
 from scipy.spatial.transform import Rotation, RotationSpline
 from time_slots_and_mains import DISTANCE, UNIT, located, tracker
 
-from magfusion.estimation.batch import smooth
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import as_trajectory
+from magfusion.estimation.batch.batch import smooth
+from magfusion.estimation.graph.state import as_trajectory
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.model.field import observe_from
 from magfusion.model.samples import FieldSamples, ImuSamples, Log
 from magfusion.model.site import Site, Slots

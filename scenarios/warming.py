@@ -11,7 +11,7 @@ import numpy as np
 from both_estimators import Row, rows_of, table
 from harness import conclude, scenario_parser
 
-from magfusion.estimation.warming import at_reference
+from magfusion.estimation.demodulation.warming import at_reference
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.temperature import MAGNETOMETER, SensorWarming, Temperatures, Warming

@@ -9,9 +9,9 @@ import numpy as np
 from online_log import online_log
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.integrity.judgement import JudgedState, Judgement
-from magfusion.estimation.integrity.levels import Levels
-from magfusion.estimation.navigator import NavigatorSettings
+from magfusion.estimation.online.navigator import NavigatorSettings
+from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
+from magfusion.estimation.online_integrity.levels import Levels
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.jobs.live import LiveSettings

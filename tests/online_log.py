@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import State, as_trajectory
+from magfusion.estimation.graph.state import State, as_trajectory
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import BeaconSigma, MagnetometerSigma, Site
 from magfusion.results.errors import TrajectoryErrors, trajectory_errors

@@ -4,10 +4,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.estimation.graph import Estimate, Graph, initial_estimate
-from magfusion.estimation.inertial import inertial_graph
+from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate
+from magfusion.estimation.graph.inertial import inertial_graph
+from magfusion.estimation.graph.preintegration import cut_at_epochs, preintegrate
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.preintegration import cut_at_epochs, preintegrate
 from magfusion.model.noise import measurement_cov, paired_whitening, stacked
 from magfusion.model.parameters import Block, initial_calibration
 from magfusion.model.samples import FieldSamples, ImuSamples, Log

@@ -16,7 +16,8 @@ from tracker_site import body_poses, tracker_site
 from magfusion.files.plain_table import ANGLES, POSITION
 from magfusion.files.site import load_site, save_site
 from magfusion.files.survey import Survey, read_survey, write_survey
-from magfusion.jobs.calibrate_antenna import AntennaSettings, run_calibrate_antenna
+from magfusion.jobs.antenna_settings import AntennaSettings
+from magfusion.jobs.calibrate_antenna import run_calibrate_antenna
 from magfusion.model.field import predict
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.site import Site

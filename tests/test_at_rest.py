@@ -12,7 +12,7 @@ from mine_noise import Config, Interference, mains, run_kind, switches, vehicles
 from scipy.stats import binom
 
 from magfusion.errors import InputError
-from magfusion.estimation.at_rest import at_rest, rests
+from magfusion.estimation.rests.at_rest import at_rest, rests
 from magfusion.files.fields import read_fields
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import save_site

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magfusion.estimation.batch import smooth
+from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.measurements.field_error import FieldError
 from magfusion.estimation.measurements.model_error import alike_in_batch
-from magfusion.estimation.residual_shares import ChannelErrors, _matrices
-from magfusion.estimation.variance_components import BeaconErrors, parts_of
+from magfusion.estimation.posterior.residual_shares import ChannelErrors, _matrices
+from magfusion.estimation.posterior.variance_components import BeaconErrors, parts_of
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.parameters.parameter import PhasorView
 from magfusion.results.errors import trajectory_errors

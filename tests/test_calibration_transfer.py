@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site
 from magfusion.model.parameters import difference, prior_sigma

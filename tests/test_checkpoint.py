@@ -18,9 +18,9 @@ from online_log import WINDOW, OnlineLog, epoch, navigate, online_log
 from test_navigate_stream import EKF, answered, records
 
 from magfusion.errors import InputError
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.restored import restored
-from magfusion.estimation.state import State
+from magfusion.estimation.graph.state import State
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.restored import restored
 from magfusion.files.atomic import whole_file
 from magfusion.files.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from magfusion.files.log import write_log

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.batch import smooth
+from magfusion.estimation.batch.batch import smooth
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.estimation.snapshot.refine import refine

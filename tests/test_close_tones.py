@@ -8,17 +8,17 @@ import pytest
 from derivatives import central_difference, relative_to_group
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.batch import Smoothed, smooth
-from magfusion.estimation.close_tones import _of_channels
-from magfusion.estimation.integrity.gate import GATE
+from magfusion.estimation.batch.batch import Smoothed, smooth
+from magfusion.estimation.demodulation.close_tones import _of_channels
+from magfusion.estimation.graph.state import MOTION, State, States, states_in
 from magfusion.estimation.integrity.judge import judged
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.navigator import Navigator
-from magfusion.estimation.navigator_settings import NavigatorSettings
-from magfusion.estimation.restored import restored
-from magfusion.estimation.state import MOTION, State, States, states_in
+from magfusion.estimation.online.navigator import Navigator
+from magfusion.estimation.online.navigator_settings import NavigatorSettings
+from magfusion.estimation.online.restored import restored
+from magfusion.estimation.online_integrity.gate import GATE
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Verdict

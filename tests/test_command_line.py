@@ -16,12 +16,12 @@ from conftest import Worked
 
 import magfusion
 from magfusion.errors import InputError
-from magfusion.estimation.batch import SmootherSettings
-from magfusion.estimation.navigator import NavigatorSettings
+from magfusion.estimation.batch.batch import SmootherSettings
+from magfusion.estimation.online.navigator import NavigatorSettings
 from magfusion.jobs import JOBS
 from magfusion.jobs.calibrate_log import LogCalibrationSettings, run_calibrate_log
 from magfusion.jobs.inputs import Job, read_estimate
-from magfusion.jobs.navigate import NavigateSettings
+from magfusion.jobs.navigate_settings import NavigateSettings
 from magfusion.jobs.settings import Command, Settings, argument, option, options, required
 from magfusion.jobs.smooth import SmoothSettings, run_smooth
 from magfusion.model.groups import GROUPS
@@ -204,7 +204,10 @@ def test_the_package_offers_its_names_and_loads_nothing_before_they_are_asked_fo
         "print(smooth.__module__, Navigator.__module__)",
     )
     done = _child("-c", "\n".join(lines))
-    assert done.stdout.split() == ["magfusion.estimation.batch", "magfusion.estimation.navigator"]
+    assert done.stdout.split() == [
+        "magfusion.estimation.batch.batch",
+        "magfusion.estimation.online.navigator",
+    ]
 
 
 def test_a_name_that_the_package_does_not_offer_is_told() -> None:
@@ -279,7 +282,7 @@ def test_the_filter_does_without_statistics_and_whoever_asks_for_them_has_them()
     told = """
 import sys
 import numpy as np
-from magfusion.estimation.without_statistics import without_statistics
+from magfusion.estimation.posterior.without_statistics import without_statistics
 with without_statistics():
     from filterpy.kalman import ExtendedKalmanFilter
 kalman = ExtendedKalmanFilter(dim_x=1, dim_z=1)
@@ -324,9 +327,9 @@ def test_what_a_command_says_that_it_imports_is_there() -> None:
 def test_a_command_imports_nothing_that_only_other_runs_ask(job: str) -> None:
     """Of a mistake, bags, slots, the pipe and doubtful starts others know, when they are asked."""
     others = {
-        "magfusion.estimation.initialization.search",
+        "magfusion.estimation.batch.search",
         "magfusion.estimation.integrity.likely_cause",
-        "magfusion.estimation.several_arrivals",
+        "magfusion.estimation.online.several_arrivals",
         "magfusion.files.bag",
         "magfusion.files.stream",
         "magfusion.receiver.slot_receiver",

@@ -17,8 +17,8 @@ from through_rock import (
 )
 
 from magfusion.errors import InputError
-from magfusion.estimation.demodulation import phasors
-from magfusion.estimation.skin_depths import depths_of
+from magfusion.estimation.demodulation.demodulation import phasors
+from magfusion.estimation.demodulation.skin_depths import depths_of
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.files.site import load_site, save_site
 from magfusion.model.coil_field import alone, coil_fields

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.model.parameters import difference, initial_calibration
 from magfusion.model.site import BeaconSigma, MagnetometerSigma, Site
 from magfusion.receiver.windows import LockinSettings

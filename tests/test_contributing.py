@@ -9,8 +9,8 @@ import numpy as np
 from derivatives import central_difference
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.measurements.measurement import Measurement, Rows
-from magfusion.estimation.state import States
+from magfusion.estimation.graph.measurement import Measurement, Rows
+from magfusion.estimation.graph.state import States
 from magfusion.model.parameters import Block, Calibration
 from magfusion.units import Array
 

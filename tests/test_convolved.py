@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.signal import fftconvolve
 
-from magfusion.estimation.integrity.turning import convolved
+from magfusion.estimation.data_checks.turning import convolved
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import yaml
 from example_site import mixed_site
 
 from magfusion.errors import InputError
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.files.site import load_site, save_site
 from magfusion.model.correlation import Component, Correlation, joined

@@ -8,7 +8,7 @@ from example_site import mixed_site
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from magfusion.estimation.integrity.fix_separation import separate_fixes
+from magfusion.estimation.snapshot.fix_separation import separate_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.audibility import tones_of
 from magfusion.model.parameters import initial_calibration

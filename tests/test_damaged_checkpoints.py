@@ -17,7 +17,7 @@ from online_log import online_log
 from test_navigate_stream import records
 
 from magfusion.errors import InputError
-from magfusion.estimation.navigator import NavigatorSettings
+from magfusion.estimation.online.navigator import NavigatorSettings
 from magfusion.files.checkpoint import MAGIC, read_checkpoint, write_checkpoint
 from magfusion.files.log import write_log
 from magfusion.files.plain_data import from_plain
@@ -25,7 +25,8 @@ from magfusion.files.site import save_site
 from magfusion.jobs import replay
 from magfusion.jobs.drift_world import WorldTask, run_world
 from magfusion.jobs.inputs import named
-from magfusion.jobs.navigate import NavigateSettings, run_navigate
+from magfusion.jobs.navigate import run_navigate
+from magfusion.jobs.navigate_settings import NavigateSettings
 from magfusion.jobs.stream import StreamSettings, run_stream
 from magfusion.model.samples import Log
 from magfusion.simulation.demo_site import demo_site

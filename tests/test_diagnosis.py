@@ -9,13 +9,13 @@ import pytest
 from mistake_case import Case, good_case, simulated
 from mistake_list import MISTAKES
 
-from magfusion.estimation.demodulation import demodulated
+from magfusion.estimation.data_checks.recording import recorded
+from magfusion.estimation.demodulation.demodulation import demodulated
 from magfusion.estimation.integrity.diagnosis import diagnosed, seen_in_streams, with_cause
 from magfusion.estimation.integrity.explanation import Explanation, clearly_best
 from magfusion.estimation.integrity.likely_cause import cause_of
 from magfusion.estimation.integrity.motion_causes import timing_causes
 from magfusion.estimation.integrity.motion_comparison import compared, surveyed
-from magfusion.estimation.integrity.recording import recorded
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.trust import CODES, Finding, Trust, Verdict
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magfusion.estimation import drift_segments
-from magfusion.estimation.batch import Smoothed, smooth
-from magfusion.estimation.drift_segments import SEGMENT
+from magfusion.estimation.batch.batch import Smoothed, smooth
+from magfusion.estimation.graph import drift_segments
+from magfusion.estimation.graph.drift_segments import SEGMENT
 from magfusion.estimation.solve.ordering import nested_dissection
 from magfusion.model.parameters import (
     LOG_MOMENT,

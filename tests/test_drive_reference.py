@@ -10,10 +10,10 @@ import pytest
 from drive_reference import CURRENT, Config, wandering_log, with_currents
 
 from magfusion.errors import InputError
-from magfusion.estimation.demodulation import phasors
-from magfusion.estimation.drive_reference import referred, with_drives
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.restored import restored
+from magfusion.estimation.demodulation.demodulation import phasors
+from magfusion.estimation.demodulation.drive_reference import referred, with_drives
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.restored import restored
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.jobs.replay import run_replay

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from time_slots_and_mains import tracker
 
+from magfusion.estimation.graph.state import State
 from magfusion.estimation.initialization.early import first_try, is_clear, next_try, open_start
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
-from magfusion.estimation.state import State
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import Site, Slots
 from magfusion.model.trust import Finding, Trust, Verdict

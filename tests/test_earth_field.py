@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.cli import main
 from magfusion.errors import InputError
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.demodulation import demodulated
-from magfusion.estimation.integrity.detection import DETECTION_CHI_SQUARE, detected
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.data_checks.detection import DETECTION_CHI_SQUARE, detected
+from magfusion.estimation.demodulation.demodulation import demodulated
+from magfusion.estimation.graph.state import as_trajectory
 from magfusion.estimation.measurements.earth import check_earth, earth_cov
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import as_trajectory
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.log import write_log
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site, save_site

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.ekf import ErrorStateFilter, measured_rows
-from magfusion.estimation.fixed_lag import SlidingWindow
+from magfusion.estimation.graph.measurement import joined, measured_rows
+from magfusion.estimation.graph.process_noise import ProcessNoise, calibration_process_noise
+from magfusion.estimation.graph.propagation import propagate
+from magfusion.estimation.graph.state import MOTION, State, between, moved, states_of
 from magfusion.estimation.measurements.earth import earth_measurement
-from magfusion.estimation.measurements.measurement import joined
 from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
-from magfusion.estimation.process_noise import ProcessNoise, calibration_process_noise
-from magfusion.estimation.propagation import propagate
-from magfusion.estimation.state import MOTION, State, between, moved, states_of
+from magfusion.estimation.online.ekf import ErrorStateFilter
+from magfusion.estimation.online.fixed_lag import SlidingWindow
 from magfusion.model.field import observe_earth
 from magfusion.model.parameters import (
     GROUPS,

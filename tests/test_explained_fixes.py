@@ -7,7 +7,7 @@ import pytest
 from test_gain_spread import error, scaled
 from tracker_site import body_poses, tracker_site
 
-from magfusion.estimation.integrity.explained_fixes import ExplainedFixes, explained_fixes
+from magfusion.estimation.snapshot.explained_fixes import ExplainedFixes, explained_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import FieldSamples

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B
 
-from magfusion.estimation.state import State, values_of
+from magfusion.estimation.graph.state import State, values_of
 from magfusion.model import quaternion
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import MotionModel

@@ -11,7 +11,7 @@ import pytest
 from conftest import Refuse
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.integrity.samples import frozen_samples
+from magfusion.estimation.data_checks.samples import frozen_samples
 from magfusion.estimation.snapshot.coil_gain import with_found_gain
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.files.log import read_log, write_log

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import X
 
-from magfusion.estimation.batch import SmootherSettings, smooth, solved_again
+from magfusion.estimation.batch.batch import SmootherSettings, smooth, solved_again
+from magfusion.estimation.graph.considered import responses
+from magfusion.estimation.graph.state import states_in
 from magfusion.estimation.measurements.field_error import modes_in_place
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.state import states_in
 from magfusion.model.noise import stacked
 from magfusion.model.parameters.parameter import PhasorView
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
@@ -54,7 +55,7 @@ def test_a_mode_moves_the_estimate_as_its_response_says() -> None:
     site, fields = result.calibration.site, result.fields
     poses = result.states
     column = 13  # of the second mode
-    steps = list(result.graph.responses(result.estimate, result.uncertain))
+    steps = list(responses(result.graph, result.estimate, result.uncertain))
     first = result.uncertain[-len(result.field_errors)].columns.start
     response = steps[first + column]
     phasors = next(m for m in result.graph.measurements if isinstance(m, FieldPhasors))

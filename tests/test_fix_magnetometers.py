@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from test_several_magnetometers import poses, two_magnetometers
 
-from magfusion.estimation.integrity.fix_magnetometers import contradicting_magnetometers
+from magfusion.estimation.snapshot.fix_magnetometers import contradicting_magnetometers
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import MagnetometerSigma, Site
 from magfusion.simulation.demo_site import demo_site

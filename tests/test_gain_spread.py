@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magfusion.estimation.integrity.gain_witness import gains_of
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.gain_spread import gain_spread
+from magfusion.estimation.snapshot.gain_witness import gains_of
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA
 from magfusion.model.parameters import initial_calibration

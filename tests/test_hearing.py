@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.estimation.integrity.signal import detected_in, heard, heard_with_motion, unheard
+from magfusion.estimation.data_checks.signal import detected_in, heard, heard_with_motion, unheard
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trust import Verdict
 from magfusion.simulation.demo_site import demo_site

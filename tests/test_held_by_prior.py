@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from test_without_imu import A_HAND, exact, nees
 
-from magfusion.estimation.batch import smooth
+from magfusion.estimation.batch.batch import smooth
+from magfusion.estimation.graph.state import State, as_trajectory
 from magfusion.estimation.measurements.model_error import alike_at, held_by_prior
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import State, as_trajectory
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.platform_motion import MotionPrior
 from magfusion.model.samples import ImuSamples, Log

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.motion_shape import motion_at
-from magfusion.estimation.preintegration import (
+from magfusion.estimation.demodulation.motion_shape import motion_at
+from magfusion.estimation.graph.preintegration import (
     cut_at_epochs,
     low_passed,
     low_passed_rate_at,

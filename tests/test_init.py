@@ -10,14 +10,15 @@ from scipy.spatial.transform import Rotation
 
 from magfusion.cli import main
 from magfusion.errors import InputError
-from magfusion.estimation.integrity.tones import transmitted
+from magfusion.estimation.data_checks.tones import transmitted
 from magfusion.files.instruments import imus, magnetometers, named_imu, named_magnetometer
 from magfusion.files.log import write_log
 from magfusion.files.site import load_site
 from magfusion.files.site_draft import beacon_draft, place_of
 from magfusion.files.site_text import SiteDraft, site_text
-from magfusion.jobs.init import InitSettings, run_init
+from magfusion.jobs.init import run_init
 from magfusion.jobs.init_questions import answered
+from magfusion.jobs.init_settings import InitSettings
 from magfusion.model.physics.earth import gravity
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.units import DEGREE

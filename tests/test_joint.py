@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, V, X
 
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.condensed import columns_of, condensed
-from magfusion.estimation.factors import CALIBRATION_KEY
-from magfusion.estimation.graph import Estimate, Graph, initial_estimate
-from magfusion.estimation.integrity.logs_agree import agreement
-from magfusion.estimation.joint import Known, Said, Shared, apart_in_sigmas, known_by
-from magfusion.estimation.joint_log import (
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.batch.joint import Known, Said, Shared, apart_in_sigmas, known_by
+from magfusion.estimation.batch.joint_log import (
     OfLog,
     Round,
     after_round,
@@ -22,6 +18,10 @@ from magfusion.estimation.joint_log import (
     of_smoothed,
     solve_round,
 )
+from magfusion.estimation.graph.factors import CALIBRATION_KEY
+from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate
+from magfusion.estimation.integrity.logs_agree import agreement
+from magfusion.estimation.posterior.condensed import columns_of, condensed
 from magfusion.jobs.joint_tasks import shared_of, together_settings
 from magfusion.model.parameters import Calibration, difference, dimension, placed
 from magfusion.model.prior import prior_sqrt_information

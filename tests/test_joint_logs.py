@@ -9,8 +9,8 @@ import pytest
 from conftest import run_command
 from test_joint import NOISE, RESTLESS, refined, step_to, surveyed
 
-from magfusion.estimation.joint import apart_in_sigmas
-from magfusion.estimation.joint_log import joint_posterior
+from magfusion.estimation.batch.joint import apart_in_sigmas
+from magfusion.estimation.batch.joint_log import joint_posterior
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.model.parameters import initial_calibration, prior_sigma

@@ -7,9 +7,9 @@ import pytest
 from test_online_separation import NAVIGATOR, _feed
 from test_smoothed_separation import EPOCHS, _walk
 
-from magfusion.estimation.integrity.bank import SLACK
-from magfusion.estimation.integrity.levels import Levels, find
-from magfusion.estimation.navigator import Navigator
+from magfusion.estimation.online.navigator import Navigator
+from magfusion.estimation.online_integrity.bank import SLACK
+from magfusion.estimation.online_integrity.levels import Levels, find
 
 
 def _levels() -> list[Levels]:

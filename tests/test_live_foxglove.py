@@ -17,7 +17,7 @@ import pytest
 from conftest import Refuse
 from live_states import EPOCH_NS, LOST, example_state, told_of, write_walk
 
-from magfusion.estimation.navigator import NavigatorSettings
+from magfusion.estimation.online.navigator import NavigatorSettings
 from magfusion.files.log import read_log
 from magfusion.jobs.live import LiveSettings
 from magfusion.jobs.replay import run_replay

@@ -16,9 +16,9 @@ from conftest import Refuse, run_command
 from live_states import DOUBTFUL, EPOCH_NS, LOST, example_state, piped, told_of, write_walk
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.integrity.judgement import Judgement
-from magfusion.estimation.integrity.levels import Levels
-from magfusion.estimation.state import moved_to
+from magfusion.estimation.graph.state import moved_to
+from magfusion.estimation.online_integrity.judgement import Judgement
+from magfusion.estimation.online_integrity.levels import Levels
 from magfusion.jobs.live import LiveSettings
 from magfusion.results.odometry import odometry_of
 from magfusion.results.odometry_mavlink import MavlinkSender, odometry_message, quality_percent

@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.state import as_trajectory
+from magfusion.estimation.graph.state import as_trajectory
 from magfusion.files.odometry_bag import Frames, write_bag
 from magfusion.files.result_states import ResultStates
 from magfusion.jobs.live import LiveSettings

@@ -10,7 +10,7 @@ from conftest import run_command
 
 from magfusion.calibration.magnetometer_size import calibrate_alone
 from magfusion.calibration.steady_field import steady_field
-from magfusion.estimation.integrity.mending import mended
+from magfusion.estimation.data_checks.mending import mended
 from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.jobs.calibrate_magnetometer import run_calibrate_magnetometer

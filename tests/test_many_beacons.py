@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.estimation.hearing import heard_site
+from magfusion.estimation.demodulation.hearing import heard_site
 from magfusion.files.site import load_site, save_site
 from magfusion.model.audibility import are_many, largest_fields, owned_at, tones_of
 from magfusion.model.parameters import (

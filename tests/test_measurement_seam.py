@@ -10,14 +10,14 @@ from online_log import OnlineLog, epoch, online_log
 from small_problem import small_log
 from test_ekf import a_site, a_state, an_imu
 
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.ekf import ErrorStateFilter
-from magfusion.estimation.fixed_lag import SlidingWindow
-from magfusion.estimation.measurements.measurement import Measurement, Rows
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.process_noise import ProcessNoise
-from magfusion.estimation.propagation import Propagated, propagate
-from magfusion.estimation.state import State, States, between
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.graph.measurement import Measurement, Rows
+from magfusion.estimation.graph.process_noise import ProcessNoise
+from magfusion.estimation.graph.propagation import Propagated, propagate
+from magfusion.estimation.graph.state import State, States, between
+from magfusion.estimation.online.ekf import ErrorStateFilter
+from magfusion.estimation.online.fixed_lag import SlidingWindow
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.model.parameters import (
     PARAMETERS,
     PHASOR_PARAMETERS,

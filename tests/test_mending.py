@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.integrity.mending import mended
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.data_checks.mending import mended
 from magfusion.model.trust import Verdict
 from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site

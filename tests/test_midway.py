@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from small_problem import small_log
 
-from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.integrity.judge import judged
 from magfusion.estimation.integrity.midway import STAMPS, Since
 from magfusion.model.parameters import (

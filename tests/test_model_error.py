@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.estimation.measurements.model_error import alike_in_batch, alike_online
 from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.model.field import model_error_cov

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.motion_shape import MotionShape, motion_at
-from magfusion.estimation.preintegration import low_passed
+from magfusion.estimation.demodulation.motion_shape import MotionShape, motion_at
+from magfusion.estimation.graph.preintegration import low_passed
 from magfusion.model.field import observe_earth
 from magfusion.model.parameters import initial_calibration, predict_channels
 from magfusion.model.quaternion import inverse, matrices, of_vectors, product, turned

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magfusion.estimation import motion_stretches
-from magfusion.estimation.motion_compensation import TakenOff, taken_off
+from magfusion.estimation.demodulation import motion_stretches
+from magfusion.estimation.demodulation.motion_compensation import TakenOff, taken_off
 from magfusion.model import path_field
 from magfusion.model.parameters import Calibration, initial_calibration
 from magfusion.model.samples import ImuSamples, Waveform

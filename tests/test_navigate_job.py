@@ -14,7 +14,7 @@ from online_log import online_log
 from rerun.chunk import RrdReader
 
 from magfusion.cli import main
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.files.trajectory_table import read_trajectory

@@ -15,7 +15,7 @@ from conftest import run_command
 from online_log import OnlineLog, online_log
 
 from magfusion.errors import InputError
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.files.stream import (

@@ -8,11 +8,11 @@ from moving_plate import MU_0, Plate
 from scipy.spatial.transform import Rotation
 from time_slots_and_mains import tracker
 
-from magfusion.estimation.integrity.near_metal import NearMetal
-from magfusion.estimation.integrity.reckoned import LATE, Reckoned
+from magfusion.estimation.graph.propagation import propagate
+from magfusion.estimation.graph.state import State, as_trajectory, between, moved
 from magfusion.estimation.measurements.phasors import field_phasors
-from magfusion.estimation.propagation import propagate
-from magfusion.estimation.state import State, as_trajectory, between, moved
+from magfusion.estimation.online_integrity.near_metal import NearMetal
+from magfusion.estimation.online_integrity.reckoned import LATE, Reckoned
 from magfusion.model.parameters import initial_calibration, predict_channels
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site, Slots

@@ -10,13 +10,12 @@ from scipy.integrate import quad
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
-from magfusion.estimation import variance_components
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.integrity.tuned_noise import tuned_noise
-from magfusion.estimation.noise_tuning import Tuned, tuned_site
-from magfusion.estimation.residual_shares import ChannelErrors
-from magfusion.estimation.solve.bounded import minimise_curved
-from magfusion.estimation.variance_components import (
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.posterior import variance_components
+from magfusion.estimation.posterior.noise_tuning import Tuned, tuned_site
+from magfusion.estimation.posterior.residual_shares import ChannelErrors
+from magfusion.estimation.posterior.tuned_noise import tuned_noise
+from magfusion.estimation.posterior.variance_components import (
     KINDS,
     NORMAL,
     STUDENT,
@@ -25,6 +24,7 @@ from magfusion.estimation.variance_components import (
     likeliest,
     parts_of,
 )
+from magfusion.estimation.solve.bounded import minimise_curved
 from magfusion.files.site import load_site, save_site
 from magfusion.model.samples import Log
 from magfusion.model.site import Site

@@ -6,9 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from small_problem import small_log
 
-from magfusion.estimation.on_new_clock import on_new_clock
-from magfusion.estimation.prepared import prepared
-from magfusion.estimation.settings import SmootherSettings
+from magfusion.estimation.batch.on_new_clock import on_new_clock
+from magfusion.estimation.batch.prepared import prepared
+from magfusion.estimation.batch.settings import SmootherSettings
 from magfusion.model.progress import quiet
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array

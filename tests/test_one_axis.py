@@ -11,7 +11,6 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import Refuse, run_command
 
-from magfusion.estimation.snapshot.axis_starts import least_turn
 from magfusion.estimation.snapshot.coil_fix import CoilFixes, Gain, _Problem, fix_coil
 from magfusion.estimation.snapshot.coil_poses import (
     judged_poses,
@@ -22,6 +21,7 @@ from magfusion.estimation.snapshot.coil_poses import (
 from magfusion.estimation.snapshot.coil_starts import CoilEpochs, at_point
 from magfusion.files.site import load_site, save_site
 from magfusion.model.coil_field import as_points
+from magfusion.model.one_axis import least_turn
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.site import Site

@@ -10,8 +10,8 @@ import pytest
 from conftest import run_command
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.graph.preintegration import across_held
 from magfusion.estimation.measurements.held_roll import held_roll, without_roll
-from magfusion.estimation.preintegration import across_held
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.model.one_axis import (

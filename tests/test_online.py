@@ -19,10 +19,10 @@ from online_log import (
 )
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.ekf import ErrorStateFilter
-from magfusion.estimation.fixed_lag import SlidingWindow
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import State, as_trajectory
+from magfusion.estimation.graph.state import State, as_trajectory
+from magfusion.estimation.online.ekf import ErrorStateFilter
+from magfusion.estimation.online.fixed_lag import SlidingWindow
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD
@@ -342,7 +342,7 @@ def test_a_singular_update_of_the_filter_is_an_estimation_error(
     def singular(*_: object) -> None:
         raise np.linalg.LinAlgError("singular matrix")
 
-    monkeypatch.setattr("magfusion.estimation.ekf._step", singular)
+    monkeypatch.setattr("magfusion.estimation.online.ekf._step", singular)
     short = replace(walk, imu=without_imu(walk.imu, 9.0, 1e9))
     navigator, _ = navigate(short, NavigatorSettings("ekf"))
     assert navigator.counts["update failed"] > 0

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from online_log import OnlineLog, navigate, online_log
 
-from magfusion.estimation.integrity.freeze import Freeze
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.restored import restored
-from magfusion.estimation.state import State, as_trajectory
+from magfusion.estimation.data_checks.freeze import Freeze
+from magfusion.estimation.graph.state import State, as_trajectory
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.restored import restored
 from magfusion.jobs.replay import Replay, feed
 from magfusion.model.samples import ImuSamples
 from magfusion.model.trust import Verdict

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magfusion.estimation.integrity.gate import Gate
-from magfusion.estimation.integrity.judgement import Judgement
-from magfusion.estimation.integrity.magnetometer_watch import MagnetometerWatch
-from magfusion.estimation.integrity.online import OnlineWitness
-from magfusion.estimation.state import MOTION, State
+from magfusion.estimation.graph.state import MOTION, State
+from magfusion.estimation.online_integrity.gate import Gate
+from magfusion.estimation.online_integrity.judgement import Judgement
+from magfusion.estimation.online_integrity.magnetometer_watch import MagnetometerWatch
+from magfusion.estimation.online_integrity.online import OnlineWitness
 from magfusion.model.parameters import Block, choose_blocks, initial_calibration, retract
 from magfusion.model.site import BeaconSigma
 from magfusion.simulation.demo_site import demo_site

@@ -9,10 +9,10 @@ from small_problem import SmallLog
 from test_smoothed_separation import EPOCHS, STEP, _false, _walk
 
 from magfusion.errors import InputError
-from magfusion.estimation.integrity.bank import SLACK, WIDE, SubsetBank
-from magfusion.estimation.integrity.judgement import JudgedState
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.restored import restored
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.restored import restored
+from magfusion.estimation.online_integrity.bank import SLACK, WIDE, SubsetBank
+from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.model.trust import Risk, Verdict
 from magfusion.units import Array
 

@@ -7,8 +7,8 @@ from typing import Literal
 import pytest
 from estimators_compared import Config, Row, calibrated, online, row
 
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.navigator import NavigatorSettings
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.online.navigator import NavigatorSettings
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site
 

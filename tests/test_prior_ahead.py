@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from test_without_imu import by_chance, nees
 
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.propagation import propagate
-from magfusion.estimation.state import as_trajectory
+from magfusion.estimation.graph.propagation import propagate
+from magfusion.estimation.graph.state import as_trajectory
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.model.platform_motion import MotionPrior
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site

@@ -10,11 +10,11 @@ import rotating_magnet_ranging as scenario
 from conftest import Refuse, run_command
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.ranging import Ranged, _moved, find_range
-from magfusion.estimation.ranging_data import RangingWindows
-from magfusion.estimation.ranging_model import RangingModel
-from magfusion.estimation.ranging_windows import ranging_log
-from magfusion.estimation.relative_wells import Wells
+from magfusion.estimation.ranging.ranging import Ranged, _moved, find_range
+from magfusion.estimation.ranging.ranging_data import RangingWindows
+from magfusion.estimation.ranging.ranging_model import RangingModel
+from magfusion.estimation.ranging.ranging_windows import ranging_log
+from magfusion.estimation.ranging.relative_wells import Wells
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.model.samples import ImuSamples

@@ -11,7 +11,7 @@ from conftest import run_command
 from scipy.spatial.transform import Rotation
 from time_slots_and_mains import tracker
 
-from magfusion.estimation.batch import SmootherSettings
+from magfusion.estimation.batch.batch import SmootherSettings
 from magfusion.jobs.inputs import Job
 from magfusion.jobs.smooth import run_smooth
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform

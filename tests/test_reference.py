@@ -9,7 +9,7 @@ import pytest
 from conftest import Refuse, run_command
 from far_and_weak import FAR_AWAY, STORMS, errors_in_sigmas, far_site, witnessed_log
 
-from magfusion.estimation.at_rest import AtRest, at_rest
+from magfusion.estimation.rests.at_rest import AtRest, at_rest
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.model.samples import Waveform

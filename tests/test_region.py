@@ -15,7 +15,7 @@ from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
-from magfusion.jobs.region import Where
+from magfusion.jobs.region_option import Where
 from magfusion.model.field import predict
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.region import HalfSpace, Region

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.convergence import pose_steps
-from magfusion.estimation.relaxation import LEAST, Step, part_of_the_way
+from magfusion.estimation.posterior.convergence import pose_steps
+from magfusion.estimation.posterior.relaxation import LEAST, Step, part_of_the_way
 from magfusion.model.parameters import Calibration, choose_blocks, difference, initial_calibration
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import demo_site

@@ -8,9 +8,9 @@ import pytest
 from small_problem import small_log
 from test_tracker_fusion import _recorded as recorded_tracker
 
-from magfusion.estimation import residual_shares
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.residual_shares import Leavings
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.posterior import residual_shares
+from magfusion.estimation.posterior.residual_shares import Leavings
 from magfusion.files.log import read_log
 from magfusion.files.site import load_site
 from magfusion.model.trajectory import Trajectory

@@ -9,8 +9,8 @@ import pytest
 from scipy.signal import bilinear, freqz, lfilter
 
 from magfusion.errors import InputError
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.demodulation import phasors
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.demodulation.demodulation import phasors
 from magfusion.estimation.integrity.judge import judged
 from magfusion.files.site import load_site, save_site
 from magfusion.model.parameters import initial_calibration, predict_channels

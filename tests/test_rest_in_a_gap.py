@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magfusion.estimation.batch import Smoothed, smooth
-from magfusion.estimation.between_epochs import at_rate
-from magfusion.estimation.navigator import Navigator
-from magfusion.estimation.prepared import LONGEST_STEP
-from magfusion.estimation.state import as_trajectory
+from magfusion.estimation.batch.batch import Smoothed, smooth
+from magfusion.estimation.batch.between_epochs import at_rate
+from magfusion.estimation.batch.prepared import LONGEST_STEP
+from magfusion.estimation.graph.state import as_trajectory
+from magfusion.estimation.online.navigator import Navigator
 from magfusion.model.samples import Log, Waveform
 from magfusion.model.trajectory import Trajectory
 from magfusion.results.errors import trajectory_errors

@@ -21,10 +21,10 @@ from far_and_weak import (
 )
 
 from magfusion.errors import InputError
-from magfusion.estimation.at_rest import AtRest, Rest, at_rest
-from magfusion.estimation.rest_running import Running
-from magfusion.estimation.rest_stream import FIRST, LATER, RestNavigator
-from magfusion.estimation.rest_witness import Judged
+from magfusion.estimation.rests.at_rest import AtRest, Rest, at_rest
+from magfusion.estimation.rests.rest_running import Running
+from magfusion.estimation.rests.rest_stream import FIRST, LATER, RestNavigator
+from magfusion.estimation.rests.rest_witness import Judged
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.jobs.navigate_rests import How, replayed, run_rests_stream

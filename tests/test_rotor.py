@@ -8,8 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.estimation.demodulation import phasors
-from magfusion.estimation.drive_reference import referred, turning_currents, with_drives
+from magfusion.estimation.demodulation.demodulation import phasors
+from magfusion.estimation.demodulation.drive_reference import (
+    referred,
+    turning_currents,
+    with_drives,
+)
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.model.field import predict

@@ -25,13 +25,13 @@ from spoiled_log import (
     without_gravity,
 )
 
-from magfusion.estimation.integrity.compasses import still_means
+from magfusion.estimation.data_checks.compasses import still_means
+from magfusion.estimation.data_checks.inertial_noise import noisy_inertial, white_density
+from magfusion.estimation.data_checks.recording import recorded
+from magfusion.estimation.data_checks.samples import clipped
+from magfusion.estimation.data_checks.spectrum import aliased, mains_of
+from magfusion.estimation.data_checks.stamps import timing
 from magfusion.estimation.integrity.first_look import first_look
-from magfusion.estimation.integrity.inertial_noise import noisy_inertial, white_density
-from magfusion.estimation.integrity.recording import recorded
-from magfusion.estimation.integrity.samples import clipped
-from magfusion.estimation.integrity.spectrum import aliased, mains_of
-from magfusion.estimation.integrity.stamps import timing
 from magfusion.model.trust import Verdict
 
 

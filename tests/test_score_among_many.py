@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.graph.measurement import Measurement
+from magfusion.estimation.graph.state import MOTION, State
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.score_epochs import MEMORY
-from magfusion.estimation.integrity.score_online import OnlineScore
-from magfusion.estimation.measurements.measurement import Measurement
 from magfusion.estimation.measurements.phasors import field_phasors
-from magfusion.estimation.navigator import Navigator
-from magfusion.estimation.navigator_settings import NavigatorSettings
-from magfusion.estimation.state import MOTION, State
+from magfusion.estimation.online.navigator import Navigator
+from magfusion.estimation.online.navigator_settings import NavigatorSettings
+from magfusion.estimation.online_integrity.score_epochs import MEMORY
+from magfusion.estimation.online_integrity.score_online import OnlineScore
 from magfusion.model.audibility import are_many
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import ImuSamples

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from small_problem import small_log
 
-from magfusion.estimation import chain_left, chain_system
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.graph.state import states_in
 from magfusion.estimation.integrity import held_columns, midway, score
 from magfusion.estimation.integrity.score import Score, answered, scores_of
 from magfusion.estimation.integrity.suspects import held_blocks
 from magfusion.estimation.measurements import phasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.state import states_in
+from magfusion.estimation.posterior import chain_left, chain_system
 from magfusion.model.parameters import placed
 from magfusion.model.samples import ImuSamples
 

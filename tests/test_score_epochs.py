@@ -7,11 +7,11 @@ import pytest
 from test_online_separation import NAVIGATOR, _feed
 from test_smoothed_separation import EPOCHS, _walk
 
-from magfusion.estimation.integrity.score_epochs import Epoch, Passed, Sums, heard
-from magfusion.estimation.integrity.score_online import MOST_WAITING
+from magfusion.estimation.graph.state import between
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
-from magfusion.estimation.navigator import Navigator
-from magfusion.estimation.state import between
+from magfusion.estimation.online.navigator import Navigator
+from magfusion.estimation.online_integrity.score_epochs import Epoch, Passed, Sums, heard
+from magfusion.estimation.online_integrity.score_online import MOST_WAITING
 from magfusion.model.parameters import BEACON_POSITION
 
 LAST = EPOCHS // 2

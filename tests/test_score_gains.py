@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from magfusion.estimation.integrity.asked import Asked
 from magfusion.estimation.integrity.held import freed_by, gains
 from magfusion.estimation.integrity.score import Score
+from magfusion.estimation.online_integrity.asked import Asked
 from magfusion.simulation.demo_site import demo_site
 
 KNOWN, UNKNOWN = 50.0, 1e-4  # by how many typical errors a direction is told of, squared

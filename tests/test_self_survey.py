@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from self_survey import Config, turn_deg, without_survey
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.beacon_placement import detected_along, places
-from magfusion.estimation.self_survey import Hypothesis, Placement, decide, smooth_and_place
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.batch.beacon_placement import detected_along, places
+from magfusion.estimation.batch.self_survey import Hypothesis, Placement, decide, smooth_and_place
 from magfusion.files.log import write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.model.parameters import initial_calibration

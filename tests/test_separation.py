@@ -7,14 +7,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
-from magfusion.estimation.integrity.fix_separation import separate_fixes, separation_trust
-from magfusion.estimation.integrity.separation import (
+from magfusion.estimation.posterior.separation import (
     Separation,
     linear_separation,
     protection_levels,
     radii,
     with_rivals,
 )
+from magfusion.estimation.snapshot.fix_separation import separate_fixes, separation_trust
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.trajectory import Trajectory

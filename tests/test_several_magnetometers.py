@@ -12,13 +12,13 @@ from example_site import mixed_site
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.integrity.judgement import JudgedState
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.data_checks.magnetometers import without_silent
+from magfusion.estimation.graph.state import as_trajectory
 from magfusion.estimation.integrity.magnetometer_exclusion import agreed
-from magfusion.estimation.integrity.magnetometers import without_silent
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.estimation.snapshot.likelihood import fix_epochs
-from magfusion.estimation.state import as_trajectory
 from magfusion.files.fields import (
     on_log_clock,
     order_channels,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from test_several_magnetometers import only, two_magnetometers
 
-from magfusion.estimation.demodulation import demodulated
-from magfusion.estimation.several_demodulation import demodulated_several, same_windows
+from magfusion.estimation.demodulation.demodulation import demodulated
+from magfusion.estimation.demodulation.several_demodulation import demodulated_several, same_windows
 from magfusion.model.parameters import Calibration, initial_calibration, predict_channels, seen_by
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory

@@ -12,15 +12,16 @@ import pytest
 from test_several_magnetometers import two_magnetometers
 
 from magfusion.errors import InputError
-from magfusion.estimation.demodulated_apart import demodulated_apart
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.demodulation.demodulated_apart import demodulated_apart
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.fields import by_own_clocks
 from magfusion.files.log import write_log
 from magfusion.files.open import open_log
 from magfusion.files.site import save_site
 from magfusion.files.stream import json_line
 from magfusion.files.trajectory_table import read_trajectory
-from magfusion.jobs.navigate import NavigateSettings, run_navigate
+from magfusion.jobs.navigate import run_navigate
+from magfusion.jobs.navigate_settings import NavigateSettings
 from magfusion.jobs.replay import Replay, feed, run_replay
 from magfusion.jobs.stream import StreamSettings, run_stream
 from magfusion.model.samples import Log

@@ -11,10 +11,10 @@ import pytest
 from test_several_magnetometers import only, two_magnetometers
 
 from magfusion.errors import InputError
-from magfusion.estimation.demodulated_apart import demodulated_apart, of_site
-from magfusion.estimation.demodulation import phasors
+from magfusion.estimation.demodulation.demodulated_apart import demodulated_apart, of_site
+from magfusion.estimation.demodulation.demodulation import phasors
+from magfusion.estimation.demodulation.warming import at_reference
 from magfusion.estimation.snapshot.likelihood import fix_epochs
-from magfusion.estimation.warming import at_reference
 from magfusion.files.fields import by_own_clocks, order_channels
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import save_site

@@ -13,7 +13,7 @@ from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from magfusion.estimation.batch import SmootherSettings
+from magfusion.estimation.batch.batch import SmootherSettings
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site
 from magfusion.files.trajectory_table import read_trajectory

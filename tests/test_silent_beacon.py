@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from magfusion.estimation.batch import smooth
-from magfusion.estimation.demodulation import demodulated
-from magfusion.estimation.integrity.detection import without_silence
+from magfusion.estimation.batch.batch import smooth
+from magfusion.estimation.data_checks.detection import without_silence
+from magfusion.estimation.demodulation.demodulation import demodulated
 from magfusion.model.samples import Waveform
 from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.motion_from_field import motion_from_field
-from magfusion.estimation.state import State
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.demodulation.motion_from_field import motion_from_field
+from magfusion.estimation.graph.state import State
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.receiver.admission import INERTIAL_GAP

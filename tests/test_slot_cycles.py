@@ -8,11 +8,11 @@ from derivatives import central_difference, relative_to_group
 from scipy.spatial.transform import Rotation
 from time_slots_and_mains import tracker
 
+from magfusion.estimation.graph.state import States
 from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
 from magfusion.estimation.snapshot.apart import by_motion, linearized, predicted
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.estimation.snapshot.problem import Motion, Problem, State, epochs_of
-from magfusion.estimation.state import States
 from magfusion.model.parameters import initial_calibration, predict_channels
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site, Slots

@@ -10,11 +10,11 @@ from conftest import Refuse, run_command
 from far_and_weak import FAR_AWAY, RATE_HZ, far_site, witnessed_log
 from rests_smoothed import Config, run
 
-from magfusion.estimation.at_rest import at_rest
-from magfusion.estimation.log_graph import overlap
-from magfusion.estimation.measurements.measurement import Rows
+from magfusion.estimation.batch.log_graph import overlap
+from magfusion.estimation.graph.measurement import Rows
+from magfusion.estimation.graph.state import States
 from magfusion.estimation.measurements.zero_rate import ZeroRate, freed_of_bias, zero_rate
-from magfusion.estimation.state import States
+from magfusion.estimation.rests.at_rest import at_rest
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.model.parameters import initial_calibration

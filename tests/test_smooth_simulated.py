@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.demodulation import first_fixes, phasors
-from magfusion.estimation.initialization.chain import choose_chains, start_phases
-from magfusion.estimation.log_graph import overlap
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.batch.chain import choose_chains, start_phases
+from magfusion.estimation.batch.log_graph import overlap
+from magfusion.estimation.demodulation.demodulation import first_fixes, phasors
 from magfusion.model.parameters import Calibration, difference, initial_calibration
 from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import BeaconSigma, MagnetometerSigma, Site

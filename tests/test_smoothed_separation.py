@@ -7,11 +7,12 @@ import pytest
 from scipy.stats import binom
 from small_problem import SIGMA, SmallLog
 
-from magfusion.estimation import chain_system, considered, factors, marginals, native_rows
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.integrity.separation import protection_levels
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.graph import considered, factors
 from magfusion.estimation.integrity.smoothed_exclusion import SLACK, separated_smooth
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
+from magfusion.estimation.posterior import chain_system, marginals, native_rows
+from magfusion.estimation.posterior.separation import protection_levels
 from magfusion.estimation.solve.chain import Chain, solve_chain
 from magfusion.model.trust import Risk, Verdict
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site

@@ -13,20 +13,15 @@ from scipy.spatial.transform import Rotation
 from small_problem import SmallLog, small_log, small_problem
 
 from magfusion.errors import EstimationError
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.factors import CALIBRATION_KEY
-from magfusion.estimation.graph import (
-    Estimate,
-    Graph,
-    initial_estimate,
-    read_states,
-)
-from magfusion.estimation.marginals import marginals
-from magfusion.estimation.measurements.measurement import robust_weight
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.graph.factors import CALIBRATION_KEY
+from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate, read_states
+from magfusion.estimation.graph.measurement import robust_weight
+from magfusion.estimation.graph.state import states_in
 from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.posterior.marginals import marginals
 from magfusion.estimation.solve.bordered import optimise
 from magfusion.estimation.solve.ordering import nested_dissection
-from magfusion.estimation.state import states_in
 from magfusion.model.noise import measurement_cov
 from magfusion.model.parameters import (
     Block,

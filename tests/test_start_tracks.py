@@ -8,9 +8,8 @@ from derivatives import central_difference, relative_to_group
 from online_log import SIGMA, surveyed_site
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.ekf import ErrorStateFilter
-from magfusion.estimation.initialization.strides import strides_between
-from magfusion.estimation.initialization.tracks import (
+from magfusion.estimation.batch.strides import strides_between
+from magfusion.estimation.batch.tracks import (
     MOTION,
     Heard,
     Tracks,
@@ -20,9 +19,10 @@ from magfusion.estimation.initialization.tracks import (
     rows_at,
     updated,
 )
+from magfusion.estimation.graph.propagation import propagate
+from magfusion.estimation.graph.state import State
 from magfusion.estimation.measurements.phasors import field_phasors
-from magfusion.estimation.propagation import propagate
-from magfusion.estimation.state import State
+from magfusion.estimation.online.ekf import ErrorStateFilter
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site

@@ -8,10 +8,10 @@ import random_starts
 from random_starts import Case, lone, recorded
 from scipy.stats import binom, chi2
 
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.demodulation import first_fixes
-from magfusion.estimation.initialization.chain import choose_chains
-from magfusion.estimation.initialization.search import differ, search, thinned
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.batch.chain import choose_chains
+from magfusion.estimation.batch.search import differ, search, thinned
+from magfusion.estimation.demodulation.demodulation import first_fixes
 from magfusion.model.parameters import initial_calibration
 from magfusion.results.errors import trajectory_errors
 from magfusion.simulation.demo_site import demo_site

@@ -13,13 +13,13 @@ from online_log import OnlineLog, navigate, online_log, silent
 from scipy.spatial.transform import Rotation
 from test_parameters import GyroScale
 
-from magfusion.estimation.carried import Departure, carried_states, carry, departing
-from magfusion.estimation.integrity.separation import radii
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.process_noise import calibration_process_noise
-from magfusion.estimation.propagation import propagate
-from magfusion.estimation.state import MOTION, State, between, moved
-from magfusion.estimation.state_of_now import CarriedState
+from magfusion.estimation.graph.process_noise import calibration_process_noise
+from magfusion.estimation.graph.propagation import propagate
+from magfusion.estimation.graph.state import MOTION, State, between, moved
+from magfusion.estimation.online.carried import Departure, carried_states, carry, departing
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.state_of_now import CarriedState
+from magfusion.estimation.posterior.separation import radii
 from magfusion.files.site import save_site
 from magfusion.jobs.replay import run_replay
 from magfusion.model.parameters import initial_calibration

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.batch import smooth
+from magfusion.estimation.batch.batch import smooth
+from magfusion.estimation.data_checks.steady_field import off_earth
 from magfusion.estimation.integrity.judge import judged
-from magfusion.estimation.integrity.steady_field import off_earth
 from magfusion.model.trust import Verdict
 from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
 from magfusion.simulation.log import SimulationConfig, simulate_log

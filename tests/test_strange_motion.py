@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from magfusion.errors import InputError
-from magfusion.estimation.integrity.recording import recorded
+from magfusion.estimation.data_checks.recording import recorded
 from magfusion.files.plausible import check_imu
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.units import DEGREE, STANDARD_GRAVITY, Array

@@ -21,9 +21,9 @@ from warming import (
 )
 
 from magfusion.errors import InputError
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.restored import restored
-from magfusion.estimation.warming import at_reference, samples_at_reference
+from magfusion.estimation.demodulation.warming import at_reference, samples_at_reference
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.restored import restored
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.jobs.demodulate import DemodulateSettings, run_demodulate

@@ -6,16 +6,16 @@ import gtsam
 import numpy as np
 import pytest
 
-from magfusion.estimation import imu_decimation as thinning
-from magfusion.estimation.batch import Smoothed, smooth
-from magfusion.estimation.imu_decimation import (
+from magfusion.estimation.batch.batch import Smoothed, smooth
+from magfusion.estimation.graph import imu_decimation as thinning
+from magfusion.estimation.graph.imu_decimation import (
     FEWEST_LEFT,
     JOINED,
     MOST_TURN,
     preintegrate_stream,
     thinned,
 )
-from magfusion.estimation.preintegration import Increments, cut_at_epochs, preintegrate
+from magfusion.estimation.graph.preintegration import Increments, cut_at_epochs, preintegrate
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import ImuModel
 from magfusion.model.trajectory import Trajectory

@@ -11,7 +11,7 @@ import tracker_motion_skew as moving
 from conftest import run_command
 from time_slots_and_mains import tracker
 
-from magfusion.estimation.batch import SmootherSettings, smooth
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import save_site
 from magfusion.files.tum import read_tum

@@ -17,7 +17,7 @@ from tracker_site import tracker_site
 
 from magfusion.cli import main
 from magfusion.errors import EstimationError
-from magfusion.estimation.integrity.priors import contradiction, unexplained
+from magfusion.estimation.snapshot.priors import contradiction, unexplained
 from magfusion.files.log import write_log
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site, save_site
@@ -290,7 +290,7 @@ def test_whatever_fails_leaves_a_report_that_says_so(
     def fails(*_given: object) -> None:
         raise EstimationError("the sky fell")
 
-    monkeypatch.setattr("magfusion.estimation.self_survey.smooth_and_place", fails)
+    monkeypatch.setattr("magfusion.estimation.batch.self_survey.smooth_and_place", fails)
     capfd.readouterr()
     failing("calibrate", "log", worked.log, "-o", tmp_path / "out")
     told = contradicted(tmp_path / "out")

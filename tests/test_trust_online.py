@@ -12,14 +12,14 @@ from online_log import OnlineLog, navigate, online_log
 from test_checkpoint import _rest, same
 from test_navigate_stream import answered, records
 
-import magfusion.estimation.navigator as navigator_module
+import magfusion.estimation.online.navigator as navigator_module
 from magfusion.cli import main
-from magfusion.estimation.integrity.judgement import JudgedState, Judgement
-from magfusion.estimation.integrity.recovery import LONGEST_WAIT, Attempts
-from magfusion.estimation.integrity.running import nothing
-from magfusion.estimation.integrity.summary import Summary
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.restored import restored
+from magfusion.estimation.data_checks.running import nothing
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.restored import restored
+from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
+from magfusion.estimation.online_integrity.recovery import LONGEST_WAIT, Attempts
+from magfusion.estimation.online_integrity.summary import Summary
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.jobs.stream import StreamSettings

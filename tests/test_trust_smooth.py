@@ -10,15 +10,15 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from small_problem import small_log
 
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.integrity.judge import judged
-from magfusion.estimation.integrity.score import scores_of
-from magfusion.estimation.integrity.statistics import (
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.data_checks.statistics import (
     effective_number,
     holm,
     log_p_chi_square,
     sigmas,
 )
+from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.integrity.score import scores_of
 from magfusion.estimation.integrity.suspects import CODE, held_blocks, suspects
 from magfusion.model.parameters import LOG_MOMENT, SENSOR_POSITION, SENSOR_ROTATION
 from magfusion.model.samples import Log

@@ -6,14 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magfusion.estimation.batch import SmootherSettings
-from magfusion.estimation.demodulation import phasors
-from magfusion.estimation.integrity.recording import BRIDGED, recorded
-from magfusion.estimation.integrity.spectrum import beside_lines
+from magfusion.estimation.batch.batch import SmootherSettings
+from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.estimation.data_checks.spectrum import beside_lines
+from magfusion.estimation.demodulation.demodulation import phasors
 from magfusion.files.log import write_log
 from magfusion.files.site import save_site
 from magfusion.jobs.inputs import Job
-from magfusion.jobs.navigate import NavigateSettings, run_navigate
+from magfusion.jobs.navigate import run_navigate
+from magfusion.jobs.navigate_settings import NavigateSettings
 from magfusion.jobs.smooth import run_smooth
 from magfusion.model.site import Site
 from magfusion.model.trust import Verdict

@@ -11,10 +11,10 @@ from conftest import Refuse
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.estimation.graph.state import States
 from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
 from magfusion.estimation.measurements.signs import along_axis, count_open, with_signs
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import States
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.log import write_log
 from magfusion.files.named_records import site_fields
 from magfusion.files.site import save_site

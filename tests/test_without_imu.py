@@ -11,11 +11,11 @@ from conftest import Refuse, run_command
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.estimation.batch import smooth
+from magfusion.estimation.batch.batch import smooth
+from magfusion.estimation.graph.preintegration import cut_at_epochs, preintegrate
+from magfusion.estimation.graph.state import as_trajectory
 from magfusion.estimation.integrity.judge import judged
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.preintegration import cut_at_epochs, preintegrate
-from magfusion.estimation.state import as_trajectory
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.log import read_log, write_log
 from magfusion.files.site import load_site, save_site
 from magfusion.files.stream_contents import fields_content, write_record

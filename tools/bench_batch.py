@@ -12,8 +12,8 @@ import time
 import gtsam
 import numpy as np
 
-from magfusion.estimation.batch import smooth
-from magfusion.estimation.preintegration import preintegration_parameters
+from magfusion.estimation.batch.batch import smooth
+from magfusion.estimation.graph.preintegration import preintegration_parameters
 from magfusion.model.samples import ImuSamples, Log
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from magfusion.estimation.navigator import NavigatorSettings
+from magfusion.estimation.online.navigator import NavigatorSettings
 from magfusion.files.checkpoint import run_key
 from magfusion.jobs.checkpoint import begin, save
 from magfusion.jobs.drift_world import bare_loop, memory_mib

@@ -32,15 +32,11 @@ from bench_batch import bench_batch
 from native_graph import native_graph
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.graph import (
-    Estimate,
-    Graph,
-    initial_estimate,
-)
-from magfusion.estimation.inertial import inertial_graph
-from magfusion.estimation.marginals import marginals
+from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate
+from magfusion.estimation.graph.inertial import inertial_graph
+from magfusion.estimation.graph.preintegration import cut_at_epochs, preintegrate
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.preintegration import cut_at_epochs, preintegrate
+from magfusion.estimation.posterior.marginals import marginals
 from magfusion.estimation.solve.bordered import Optimised, optimise
 from magfusion.model.noise import paired_whitening, stacked
 from magfusion.model.parameters import Block, Calibration, choose_blocks, initial_calibration

@@ -26,8 +26,8 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.preintegration import preintegration_parameters
+from magfusion.estimation.graph.preintegration import preintegration_parameters
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.model.field import skew
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.site import Site

@@ -24,7 +24,7 @@ import gtsam
 import numpy as np
 from bench_long import GOAL_MINUTES, measure, used
 
-from magfusion.estimation.preintegration import preintegration_parameters
+from magfusion.estimation.graph.preintegration import preintegration_parameters
 from magfusion.files.open import open_log
 from magfusion.files.site import load_site
 from magfusion.model.samples import ImuSamples

@@ -15,11 +15,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.batch import SmootherSettings, smooth
-from magfusion.estimation.integrity.fix_separation import separate_fixes
+from magfusion.estimation.batch.batch import SmootherSettings, smooth
+from magfusion.estimation.graph.preintegration import preintegration_parameters
 from magfusion.estimation.integrity.score import scores_of
 from magfusion.estimation.integrity.suspects import suspects
-from magfusion.estimation.preintegration import preintegration_parameters
+from magfusion.estimation.snapshot.fix_separation import separate_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.field import predict
 from magfusion.model.parameters import initial_calibration

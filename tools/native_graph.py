@@ -12,8 +12,8 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import L, M, S, X
 
-from magfusion.estimation.graph import initial_estimate
-from magfusion.estimation.inertial import inertial_graph
+from magfusion.estimation.graph.graph import initial_estimate
+from magfusion.estimation.graph.inertial import inertial_graph
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.solve.ordering import nested_dissection
 from magfusion.model.field import observe, predict

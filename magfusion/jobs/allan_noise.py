@@ -11,13 +11,13 @@ from magfusion.calibration.allan import AllanVariance
 from magfusion.calibration.allan_fit import MISFIT, AllanFit, fit_allan
 from magfusion.calibration.rest import QUANTISED, RestStream
 from magfusion.errors import InputError
-from magfusion.estimation.integrity.samples import (
+from magfusion.estimation.data_checks.samples import (
     clipped_samples,
     false_samples,
     frozen_samples,
     repeated_samples,
 )
-from magfusion.estimation.integrity.stamps import uneven_stamps
+from magfusion.estimation.data_checks.stamps import uneven_stamps
 from magfusion.files.table_stream import Piece, pieces
 from magfusion.jobs.inputs import Job
 from magfusion.model.progress import Report

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from magfusion.calibration.antenna_site import BodySurvey
     from magfusion.calibration.antenna_tracking import PoseErrors
     from magfusion.files.probe import Side
-    from magfusion.jobs.calibrate_antenna import AntennaSettings
+    from magfusion.jobs.antenna_settings import AntennaSettings
     from magfusion.model.antenna import Antenna
     from magfusion.model.probe import ProbeReadings
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from magfusion.calibration.antenna_observability import Observability
     from magfusion.calibration.antenna_tracking import PoseErrors
     from magfusion.jobs.antenna_fit import Bench, Solved
-    from magfusion.jobs.calibrate_antenna import AntennaSettings
+    from magfusion.jobs.antenna_settings import AntennaSettings
     from magfusion.model.antenna import Antenna
     from magfusion.model.site import Site
 

@@ -33,7 +33,7 @@ def judged(
         Of fixes at surveyed poses with the declared antenna, and with one that was fitted without
         the pose; None where there was no survey.
     """
-    from magfusion.estimation.integrity.priors import contradiction, trust_of, unexplained
+    from magfusion.estimation.snapshot.priors import contradiction, trust_of, unexplained
 
     fit = found.fit
     fitted = unexplained(

@@ -157,7 +157,7 @@ def judged(index: Index, site: Site, log: Log) -> Trust:
     Iron on the platform may distort it, for which a database is made; what no uniform field
     resembles has attitudes that are not those of the field.
     """
-    from magfusion.estimation.integrity.recording import BRIDGED, recorded
+    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
     from magfusion.model.trust import Finding, Trust, Verdict
 
     found = list(recorded(log, site, BRIDGED))

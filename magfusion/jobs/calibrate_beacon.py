@@ -241,7 +241,7 @@ def _estimates(found: _Calibrated) -> list[Estimate]:
 
 def judged(found: _Calibrated) -> tuple[_Calibrated, Trust]:
     """Return a calibration with sigmas that its witnesses allow, and what they say."""
-    from magfusion.estimation.integrity.priors import contradiction, trust_of, unexplained
+    from magfusion.estimation.snapshot.priors import contradiction, trust_of, unexplained
     from magfusion.model.trust import Finding, Trust, Verdict
 
     name = found.refined.beacon.name
@@ -326,7 +326,7 @@ def _bent_deg(found: _Calibrated) -> float:
 
 
 def _rivals(found: _Calibrated) -> list[tuple[Array, float]]:
-    from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
+    from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
 
     excess = found.fits.rival_chi_square[0] - found.fits.chi_square[0]
     out: list[tuple[Array, float]] = []

@@ -172,7 +172,7 @@ def points_of(survey: Survey, site: Site, path: Path) -> MapPoints:
 
 def _from_log(settings: MapSettings) -> tuple[Site, MapPoints, Figures, tuple[Finding, ...]]:
     from magfusion.calibration.fieldmap import MapPoints, thinned
-    from magfusion.estimation.integrity.recording import BRIDGED, recorded
+    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
     from magfusion.jobs.inputs import Job, named, read_estimate, read_job
     from magfusion.model.trajectory import interpolate
     from magfusion.results.report import dropped_figures
@@ -203,7 +203,7 @@ def _from_log(settings: MapSettings) -> tuple[Site, MapPoints, Figures, tuple[Fi
 
 def _samples(log: Log, site: Site, poses: Trajectory) -> tuple[FieldSamples, dict[str, int]]:
     """Return phasors; with the motion in each window taken off where the poses are its own."""
-    from magfusion.estimation.demodulation import demodulated
+    from magfusion.estimation.demodulation.demodulation import demodulated
     from magfusion.model.parameters import initial_calibration
 
     source = demodulated(log, site, None)

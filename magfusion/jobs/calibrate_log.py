@@ -14,7 +14,7 @@ from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Site
 
 if TYPE_CHECKING:
-    from magfusion.estimation.batch import Smoothed, SmootherSettings
+    from magfusion.estimation.batch.batch import Smoothed, SmootherSettings
     from magfusion.jobs.inputs import Job
     from magfusion.model.samples import Log
     from magfusion.model.trust import Trust, Verdict
@@ -89,9 +89,9 @@ def run_calibrate_log(
     EstimationError
         Where the smoother fails, or the verdict is failed.
     """
-    from magfusion.estimation.batch import SmootherSettings
+    from magfusion.estimation.batch.batch import SmootherSettings
+    from magfusion.estimation.batch.self_survey import smooth_and_place
     from magfusion.estimation.integrity.judge import judged
-    from magfusion.estimation.self_survey import smooth_and_place
     from magfusion.files.site import save_site
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
     from magfusion.model.trust import Trust
@@ -184,7 +184,7 @@ def against_site(result: Smoothed, least: float = 1.0) -> tuple[Smoothed, Trust]
     least : float
         What the covariance of the calibration is multiplied by at least.
     """
-    from magfusion.estimation.integrity.priors import contradiction, trust_of, unexplained
+    from magfusion.estimation.snapshot.priors import contradiction, trust_of, unexplained
     from magfusion.model.parameters import difference
     from magfusion.model.prior import prior_sqrt_covariance
     from magfusion.results.refinement import parameter_estimates
@@ -275,7 +275,7 @@ def _cuts(job: Job, log: Log, site: Site, parts: int | None) -> list[float | Non
 def _transfer(
     job: Job, site: Site, settings: SmootherSettings, cuts: list[float | None], report: Report
 ) -> Transfer:
-    from magfusion.estimation.batch import smooth
+    from magfusion.estimation.batch.batch import smooth
     from magfusion.jobs.inputs import read_job
     from magfusion.results.refinement import result_site
     from magfusion.results.transfer import Estimated, agreement
@@ -303,7 +303,7 @@ def _transfer(
 
 
 def _score(log: Log, site: Site, settings: SmootherSettings) -> Score:
-    from magfusion.estimation.batch import smooth
+    from magfusion.estimation.batch.batch import smooth
     from magfusion.results.errors import trajectory_errors
 
     fixed = smooth(log, site, replace(settings, estimate=OF_LOG))

@@ -16,7 +16,7 @@ from magfusion.units import DEGREE, NANOTESLA, Array
 
 if TYPE_CHECKING:
     from magfusion.calibration.magnetometer_log import LogCalibration
-    from magfusion.estimation.integrity.priors import Contradiction
+    from magfusion.estimation.snapshot.priors import Contradiction
     from magfusion.jobs.inputs import Job
     from magfusion.model.samples import Log
     from magfusion.model.trust import Finding, Trust
@@ -214,8 +214,8 @@ def calibrated(log: Log, site: Site, *, positions: bool = False) -> tuple[LogCal
 def judged(found: LogCalibration, site: Site, log: Log) -> tuple[LogCalibration, Trust]:
     """Return a calibration with sigmas that its witnesses allow, and what they say."""
     from magfusion.calibration.magnetometer import refined
-    from magfusion.estimation.integrity.priors import contradiction, trust_of
-    from magfusion.estimation.integrity.recording import BRIDGED, recorded
+    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+    from magfusion.estimation.snapshot.priors import contradiction, trust_of
     from magfusion.model.trust import Trust
 
     declared, prior, fit = site.platform.magnetometer, found.prior, found.graph.fit
@@ -242,7 +242,7 @@ def judged(found: LogCalibration, site: Site, log: Log) -> tuple[LogCalibration,
 
 def _beside(found: LogCalibration) -> Contradiction:
     """Return whether what was found beside the calibration contradicts the site."""
-    from magfusion.estimation.integrity.priors import contradiction
+    from magfusion.estimation.snapshot.priors import contradiction
 
     graph, prior = found.graph, found.prior
     names = ["earth.dip", *(f"imu.{k}_bias_{axis}" for k in ("accel", "gyro") for axis in _AXES)]

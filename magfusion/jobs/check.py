@@ -37,7 +37,7 @@ def run_check(
     """
     from contextlib import nullcontext
 
-    from magfusion.estimation.demodulated_apart import by_name, each_recorded
+    from magfusion.estimation.demodulation.demodulated_apart import by_name, each_recorded
     from magfusion.estimation.integrity.first_look import first_look
     from magfusion.jobs.inputs import claim, found_in, read_recording
     from magfusion.model.trust import Trust

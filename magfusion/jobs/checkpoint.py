@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.checkpoint import (
     Checkpoint,
     claim_checkpoint,
@@ -68,7 +68,7 @@ def begin(
         if place is not None:
             claim_checkpoint(place)
         return Begun(Navigator(site, settings), 0, beside)
-    from magfusion.estimation.restored import restored
+    from magfusion.estimation.online.restored import restored
 
     with named(place):
         beside = from_plain(type(beside), found.content.get("beside"), "beside")

@@ -30,7 +30,7 @@ def run_demo(settings: DemoSettings, output: Path, report: Report = quiet) -> Fi
     InputError
         Where ``output`` is in the way.
     """
-    from magfusion.estimation.batch import SmootherSettings
+    from magfusion.estimation.batch.batch import SmootherSettings
     from magfusion.jobs.inputs import Job
     from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
     from magfusion.simulation.log import SimulationConfig

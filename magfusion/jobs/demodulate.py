@@ -32,10 +32,10 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     """
     import numpy as np
 
-    from magfusion.estimation.demodulated_apart import demodulated_apart
-    from magfusion.estimation.demodulation import phasors
-    from magfusion.estimation.drive_reference import referred
-    from magfusion.estimation.integrity.recording import passed_on
+    from magfusion.estimation.data_checks.recording import passed_on
+    from magfusion.estimation.demodulation.demodulated_apart import demodulated_apart
+    from magfusion.estimation.demodulation.demodulation import phasors
+    from magfusion.estimation.demodulation.drive_reference import referred
     from magfusion.files.fields import by_own_clocks
     from magfusion.files.log import write_log
     from magfusion.files.site import save_site

@@ -10,7 +10,7 @@ import numpy as np
 from magfusion.jobs.coverage import finite, level_figures
 
 if TYPE_CHECKING:
-    from magfusion.jobs.design import DesignSettings
+    from magfusion.jobs.design_settings import DesignSettings
     from magfusion.model.site import Beacon
     from magfusion.results.coverage import Coverage
     from magfusion.results.design.planning import Design, Task

@@ -10,7 +10,7 @@ import numpy as np
 from magfusion.errors import InputError
 
 if TYPE_CHECKING:
-    from magfusion.jobs.design import DesignSettings
+    from magfusion.jobs.design_settings import DesignSettings
     from magfusion.model.hall import Hall
     from magfusion.model.site import Site
     from magfusion.results.design.motion import Motion, Stop

@@ -14,9 +14,9 @@ import gtsam
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.preintegration import preintegration_parameters
-from magfusion.estimation.state import ACCEL_BIAS, GYRO_BIAS, State
+from magfusion.estimation.graph.preintegration import preintegration_parameters
+from magfusion.estimation.graph.state import ACCEL_BIAS, GYRO_BIAS, State
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
 from magfusion.files.atomic import abandoned_pattern
 from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
 from magfusion.files.row_file import Mark, RowFile, claim_rows

@@ -117,7 +117,7 @@ def run_fix(
     ----------
     free : tuple of str
         What is found beside the pose, whether or not the fields ask for it, as in
-        `magfusion.estimation.integrity.explained_fixes`.
+        `magfusion.estimation.snapshot.explained_fixes`.
     risk : Risk, optional
         What the protection levels promise.
     rest : RestSettings, optional
@@ -129,11 +129,11 @@ def run_fix(
     """
     import numpy as np
 
-    from magfusion.estimation.demodulation import fix_inputs, phasors
-    from magfusion.estimation.integrity.explained_fixes import explained_fixes
-    from magfusion.estimation.integrity.fix_magnetometers import contradicting_magnetometers
+    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+    from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
     from magfusion.estimation.integrity.place_witness import of_place
-    from magfusion.estimation.integrity.recording import BRIDGED, recorded
+    from magfusion.estimation.snapshot.explained_fixes import explained_fixes
+    from magfusion.estimation.snapshot.fix_magnetometers import contradicting_magnetometers
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
     from magfusion.model.parameters import initial_calibration
     from magfusion.model.trust import Trust
@@ -206,7 +206,7 @@ def _run_coil(
     report: Report,
 ) -> Figures:
     """Fix a receiver of one axis, whose roll about it nothing tells."""
-    from magfusion.estimation.demodulation import fix_inputs, phasors
+    from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
     from magfusion.jobs.fix_coil import find_coil
     from magfusion.jobs.inputs import found_in, named, refuse_failed
 
@@ -309,8 +309,8 @@ def run_published_fix(job: Job, settings: FixSettings) -> Figures:
         share fewer than three rotating beacons, or as many are detected in no epoch.
     EstimationError
     """
-    from magfusion.estimation.demodulation import phasors
-    from magfusion.estimation.integrity.recording import BRIDGED, recorded
+    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+    from magfusion.estimation.demodulation.demodulation import phasors
     from magfusion.files.survey import read_survey
     from magfusion.files.trajectory_table import write_trajectory
     from magfusion.files.tum import write_tum

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magfusion.errors import EstimationError
+from magfusion.estimation.data_checks.recording import BRIDGED, recorded
 from magfusion.estimation.integrity.place_witness import of_place
-from magfusion.estimation.integrity.recording import BRIDGED, recorded
 from magfusion.estimation.snapshot.ambiguity import relations
 from magfusion.estimation.snapshot.coil_fix import UNKNOWNS, CoilFixes, Gain, fix_coil
 from magfusion.estimation.snapshot.coil_poses import (

@@ -3,56 +3,24 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magfusion.errors import InputError
-from magfusion.jobs.settings import Command, TopicSettings, option
+from magfusion.jobs.init_settings import InitSettings
+from magfusion.jobs.settings import Command
 from magfusion.results.figures import Figure, Figures, Section, heading
 
 if TYPE_CHECKING:
-    from magfusion.estimation.integrity.tones import Tone, Transmitted
+    from magfusion.estimation.data_checks.tones import Tone, Transmitted
     from magfusion.files.site_draft import BeaconDraft
     from magfusion.files.site_text import SiteDraft
     from magfusion.model.site import Site
     from magfusion.model.trust import Finding
 
 NEAR_HZ = 0.5  # of a declared frequency, a line is that beacon
-
-
-@dataclass(frozen=True, kw_only=True)
-class InitSettings(TopicSettings):
-    """What is said of an installation; on a terminal, what nobody said is asked."""
-
-    beacon: tuple[str, ...] = option(
-        (),
-        "A beacon, in the keys of a site; again for each",
-        metavar="'NAME KEY=VALUE ...'",
-        note="frequency_hz, and position_m, rpy_deg, moment_a_m2, axes, radius_m, synchronised",
-    )
-    log: Path | None = option(
-        None, "Recording in which to find the tones of the beacons", note="default: none"
-    )
-    imu: str | None = option(None, "Inertial sensor, of those that --list-imus names")
-    magnetometer: str | None = option(
-        None, "Magnetometer, of those that --list-magnetometers names"
-    )
-    lever: str | None = option(None, "Magnetometer from the IMU, in its axes, m", metavar="X,Y,Z")
-    mounting: str | None = option(
-        None, "Magnetometer against the IMU, degrees", metavar="ROLL,PITCH,YAW"
-    )
-    location: str | None = option(
-        None, "Place, for gravity and the Earth's field", metavar="LAT,LON,HEIGHT,DATE"
-    )
-    list_imus: bool = option(False, "List the inertial sensors that are known by name")
-    list_magnetometers: bool = option(False, "List the magnetometers that are known by name")
-
-    @property
-    def described(self) -> bool:
-        """Whether anything was said of the installation itself."""
-        said = (self.imu, self.magnetometer, self.lever, self.mounting, self.location)
-        return bool(self.beacon) or any(one is not None for one in said)
 
 
 def run_init(settings: InitSettings, output: Path) -> Figures | None:
@@ -92,8 +60,8 @@ def _heard(settings: InitSettings) -> Transmitted | None:
     """Return what transmits in the recording, if there is one."""
     if settings.log is None:
         return None
-    from magfusion.estimation.integrity.mending import mended
-    from magfusion.estimation.integrity.tones import transmitted
+    from magfusion.estimation.data_checks.mending import mended
+    from magfusion.estimation.data_checks.tones import transmitted
     from magfusion.files.open import open_log
     from magfusion.jobs.inputs import topics_option
 
@@ -170,7 +138,6 @@ def _with_tones(
 ) -> tuple[list[BeaconDraft], list[Finding]]:
     """Return the beacons with the tones of the recording, and what the two say of each other."""
     from magfusion.files.site_draft import BeaconDraft
-    from magfusion.model.trust import Finding
 
     silent = [beacon.name for beacon in beacons if beacon.frequency_hz is None]
     if heard is None:
@@ -180,19 +147,9 @@ def _with_tones(
                 " --log, in which to find it"
             )
         return beacons, []
-    declared = [f for beacon in beacons for f in beacon.frequency_hz or ()]
-    free = [t for t in heard.tones if all(abs(t.frequency_hz - f) > NEAR_HZ for f in declared)]
-    findings = [
-        Finding(
-            "silent_beacon",
-            f"beacon {beacon.name} is not heard at {f:g} Hz in the recording: it is switched off,"
-            f" far away, or its frequency is another ({_listed(free) or 'no other stands out'}).",
-        )
-        for beacon in beacons
-        for f in beacon.frequency_hz or ()
-        if all(abs(tone.frequency_hz - f) > NEAR_HZ for tone in heard.tones)
-    ]
-    if silent and (len(silent) > 1 or len(free) != 1):
+    free = _free_tones(beacons, heard.tones)
+    findings = _switched_off(beacons, heard.tones, free)
+    if len(silent) > 1 or (silent and len(free) != 1):
         raise InputError(
             f"--beacon {silent[0]}: frequency_hz is missing, and the recording does not tell it:"
             f" {_listed(free) or 'no other tone'} stands out; give frequency_hz"
@@ -202,14 +159,49 @@ def _with_tones(
         return [_of_tone(BeaconDraft(name), tone) for name, tone in tones], findings
     if silent:
         return [_of_tone(b, free[0]) if b.frequency_hz is None else b for b in beacons], findings
-    findings += [
+    return beacons, findings + _undeclared(free)
+
+
+def _near(tone: Tone, frequencies_hz: Iterable[float]) -> bool:
+    """Tell whether a tone is at one of some frequencies."""
+    return any(abs(tone.frequency_hz - f) <= NEAR_HZ for f in frequencies_hz)
+
+
+def _free_tones(beacons: list[BeaconDraft], tones: Iterable[Tone]) -> list[Tone]:
+    """Return the tones that are at no beacon's frequency."""
+    declared = [f for beacon in beacons for f in beacon.frequency_hz or ()]
+    return [tone for tone in tones if not _near(tone, declared)]
+
+
+def _switched_off(
+    beacons: list[BeaconDraft], tones: Iterable[Tone], free: list[Tone]
+) -> list[Finding]:
+    """Return which frequencies of beacons are not in a recording, and what else is."""
+    from magfusion.model.trust import Finding
+
+    return [
+        Finding(
+            "silent_beacon",
+            f"beacon {beacon.name} is not heard at {f:g} Hz in the recording: it is switched off,"
+            f" far away, or its frequency is another ({_listed(free) or 'no other stands out'}).",
+        )
+        for beacon in beacons
+        for f in beacon.frequency_hz or ()
+        if not any(_near(tone, (f,)) for tone in tones)
+    ]
+
+
+def _undeclared(tones: Iterable[Tone]) -> list[Finding]:
+    """Return that some tones of a recording are of no beacon."""
+    from magfusion.model.trust import Finding
+
+    return [
         Finding(
             "undeclared_line",
             f"{_listed([tone])} transmits in the recording, and no --beacon has this frequency.",
         )
-        for tone in free
+        for tone in tones
     ]
-    return beacons, findings
 
 
 def _names() -> list[str]:

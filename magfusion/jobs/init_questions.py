@@ -9,10 +9,10 @@ from rich.console import Console
 from rich.prompt import Prompt
 
 from magfusion.errors import InputError
-from magfusion.estimation.integrity.tones import Tone
+from magfusion.estimation.data_checks.tones import Tone
 from magfusion.files.instruments import UNNAMED, named_imu, named_magnetometer
 from magfusion.files.site_draft import beacon_draft, numbers, place_of
-from magfusion.jobs.init import InitSettings
+from magfusion.jobs.init_settings import InitSettings
 
 Answer = TypeVar("Answer")
 _SCREEN = Console(stderr=True, highlight=False, emoji=False)

@@ -9,13 +9,13 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.demodulated_apart import demodulated_apart, of_site
-from magfusion.estimation.drive_reference import turning_currents, with_drives
-from magfusion.estimation.hearing import heard_site
-from magfusion.estimation.integrity.magnetometers import without_silent
-from magfusion.estimation.integrity.mending import mended
+from magfusion.estimation.data_checks.magnetometers import without_silent
+from magfusion.estimation.data_checks.mending import mended
+from magfusion.estimation.demodulation.demodulated_apart import demodulated_apart, of_site
+from magfusion.estimation.demodulation.drive_reference import turning_currents, with_drives
+from magfusion.estimation.demodulation.hearing import heard_site
+from magfusion.estimation.demodulation.warming import at_reference
 from magfusion.estimation.measurements.signs import along_axis
-from magfusion.estimation.warming import at_reference
 from magfusion.files.atomic import (
     abandoned_pattern,
     real,
@@ -29,7 +29,7 @@ from magfusion.files.site import load_site
 from magfusion.files.trajectory_table import read_trajectory
 from magfusion.files.tum import read_tum
 from magfusion.jobs.receiver_axes import check_axes
-from magfusion.jobs.region import ANYWHERE, Where
+from magfusion.jobs.region_option import ANYWHERE, Where
 from magfusion.jobs.rotor_inputs import check_rotors, is_for_ranging
 from magfusion.jobs.written import CHECKPOINT as CHECKPOINT
 from magfusion.jobs.written import KEPT as KEPT

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.condensed import Condensed
-from magfusion.estimation.initialization.chain import Start
-from magfusion.estimation.joint import Said
-from magfusion.estimation.joint_log import OfLog
-from magfusion.estimation.noise_tuning import Tuned
-from magfusion.estimation.prepared import Begun
+from magfusion.estimation.batch.chain import Start
+from magfusion.estimation.batch.joint import Said
+from magfusion.estimation.batch.joint_log import OfLog
+from magfusion.estimation.batch.prepared import Begun
+from magfusion.estimation.posterior.condensed import Condensed
+from magfusion.estimation.posterior.noise_tuning import Tuned
 from magfusion.files.kept import Kept, load_kept, save_kept
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import Site

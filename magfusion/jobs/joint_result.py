@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magfusion.estimation.noise_tuning import Tuned, with_noise
+from magfusion.estimation.posterior.noise_tuning import Tuned, with_noise
 from magfusion.files.row_table import write_rows
 from magfusion.files.site import save_site
 from magfusion.jobs.inputs import LOGS, LOGS_TABLE, Job, claim, keep_results
@@ -33,7 +33,7 @@ from magfusion.results.verdict import trust_figures
 from magfusion.units import Array, Rate
 
 if TYPE_CHECKING:
-    from magfusion.estimation.batch import SmootherSettings
+    from magfusion.estimation.batch.batch import SmootherSettings
     from magfusion.jobs.settings import LogsSettings
     from magfusion.model.trust import Risk
 

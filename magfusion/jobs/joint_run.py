@@ -13,10 +13,17 @@ from typing import Any
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.batch import SmootherSettings
+from magfusion.estimation.batch.batch import SmootherSettings
+from magfusion.estimation.batch.joint import (
+    Known,
+    Shared,
+    apart_in_sigmas,
+    between,
+    known_by,
+    uncoupled,
+)
+from magfusion.estimation.batch.joint_log import OfLog
 from magfusion.estimation.integrity.logs_agree import Agreement, agreement
-from magfusion.estimation.joint import Known, Shared, apart_in_sigmas, between, known_by, uncoupled
-from magfusion.estimation.joint_log import OfLog
 from magfusion.files.atomic import real
 from magfusion.files.kept import digest_of_files
 from magfusion.jobs.inputs import KEPT, Job, read_job, read_site

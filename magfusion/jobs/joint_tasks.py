@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.condensed import shared_blocks
-from magfusion.estimation.integrity.judge import judged
-from magfusion.estimation.joint import Known, Shared, uncoupled
-from magfusion.estimation.joint_log import (
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.batch.joint import Known, Shared, uncoupled
+from magfusion.estimation.batch.joint_log import (
     OfLog,
     after_round,
     joint_posterior,
     of_smoothed,
     solve_round,
 )
+from magfusion.estimation.integrity.judge import judged
+from magfusion.estimation.posterior.condensed import shared_blocks
 from magfusion.jobs.failure import reason_of
 from magfusion.jobs.inputs import Job, claim, named, read_job
 from magfusion.jobs.joint_kept import Alone, load_alone, save_alone

@@ -11,7 +11,7 @@ from magfusion.errors import InputError
 from magfusion.jobs.settings import FrameSettings, option
 
 if TYPE_CHECKING:
-    from magfusion.estimation.integrity.judgement import JudgedState
+    from magfusion.estimation.online_integrity.judgement import JudgedState
     from magfusion.model.site import Site
     from magfusion.results.recording_live import LiveView
 

@@ -43,7 +43,7 @@ def judged(
         The field that was taken as exact (T); none with a database, which refuses what it does not
         know by itself.
     """
-    from magfusion.estimation.integrity.recording import BRIDGED, recorded
+    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
 
     findings = [*_undetermined(matches), *recorded(log, site, BRIDGED)]
     unverified = []

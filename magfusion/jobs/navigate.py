@@ -6,32 +6,21 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.jobs.live import LiveSettings, state_sinks
-from magfusion.jobs.rates import RateSettings, refuse_rate
-from magfusion.jobs.region import RegionSettings
-from magfusion.jobs.rest_settings import RestSettings
-from magfusion.jobs.settings import (
-    Command,
-    EarthSettings,
-    EstimateSettings,
-    ReplayedSettings,
-    RiskSettings,
-    WindowSettings,
-    argument,
-    option,
-)
+from magfusion.jobs.live import state_sinks
+from magfusion.jobs.navigate_settings import NavigateSettings
+from magfusion.jobs.rates import refuse_rate
+from magfusion.jobs.settings import Command
 from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Site
 
 if TYPE_CHECKING:
-    from magfusion.estimation.integrity.judgement import JudgedState
-    from magfusion.estimation.navigator import Navigator, NavigatorSettings
-    from magfusion.jobs.inputs import Job
+    from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+    from magfusion.estimation.online_integrity.judgement import JudgedState
     from magfusion.jobs.live import StateSink
     from magfusion.jobs.navigate_results import NavigateResults
     from magfusion.jobs.replay import Replay
@@ -41,80 +30,6 @@ if TYPE_CHECKING:
     from magfusion.results.figures import Figures
 
 LONGEST_EPOCH = 60.0  # s; of a phasor that belongs to a state of now
-
-
-@dataclass(frozen=True, kw_only=True)
-class NavigateSettings(
-    RegionSettings,
-    WindowSettings,
-    RestSettings,
-    ReplayedSettings,
-    EarthSettings,
-    EstimateSettings,
-    RiskSettings,
-    LiveSettings,
-    RateSettings,
-):
-    """How to navigate as data come, along a log or by records on standard input."""
-
-    log: Path = argument("Log to replay, or - for records on standard input")
-    estimator: Literal["smoother", "ekf"] = option(
-        "smoother", "Fixed-lag smoother, or Kalman filter"
-    )
-    lag: float = option(4.0, "Window of the smoother", unit="s", least=0.5, most=60.0)
-    delay: float = option(
-        0.0,
-        "How late samples may come",
-        unit="s",
-        least=0.0,
-        most=10.0,
-        note="so much later are states",
-    )
-    horizon: float = option(
-        0.0,
-        "So far ahead of the inertial samples are states between epochs",
-        unit="s",
-        least=0.0,
-        most=1.0,
-    )
-    blend: float = option(
-        0.0,
-        "So long a correction takes to enter states between epochs",
-        unit="s",
-        least=0.0,
-        most=10.0,
-        note="0: at once",
-    )
-    checkpoint: Path | None = option(
-        None, "Checkpoint file", note="default: in the output while the job runs"
-    )
-    every: float = option(30.0, "Between checkpoints", unit="s", least=0.1, most=86400.0)
-    resume: bool = option(False, "Continue from the checkpoint, if there is one")
-    keep_going: bool = option(False, "Count bad records, and skip them")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.rate == "field" and (self.horizon or self.blend):
-            raise InputError(
-                "--horizon and --blend are of states between epochs; give --rate imu, or --rate HZ"
-            )
-
-    def navigator(self, job: Job) -> NavigatorSettings:
-        """Return the settings of the estimator."""
-        from magfusion.estimation.navigator import NavigatorSettings
-
-        return NavigatorSettings(
-            estimator=self.estimator,
-            lag=self.lag,
-            delay=self.delay,
-            estimate=self.groups,
-            earth=self.earth,
-            lockin=self.lockin(job),
-            risk=self.risks,
-            rate=self.rates,
-            horizon=self.horizon,
-            blend=self.blend,
-        )
 
 
 OF_A_LOG = {"output", "start", "end", "topics", "realtime", "as_json"}
@@ -190,7 +105,7 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
     EstimationError
         Where the log leads to no state.
     """
-    from magfusion.estimation.integrity.spectrum import beside_lines
+    from magfusion.estimation.data_checks.spectrum import beside_lines
     from magfusion.files.checkpoint import claim_checkpoint
     from magfusion.files.row_file import claim_rows
     from magfusion.jobs.inputs import CHECKPOINT, claim, found_in, named, read_job, refuse_failed
@@ -259,8 +174,8 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
 
 def _results(run: NavigateRun) -> tuple[Figures, Trust, NavigateResults | None]:
     """Return figures and verdict of a run, and its results where it led to a state."""
+    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
     from magfusion.estimation.integrity.diagnosis import with_cause
-    from magfusion.estimation.integrity.recording import BRIDGED, recorded
     from magfusion.jobs.navigate_results import navigated, no_start
     from magfusion.jobs.replay import PIECE
     from magfusion.model.trust import Trust

@@ -15,10 +15,10 @@ from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figure, Figures, heading
 
 if TYPE_CHECKING:
-    from magfusion.estimation.rest_stream import RestNavigator, RestState
+    from magfusion.estimation.rests.rest_stream import RestNavigator, RestState
     from magfusion.files.stream import Format, Record
     from magfusion.jobs.inputs import Job
-    from magfusion.jobs.navigate import NavigateSettings
+    from magfusion.jobs.navigate_settings import NavigateSettings
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
     from magfusion.model.trust import Risk, Trust
@@ -36,7 +36,7 @@ _PLACE = {"json": "line", "msgpack": "record"}
 
 @dataclass(frozen=True)
 class How:
-    """How rests are integrated: as `magfusion.estimation.rest_stream.RestNavigator`."""
+    """How rests are integrated: as `magfusion.estimation.rests.rest_stream.RestNavigator`."""
 
     lockin: LockinSettings | None
     false_alarm: float
@@ -44,7 +44,7 @@ class How:
 
     def navigator(self, site: Site) -> RestNavigator:
         """Return an estimator."""
-        from magfusion.estimation.rest_stream import RestNavigator
+        from magfusion.estimation.rests.rest_stream import RestNavigator
 
         return RestNavigator(site, self.lockin, self.false_alarm, self.risk)
 
@@ -118,7 +118,7 @@ def run_rests(job: Job, how: How, report: Report = quiet) -> Figures:
     InputError, EstimationError
         Where it does not rest, or no beacon is heard.
     """
-    from magfusion.estimation.integrity.recording import BRIDGED, recorded
+    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
     from magfusion.jobs.inputs import claim, named, read_job, refuse_failed
     from magfusion.model.trust import Trust
 
@@ -280,7 +280,7 @@ def _take_in(navigator: RestNavigator, record: Record) -> None:
 
 def rest_content(state: RestState) -> dict[str, Any]:
     """Return a state of a rest as it is written; what is not known is null."""
-    from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
+    from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
     from magfusion.model.quaternion import of_matrices
 
     trust, names = state.trust, () if state.samples is None else state.samples.channels

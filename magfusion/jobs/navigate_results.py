@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.estimation.data_checks.signal import Detected
+from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.initialization.online import NoStart
 from magfusion.estimation.integrity.diagnosis import with_cause
-from magfusion.estimation.integrity.open_roll import comparable
-from magfusion.estimation.integrity.recording import BRIDGED, recorded
-from magfusion.estimation.integrity.signal import Detected
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import MOTION
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online_integrity.open_roll import comparable
 from magfusion.files.site import save_site
 from magfusion.files.trajectory_table import write_trajectory
 from magfusion.files.tum import write_tum

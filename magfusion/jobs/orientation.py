@@ -10,12 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.estimation.integrity.stamps import uneven_stamps
+from magfusion.estimation.data_checks.stamps import uneven_stamps
+from magfusion.estimation.graph.state import GYRO_BIAS, ROTATION
 from magfusion.estimation.orientation.layout import LAG, MICROTESLA, OFFSET, Orientation
 from magfusion.estimation.orientation.online import ANYWHERE, TIMING, OrientationNavigator
 from magfusion.estimation.orientation.remarks import doubts, remarks
 from magfusion.estimation.orientation.smoother import Oriented, oriented
-from magfusion.estimation.state import GYRO_BIAS, ROTATION
 from magfusion.files.site import save_site
 from magfusion.files.stream import Format, json_line, read_records, whole_rows
 from magfusion.files.trajectory_table import write_trajectory
@@ -34,7 +34,7 @@ from magfusion.results.verdict import trust_figures
 from magfusion.units import DEGREE, Array, Rate
 
 if TYPE_CHECKING:
-    from magfusion.estimation.integrity.judgement import JudgedState
+    from magfusion.estimation.online_integrity.judgement import JudgedState
 
 LONGEST_STEP = 0.1  # s; of a truth that is compared with
 _PLACE = {"json": "line", "msgpack": "record"}

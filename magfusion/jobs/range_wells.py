@@ -10,9 +10,9 @@ from magfusion.jobs.settings import Command, LogSettings, option
 from magfusion.results.figures import Figure, Figures, Section, heading
 
 if TYPE_CHECKING:
-    from magfusion.estimation.ranging import Ranged
-    from magfusion.estimation.ranging_windows import RangingLog
-    from magfusion.estimation.relative_wells import Wells
+    from magfusion.estimation.ranging.ranging import Ranged
+    from magfusion.estimation.ranging.ranging_windows import RangingLog
+    from magfusion.estimation.ranging.relative_wells import Wells
     from magfusion.model.samples import Log
     from magfusion.model.trust import Trust
 
@@ -44,9 +44,9 @@ def run_range(settings: RangeSettings, output: Path) -> Figures:
     """
     import numpy as np
 
-    from magfusion.estimation.ranging import find_range
-    from magfusion.estimation.ranging_windows import DepthErrors, ranging_log
-    from magfusion.estimation.relative_wells import Wells
+    from magfusion.estimation.ranging.ranging import find_range
+    from magfusion.estimation.ranging.ranging_windows import DepthErrors, ranging_log
+    from magfusion.estimation.ranging.relative_wells import Wells
     from magfusion.files.table import Span, write_table
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
     from magfusion.results.plots.ranging import RangePicture, write_range_plot
@@ -105,8 +105,8 @@ def run_range(settings: RangeSettings, output: Path) -> Figures:
 def _judged(log: Log, told: RangingLog, found: Ranged) -> tuple[Trust, float]:
     import numpy as np
 
-    from magfusion.estimation.integrity.priors import trust_of, unexplained
-    from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
+    from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
+    from magfusion.estimation.snapshot.priors import trust_of, unexplained
     from magfusion.model.trust import Finding, Trust, Verdict
 
     fields = told.windows.fields

@@ -1,5 +1,6 @@
 """Whether a log has the components that its site declares of the receiver, and a job needs."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from magfusion.errors import InputError
@@ -12,34 +13,39 @@ def check_axes(
 ) -> None:
     """Refuse components that are not those of the site's receiver, or that a job cannot take."""
     sensor, fields, wave = site.platform.magnetometer, log.fields, log.waveform
-    declared = sensor.axes
-    key = f"{declared_path}: platform.magnetometer.axes:"
-    whole = fields is None or (fields.axes == "xyz" and fields.signed)
-    if declared == "xyz" and whole and (wave is None or wave.axes == "xyz"):
+    measured = {stream.axes for stream in (fields, wave) if stream is not None}
+    amplitude = fields is not None and not fields.signed
+    if measured <= {"xyz"} and sensor.axes == "xyz" and not amplitude:
         return
-    if len(declared) < 3 and (sensor.warming is not None or sensor.coil_kappa != 0.0):
+    key = f"{declared_path}: platform.magnetometer.axes:"
+    if len(sensor.axes) < 3 and (sensor.warming is not None or sensor.coil_kappa != 0.0):
         raise InputError(
             f"{key} of a receiver of fewer than three axes neither warming nor coil_kappa_m2 is"
             " taken into account; leave them out"
         )
-    for stream, found in (
-        ("fields", None if fields is None else fields.axes if fields.signed else declared),
-        ("magnetometer", None if wave is None else wave.axes),
-    ):
-        one = fields is not None and not fields.signed and stream == "fields"
-        if found is not None and (found != declared or (one and len(declared) != 1)):
-            has = "one amplitude" if one else ", ".join(found)
-            raise InputError(
-                f"{key} is [{', '.join(declared)}], and the {stream} of {log_path} have {has};"
-                " declare the axes that the receiver has"
-            )
+    for stream, has in _other_axes(log, sensor.axes):
+        raise InputError(
+            f"{key} is [{', '.join(sensor.axes)}], and the {stream} of {log_path} have {has};"
+            " declare the axes that the receiver has"
+        )
     if not fewer:
         three_axes(site, declared_path)
-    if fields is not None and not fields.signed and not amplitudes:
+    if amplitude and not amplitudes:
         raise InputError(
             f"{log_path}: amplitudes without sign are taken by fix, smooth and navigate alone;"
             " run one of these, or give phasors (re and im)"
         )
+
+
+def _other_axes(log: Log, declared: str) -> Iterator[tuple[str, str]]:
+    """Yield the streams of a log whose axes are not those declared, and what they have."""
+    if log.fields is not None and not log.fields.signed:  # amplitudes are of any one axis
+        if len(declared) != 1:
+            yield "fields", "one amplitude"
+    elif log.fields is not None and log.fields.axes != declared:
+        yield "fields", ", ".join(log.fields.axes)
+    if log.waveform is not None and log.waveform.axes != declared:
+        yield "magnetometer", ", ".join(log.waveform.axes)
 
 
 def three_axes(site: Site, path: Path) -> Site:

@@ -1,4 +1,4 @@
-"""Where the magnetometer may be, as the command line has it."""
+"""The settings of a log whose receiver is known to be on one side of a beacon, or in a room."""
 
 from __future__ import annotations
 
@@ -7,50 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from magfusion.errors import InputError
+from magfusion.jobs.region_option import Where
 from magfusion.jobs.settings import LogSettings, option
 
 if TYPE_CHECKING:
     from magfusion.jobs.inputs import Job
-    from magfusion.model.site import Site
-    from magfusion.units import Array
-
-LARGEST = 1e6  # m
-
-
-@dataclass(frozen=True)
-class Where:
-    """What the user says of the place, beside what the site does.
-
-    Parameters
-    ----------
-    hemisphere : tuple of str
-        ``[BEACON=]DIRECTION`` each.
-    region : str, optional
-        ``xmin,xmax,ymin,ymax,zmin,zmax``.
-    """
-
-    hemisphere: tuple[str, ...] = ()
-    region: str | None = None
-
-    def bounded(self, site: Site) -> Site:
-        """Return the site with them.
-
-        Raises
-        ------
-        InputError
-        """
-        for text in self.hemisphere:
-            site = _in_front(site, text)
-        if self.region is None:
-            return site
-        from magfusion.model.region import Region
-
-        box, earlier = _box(self.region), site.region or Region()
-        return dataclasses.replace(site, region=dataclasses.replace(earlier, box_world=box))
-
-
-ANYWHERE = Where()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,63 +45,3 @@ class RegionSettings(LogSettings):
         InputError
         """
         return dataclasses.replace(super().job(output), where=self.where)
-
-
-def _in_front(site: Site, text: str) -> Site:
-    name, equals, direction = text.rpartition("=")
-    known = [beacon.name for beacon in site.beacons]
-    if equals and name not in known:
-        raise InputError(
-            f"--hemisphere {text!r}: the site has no beacon {name!r}; it has {', '.join(known)}"
-        )
-    if not equals and len(known) != 1:
-        raise InputError(
-            f"--hemisphere {text!r}: the site has {len(known)} beacons; say of which it is, as"
-            f" --hemisphere {known[0] if known else 'A'}={text}"
-        )
-    side = _direction(direction, text)
-    beacons = tuple(
-        dataclasses.replace(beacon, hemisphere_beacon=side)
-        if beacon.name == (name if equals else known[0])
-        else beacon
-        for beacon in site.beacons
-    )
-    return dataclasses.replace(site, beacons=beacons)
-
-
-def _direction(direction: str, text: str) -> Array:
-    import numpy as np
-
-    if len(direction) == 2 and direction[0] in "+-" and direction[1] in "xyz":
-        sign = 1.0 if direction[0] == "+" else -1.0
-        return np.asarray(sign * np.eye(3)["xyz".index(direction[1])])
-    try:
-        numbers = np.array([float(part) for part in direction.split(",")])
-    except ValueError:
-        numbers = np.zeros(0)
-    if numbers.shape != (3,) or not np.all(np.isfinite(numbers)) or not numbers.any():
-        raise InputError(
-            f"--hemisphere {text!r}: a direction is one of +x, -x, +y, -y, +z, -z, or three numbers"
-            " in the beacon's axes, separated by commas"
-        )
-    return numbers
-
-
-def _box(text: str) -> Array:
-    import numpy as np
-
-    try:
-        box = np.array([float(part) for part in text.split(",")]).reshape(3, 2).T
-    except ValueError:
-        raise InputError(
-            f"--region {text!r}: six numbers in metres are needed, the limits of x, y and z; inf"
-            " where there is none"
-        ) from None
-    limits = box[np.isfinite(box)]
-    if np.any(np.isnan(box)) or not np.all(box[0] < box[1]) or not len(limits):
-        raise InputError(
-            f"--region {text!r}: each lower limit must be below its upper limit, and one finite"
-        )
-    if np.max(np.abs(limits)) > LARGEST:
-        raise InputError(f"--region {text!r}: limits must lie within {LARGEST:g} m of the origin")
-    return box

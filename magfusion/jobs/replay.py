@@ -14,7 +14,7 @@ from magfusion.jobs.settings import Command, PartSettings, ReplayedSettings
 from magfusion.units import Array, IntArray
 
 if TYPE_CHECKING:
-    from magfusion.estimation.navigator import Navigator
+    from magfusion.estimation.online.navigator import Navigator
     from magfusion.files.long_log import LongLog
     from magfusion.files.stream import Format
     from magfusion.model.drive import DriveSamples
@@ -185,7 +185,7 @@ def _of_long(log: LongLog) -> Iterator[tuple[int, Piece]]:
 
 def _currents(log: Log | LongLog) -> DriveSamples | None:
     """Return the currents of coils, or those that stand for the angles of rotors."""
-    from magfusion.estimation.drive_reference import cosines
+    from magfusion.estimation.demodulation.drive_reference import cosines
     from magfusion.files.long_log import LongLog
 
     if isinstance(log, LongLog) or log.drive is not None or log.rotation is None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from magfusion.jobs.settings import Settings, option
 
 if TYPE_CHECKING:
-    from magfusion.estimation.at_rest import AtRest
+    from magfusion.estimation.rests.at_rest import AtRest
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
     from magfusion.receiver.windows import LockinSettings
@@ -41,10 +41,10 @@ class RestSettings(Settings):
         Raises
         ------
         InputError
-            As `magfusion.estimation.at_rest.at_rest`.
+            As `magfusion.estimation.rests.at_rest.at_rest`.
         """
         if not self.at_rest:
             return None
-        from magfusion.estimation.at_rest import at_rest
+        from magfusion.estimation.rests.at_rest import at_rest
 
         return at_rest(log, site, lockin, self.false_alarm, least)

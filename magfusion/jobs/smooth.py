@@ -24,9 +24,9 @@ from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figure, Figures, Section, heading
 
 if TYPE_CHECKING:
-    from magfusion.estimation.at_rest import AtRest
-    from magfusion.estimation.batch import Smoothed, SmootherSettings
-    from magfusion.estimation.passes import PassFile
+    from magfusion.estimation.batch.batch import Smoothed, SmootherSettings
+    from magfusion.estimation.batch.passes import PassFile
+    from magfusion.estimation.rests.at_rest import AtRest
     from magfusion.jobs.inputs import Job
     from magfusion.model.samples import Log
     from magfusion.model.site import Site
@@ -95,7 +95,7 @@ class SmoothSettings(
 
     def smoother(self, job: Job) -> SmootherSettings:
         """Return the settings of the estimator."""
-        from magfusion.estimation.batch import SmootherSettings
+        from magfusion.estimation.batch.batch import SmootherSettings
 
         return SmootherSettings(
             coupling=self.coupling,
@@ -167,8 +167,8 @@ def run_smooth(
     InputError, EstimationError
         In the latter case the single-epoch fixes have been saved in the output directory.
     """
-    from magfusion.estimation.integrity.recording import beyond
-    from magfusion.estimation.self_survey import smooth_and_place
+    from magfusion.estimation.batch.self_survey import smooth_and_place
+    from magfusion.estimation.data_checks.recording import beyond
     from magfusion.estimation.solve.memory import give_back_memory
     from magfusion.jobs.failure import reason_of
     from magfusion.jobs.inputs import claim, named, read_job, refuse_failed
@@ -238,7 +238,7 @@ def _passes(
     place: Path, resume: bool, log: Log, site: Site, settings: SmootherSettings
 ) -> PassFile:
     """Return the file that keeps the passes, of a log with this site and these settings."""
-    from magfusion.estimation.passes import PassFile
+    from magfusion.estimation.batch.passes import PassFile
     from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
 
     if any(beacon.unknown is not None for beacon in site.beacons):
@@ -279,7 +279,7 @@ def _rested(
 
 def _with_gain(job: Job, log: Log, site: Site, settings: SmootherSettings) -> Site:
     """Return the site with the gain that the epochs of a receiver of one axis tell."""
-    from magfusion.estimation.demodulation import fix_inputs, phasors
+    from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
     from magfusion.estimation.snapshot.coil_gain import with_found_gain
     from magfusion.jobs.inputs import named
 
@@ -299,7 +299,7 @@ def _agreed(
     """Return all without a magnetometer that contradicts the others, and what is said of it."""
     if not site.platform.further:
         return log, site, result, ()
-    from magfusion.estimation.batch import smooth
+    from magfusion.estimation.batch.batch import smooth
     from magfusion.estimation.integrity.magnetometer_exclusion import agreed
 
     plain = replace(settings, tune=False)
@@ -320,9 +320,9 @@ def _save_fixes_instead(
     """Write the fixes where there is no trajectory, below a name that says so; return why."""
     import numpy as np
 
-    from magfusion.estimation.demodulation import first_fixes, phasors
+    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+    from magfusion.estimation.demodulation.demodulation import first_fixes, phasors
     from magfusion.estimation.integrity.diagnosis import OF_CATCH_ALL, with_cause
-    from magfusion.estimation.integrity.recording import BRIDGED, recorded
     from magfusion.jobs.failure import OPEN
     from magfusion.jobs.fix import write_fix_result
     from magfusion.jobs.inputs import found_in

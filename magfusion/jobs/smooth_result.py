@@ -7,16 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.batch.self_survey import Placement
 from magfusion.estimation.integrity.diagnosis import with_cause
 from magfusion.estimation.integrity.judge import judged
-from magfusion.estimation.integrity.open_roll import comparable, roll_findings, with_open_roll
 from magfusion.estimation.integrity.smoothed_exclusion import (
     separated_smooth,
     states_between,
     states_judged,
 )
-from magfusion.estimation.self_survey import Placement
+from magfusion.estimation.online_integrity.open_roll import (
+    comparable,
+    roll_findings,
+    with_open_roll,
+)
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.files.site import save_site
 from magfusion.files.trajectory_table import write_trajectory
@@ -145,7 +149,7 @@ def write_finished(whole: Path, log: Log, done: Finished, *, rate: Rate) -> None
     refined, innovations = result_site(result, log.name), _innovations(result)
     written = result.states
     if rate != "field":
-        from magfusion.estimation.between_epochs import at_rate
+        from magfusion.estimation.batch.between_epochs import at_rate
 
         written = with_open_roll(at_rate(done.result, log, rate), result.declared.site)
     if not log.inertial:

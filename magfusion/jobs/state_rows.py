@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magfusion.estimation.integrity.levels import Levels, find
+from magfusion.estimation.online_integrity.levels import Levels, find
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from magfusion.estimation.integrity.judgement import JudgedState
-    from magfusion.estimation.navigator import Navigator
+    from magfusion.estimation.online.navigator import Navigator
+    from magfusion.estimation.online_integrity.judgement import JudgedState
     from magfusion.files.row_file import Mark, RowFile
     from magfusion.model.site import Site
     from magfusion.units import Array

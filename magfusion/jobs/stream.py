@@ -8,13 +8,13 @@ from typing import Any, BinaryIO, TextIO
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
+from magfusion.estimation.graph.state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
 from magfusion.estimation.initialization.online import NoStart
-from magfusion.estimation.integrity.judgement import JudgedState
-from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.measurements.signs import along_axis
-from magfusion.estimation.navigator import Navigator, NavigatorSettings
-from magfusion.estimation.state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, VELOCITY
-from magfusion.estimation.state_of_now import CarriedState
+from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
+from magfusion.estimation.online.state_of_now import CarriedState
+from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.checkpoint import run_key
 from magfusion.files.named_records import site_fields
 from magfusion.files.site import load_site
@@ -29,7 +29,7 @@ from magfusion.files.stream import (
 )
 from magfusion.jobs.checkpoint import begin, save
 from magfusion.jobs.live import LiveSettings, StateSink, state_sinks
-from magfusion.jobs.region import ANYWHERE, Where
+from magfusion.jobs.region_option import ANYWHERE, Where
 from magfusion.jobs.rotor_inputs import AwaitedAngles, check_streamed_rotors
 from magfusion.model.marks import Marks
 from magfusion.model.quaternion import of_matrices

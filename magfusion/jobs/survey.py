@@ -55,7 +55,7 @@ def run_survey(settings: SurveySettings, output: Path) -> Figures:
     InputError
         Where the log has no pose, none of its epochs can be a point, or ``output`` is in the way.
     """
-    from magfusion.estimation.demodulation import fix_inputs, phasors
+    from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
     from magfusion.files.survey import write_survey
     from magfusion.jobs.inputs import claim, named, read_job
     from magfusion.results.plots.survey import write_survey_plot
@@ -239,7 +239,7 @@ def _spaced(position: Array, spacing: float) -> IntArray:
 
 
 def _figures(log: Log, site: Site, survey: Survey, dropped: dict[str, int]) -> Figures:
-    from magfusion.estimation.integrity.recording import passed_on
+    from magfusion.estimation.data_checks.recording import passed_on
     from magfusion.results.figures import Figure, Figures, heading
     from magfusion.results.report import dropped_figures
     from magfusion.results.verdict import trust_figures

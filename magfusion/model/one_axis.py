@@ -8,6 +8,7 @@ opened: the roll may be any, and with it the place of the body on its circle abo
 import numpy as np
 
 from magfusion.model.platform_motion import NO_IMU
+from magfusion.model.rotation import rotations_of
 from magfusion.model.site import Magnetometer, Site
 from magfusion.units import Array
 
@@ -27,6 +28,19 @@ def coil_lever(sensor: Magnetometer) -> Array:
         return sensor.position_body
     own = sensor.coil_centres_sensor["xyz".index(sensor.axes)]
     return np.asarray(sensor.position_body + sensor.body_from_sensor @ own)
+
+
+def least_turn(from_vector: Array, to_vector: Array) -> Array:
+    """Return the smallest rotations that take directions to others, shape (..., 3, 3)."""
+    start = np.broadcast_to(from_vector, to_vector.shape)
+    across = np.cross(start, to_vector)
+    sine = np.linalg.norm(across, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, np.sum(start * to_vector, axis=-1, keepdims=True))
+    smallest = np.eye(3)[np.argmin(np.abs(start), axis=-1)]
+    other = np.cross(start, smallest)  # any axis across, for the opposite direction
+    other = other / np.linalg.norm(other, axis=-1, keepdims=True)
+    about = np.where(sine > 1e-12, across / np.maximum(sine, 1e-300), other)
+    return rotations_of(about * angle)
 
 
 def roll_is_open(site: Site) -> bool:

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from magfusion.errors import InputError
-from magfusion.estimation.integrity.judgement import JudgedState
+from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.stream import json_line
 from magfusion.results.odometry import odometry_of
 

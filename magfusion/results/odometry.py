@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from magfusion.estimation.state import ROTATION, VELOCITY, State
+from magfusion.estimation.graph.state import ROTATION, VELOCITY, State
 from magfusion.model.fixed_axes import fixed_axes_covariance
 from magfusion.units import Array
 

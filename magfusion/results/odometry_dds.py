@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.estimation.integrity.judgement import JudgedState
+from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.odometry_bag import UNKNOWN_VARIANCE
 from magfusion.results.odometry import Odometry, odometry_of
 

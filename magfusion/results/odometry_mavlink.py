@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.estimation.integrity.judgement import JudgedState
+from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.model.trust import Verdict
 from magfusion.results.odometry import Odometry, odometry_of
 

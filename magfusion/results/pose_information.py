@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.estimation.integrity.separation import Separation, protection_levels
+from magfusion.estimation.posterior.separation import Separation, protection_levels
 from magfusion.model.audibility import owned_at
 from magfusion.model.field import model_error_cov
 from magfusion.model.noise import alike_beside, model_error, paired_whitening, sensors_at
@@ -189,7 +189,7 @@ def protected(
 ) -> Array:
     """Return the protection levels of position (m) and attitude (deg), shape (n, 2).
 
-    Those of `magfusion.estimation.integrity.separation` with the covariances that a best estimate
+    Those of `magfusion.estimation.posterior.separation` with the covariances that a best estimate
     has: nothing is measured yet.  Infinite where there is none.
 
     Parameters

@@ -5,7 +5,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from magfusion.errors import InputError
-from magfusion.estimation.state import POSITION, State
+from magfusion.estimation.graph.state import POSITION, State
 from magfusion.model.rotation import quaternions_of
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.batch.batch import Smoothed
 from magfusion.model.correlation import Correlation, joined
 from magfusion.model.parameters import BeaconParameter, Block, Calibration, difference
 from magfusion.model.prior import parameters_of

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.estimation.batch import Smoothed
-from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
+from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.one_axis import roll_is_open
 from magfusion.model.samples import Log
@@ -35,7 +35,7 @@ from magfusion.results.refinement import parameter_estimates
 from magfusion.units import Array
 
 if TYPE_CHECKING:
-    from magfusion.estimation.self_survey import Placement
+    from magfusion.estimation.batch.self_survey import Placement
     from magfusion.results.observability import Observability
 
 FAILED = "failed"  # directory of what was found where the verdict is that

@@ -10,7 +10,7 @@ import numpy as np
 from magfusion.results.figures import Figure, Figures
 
 if TYPE_CHECKING:
-    from magfusion.estimation.at_rest import AtRest
+    from magfusion.estimation.rests.at_rest import AtRest
 
 
 def rest_figures(rested: AtRest) -> Figures:

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from magfusion.estimation.batch.settings import EstimatorSettings
+from magfusion.estimation.graph.state import MOTION, State
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.settings import EstimatorSettings
-from magfusion.estimation.state import MOTION, State
 from magfusion.model.parameters import (
     Block,
     Calibration,

@@ -4,8 +4,8 @@ Its motion tells the side within a second or two, against which a mirrored start
 is less clear waits as long as all other starts do.
 """
 
+from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE, DECIDED
 from magfusion.estimation.initialization.online import NoStart, OnlineStart
-from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE, DECIDED
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.receiver.slots import has_schedule

@@ -4,11 +4,12 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from magfusion.estimation.batch import Smoothed
-from magfusion.estimation.factors import CALIBRATION_KEY
-from magfusion.estimation.graph import Estimate
+from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.graph.considered import responses
+from magfusion.estimation.graph.factors import CALIBRATION_KEY
+from magfusion.estimation.graph.graph import Estimate
+from magfusion.estimation.graph.state import State
 from magfusion.estimation.solve.bordered import eliminate_partial
-from magfusion.estimation.state import State
 from magfusion.model.parameters import Block, dimension, placed
 from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.units import Array
@@ -63,7 +64,7 @@ def _with_considered(
         return cov
     last, size = len(result.states) - 1, dimension(considered)
     columns = []
-    for step in result.graph.responses(estimate, uncertain):
+    for step in responses(result.graph, estimate, uncertain):
         own = [step.at(X(last)), step.at(V(last)), step.at(B(last))]
         own += [step.at(CALIBRATION_KEY)] if result.blocks else []
         columns.append(np.concatenate(own))

@@ -3,20 +3,21 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from dataclasses import fields as fields_of
+from typing import NamedTuple
 
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.batch import Smoothed, SmootherSettings, smooth
-from magfusion.estimation.demodulated_apart import each_alone
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
+from magfusion.estimation.batch.settings import EstimatorSettings
+from magfusion.estimation.data_checks.spectrum import beside_lines
+from magfusion.estimation.data_checks.stream_buffer import Buffer
+from magfusion.estimation.demodulation.demodulated_apart import each_alone
+from magfusion.estimation.graph.state import POSITION, ROTATION, State
 from magfusion.estimation.initialization.handover import last_state
 from magfusion.estimation.integrity.judge import judged_with_score
 from magfusion.estimation.integrity.score import Score
-from magfusion.estimation.integrity.spectrum import beside_lines
-from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
-from magfusion.estimation.settings import EstimatorSettings
-from magfusion.estimation.state import POSITION, ROTATION, State
-from magfusion.estimation.stream_buffer import Buffer
 from magfusion.model.audibility import are_many
 from magfusion.model.marks import Marks
 from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields, Waveform
@@ -122,14 +123,14 @@ def find_online_start(
     waveforms : mapping, optional
         The samples of several magnetometers until then, each by its own stamps.
     """
-    several = {} if waveforms is None else waveforms
-    wave = Waveform(*waveform.rows(), marks, site.platform.magnetometer.axes)
     if not fields:
         receiver = receiver_of(site, settings.lockin)
         receiver.check()
         if settings.earth:
             windowed(receiver)
+    wave = Waveform(*waveform.rows(), marks, site.platform.magnetometer.axes)
     whole = [s for s in fields if s.time[0] <= until]
+    several = {} if waveforms is None else waveforms
     log = Log(
         name="the beginning",
         epoch_ns=0,
@@ -141,43 +142,86 @@ def find_online_start(
         inertial=site.platform.inertial,
         waveforms=several,
     )
-    asked = {f.name: getattr(settings, f.name) for f in fields_of(EstimatorSettings)}
-    heard = log
     try:
-        if several and are_many(site):  # by what is heard they are chosen
-            from magfusion.estimation.several_demodulation import demodulated_several
-
-            log = replace(log, fields=demodulated_several(log, site, settings.lockin).fields)
-        if log.waveform is not None and has_schedule(site) and joins(site, log.waveform.marks):
-            log = _of_cycles(log, log.waveform, site, settings)
-        how = SmootherSettings(loss="huber", **asked)
-        log, left, result, excluded = _agreed(smooth(log, site, how), log, site, how)
-        honest, trust, score = judged_with_score(result, log)
-        state = last_state(result, result.considered)
-        if result.calibration.site.unheard or site.platform.further:
-            state, score = _among_all(state, score, result, site, settings)
+        found = _smoothed(log, site, settings)
     except (EstimationError, InputError) as error:
         return NoStart(f"{error}.")
     except (RuntimeError, np.linalg.LinAlgError):
         return NoStart("The measurements leave a direction of the motion open.")
-    if trust.verdict is Verdict.FAILED:
-        return NoStart(trust.reasons[0].text, trust)
-    kept = [sensor.name for sensor in left.platform.magnetometers]
-    given = settings.lockin
+    if found.trust.verdict is Verdict.FAILED:
+        return NoStart(found.trust.reasons[0].text, found.trust)
+    return _start_of(found, log, site, settings.lockin)
+
+
+class _Beginning(NamedTuple):
+    """The smoothed beginning.
+
+    Parameters
+    ----------
+    log, site : Log, Site
+        Without the magnetometers that were excluded.
+    result, honest : Smoothed
+        As the estimator has it, and with what its tests add to the sigmas.
+    excluded : tuple of Finding
+        Why magnetometers are left out.
+    """
+
+    log: Log
+    site: Site
+    result: Smoothed
+    honest: Smoothed
+    state: State
+    trust: Trust
+    score: Score | None
+    excluded: tuple[Finding, ...]
+
+
+def _smoothed(log: Log, site: Site, settings: EstimatorSettings) -> _Beginning:
+    """Smooth the beginning and judge it."""
+    if log.waveforms and are_many(site):  # by what is heard they are chosen
+        from magfusion.estimation.demodulation.several_demodulation import demodulated_several
+
+        log = replace(log, fields=demodulated_several(log, site, settings.lockin).fields)
+    if log.waveform is not None and has_schedule(site) and joins(site, log.waveform.marks):
+        log = _of_cycles(log, log.waveform, site, settings)
+    asked = {f.name: getattr(settings, f.name) for f in fields_of(EstimatorSettings)}
+    how = SmootherSettings(loss="huber", **asked)
+    log, left, result, excluded = _agreed(smooth(log, site, how), log, site, how)
+    honest, trust, score = judged_with_score(result, log)
+    state = last_state(result, result.considered)
+    if result.calibration.site.unheard or site.platform.further:
+        state, score = _among_all(state, score, result, site, settings)
+    return _Beginning(log, left, result, honest, state, trust, score, excluded)
+
+
+def _start_of(
+    found: _Beginning, heard: Log, site: Site, given: LockinSettings | None
+) -> OnlineStart:
+    """Return the start that a smoothed beginning gives.
+
+    Parameters
+    ----------
+    heard : Log
+        The beginning as it was recorded, of all magnetometers.
+    given : LockinSettings, optional
+        How samples are asked to be demodulated.
+    """
+    result = found.result
+    kept = [sensor.name for sensor in found.site.platform.magnetometers]
     lined = given is not None and len(given.lines_hz) > 0
-    beside = given if lined else beside_lines(log, site, given)
+    beside = given if lined else beside_lines(found.log, site, given)
     return OnlineStart(
-        state,
+        found.state,
         heard.waveform,
         result.rival_chi_square,
-        trust,
-        score,
-        *_wider(result, honest),
+        found.trust,
+        found.score,
+        *_wider(result, found.honest),
         None if beside is given else beside,
-        _lines_of_each(heard, site, given) if several else {},
+        _lines_of_each(heard, site, given) if heard.waveforms else {},
         {b.name: np.sum(result.calibration_response[b.columns] ** 2, 1) for b in result.blocks},
         tuple(sensor.name for sensor in site.platform.magnetometers if sensor.name not in kept),
-        excluded,
+        found.excluded,
     )
 
 
@@ -214,7 +258,7 @@ def _among_all(
 
 def _lines_of_each(log: Log, site: Site, given: LockinSettings | None) -> dict[str, LockinSettings]:
     """Return how the receivers of several magnetometers go on that have lines to be fitted."""
-    from magfusion.estimation.several_demodulation import same_windows
+    from magfusion.estimation.demodulation.several_demodulation import same_windows
 
     lockin, found = same_windows(site, given), dict[str, LockinSettings]()
     for name, own, alone in each_alone(log, site):

@@ -1,1 +1,1 @@
-"""Whether measurements and state agree: innovation gate, detection, recovery."""
+"""Integrity of a smoothed log: hypotheses, fault isolation, separation, verdict."""

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from magfusion.estimation.integrity.priors import NOTHING_EXPLAINED
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
+from magfusion.estimation.snapshot.priors import NOTHING_EXPLAINED
 from magfusion.model.trust import Finding, Verdict
 from magfusion.receiver.windows import LONGEST_WINDOW
 

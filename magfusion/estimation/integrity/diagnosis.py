@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.integrity.magnetometers import first_magnetometer
+from magfusion.estimation.data_checks.magnetometers import first_magnetometer
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict

@@ -7,13 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
-from magfusion.estimation.demodulation import phasors
-from magfusion.estimation.hearing import heard_site
-from magfusion.estimation.integrity.compasses import StillMeans, still_means
-from magfusion.estimation.integrity.diagnosis import with_cause
-from magfusion.estimation.integrity.recording import recorded
-from magfusion.estimation.integrity.signal import Heard, heard_in, within_reach
-from magfusion.estimation.integrity.spectrum import (
+from magfusion.estimation.data_checks.compasses import StillMeans, still_means
+from magfusion.estimation.data_checks.recording import recorded
+from magfusion.estimation.data_checks.signal import Heard, heard_in, within_reach
+from magfusion.estimation.data_checks.spectrum import (
     Line,
     Spectrum,
     beside_lines,
@@ -21,8 +18,11 @@ from magfusion.estimation.integrity.spectrum import (
     named_lines,
     spectrum,
 )
-from magfusion.estimation.integrity.stamps import Timing, timings
-from magfusion.estimation.skin_depths import depths_of
+from magfusion.estimation.data_checks.stamps import Timing, timings
+from magfusion.estimation.demodulation.demodulation import phasors
+from magfusion.estimation.demodulation.hearing import heard_site
+from magfusion.estimation.demodulation.skin_depths import depths_of
+from magfusion.estimation.integrity.diagnosis import with_cause
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.model.audibility import are_many

@@ -9,12 +9,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.data_checks.statistics import (
+    WITNESS_BUDGET,
+    holm,
+    log_p_chi_square,
+    sigmas,
+)
 from magfusion.estimation.integrity.score import (
     Score,
     field_residual,
     moved_estimate,
 )
-from magfusion.estimation.integrity.statistics import WITNESS_BUDGET, holm, log_p_chi_square, sigmas
 from magfusion.estimation.integrity.suspects import CODE, Suspect, suspects
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
 from magfusion.model.parameters import Block, prior_sigma

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from magfusion.estimation.batch import Smoothed
-from magfusion.estimation.graph import Graph
-from magfusion.estimation.inertial import ROWS
+from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.graph.graph import Graph
+from magfusion.estimation.graph.inertial import ROWS
 from magfusion.estimation.integrity.suspects import Inertial, Stream
 from magfusion.model.parameters import Block, dimension
 from magfusion.model.samples import ImuSamples

@@ -8,9 +8,9 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from magfusion.estimation.batch import Smoothed
-from magfusion.estimation.graph import Estimate
-from magfusion.estimation.inertial import ROWS
+from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.graph.graph import Estimate
+from magfusion.estimation.graph.inertial import ROWS
 from magfusion.estimation.solve.bordered import eliminate
 from magfusion.units import Array
 

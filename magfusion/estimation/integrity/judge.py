@@ -10,15 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.batch import Smoothed
-from magfusion.estimation.graph import Estimate
+from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.estimation.data_checks.signal import detected_in
+from magfusion.estimation.graph.graph import Estimate
 from magfusion.estimation.integrity.close_residuals import together
 from magfusion.estimation.integrity.held import held
 from magfusion.estimation.integrity.midway import changed, steps_asked
 from magfusion.estimation.integrity.outcome import convergence, geometry, rivals
 from magfusion.estimation.integrity.place_witness import of_place
 from magfusion.estimation.integrity.priors_of_log import bias_change, calibration_change
-from magfusion.estimation.integrity.recording import BRIDGED, recorded
 from magfusion.estimation.integrity.residual_blocks import fields, fixes, inertial
 from magfusion.estimation.integrity.score import (
     Score,
@@ -26,10 +27,9 @@ from magfusion.estimation.integrity.score import (
     moved_estimate,
     scores_of,
 )
-from magfusion.estimation.integrity.signal import detected_in
 from magfusion.estimation.integrity.smoothed_compass import compass
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
-from magfusion.estimation.integrity.tuned_noise import tuned_noise
+from magfusion.estimation.posterior.tuned_noise import tuned_noise
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.model.samples import Log
 from magfusion.model.trust import Trust, Verdict

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from magfusion.estimation.demodulation import demodulated
+from magfusion.estimation.demodulation.demodulation import demodulated
 from magfusion.estimation.integrity.beacon_causes import (
     MISFIT,
     beacon_causes,

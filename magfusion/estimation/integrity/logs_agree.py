@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.estimation.batch.joint import Known, Said, Shared, known_by
+from magfusion.estimation.data_checks.statistics import WITNESS_BUDGET, holm, sigmas
 from magfusion.estimation.integrity.priors_of_log import TOLERATED, distance
-from magfusion.estimation.integrity.statistics import WITNESS_BUDGET, holm, sigmas
-from magfusion.estimation.joint import Known, Said, Shared, known_by
 from magfusion.model.parameters import BeaconParameter
 from magfusion.model.trust import Finding
 from magfusion.units import Array

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.estimation.batch import Smoothed
-from magfusion.estimation.hearing import heard_site
-from magfusion.estimation.integrity.magnetometers import without_magnetometer
+from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.data_checks.magnetometers import without_magnetometer
+from magfusion.estimation.demodulation.hearing import heard_site
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
 from magfusion.model.samples import Log
 from magfusion.model.site import Site

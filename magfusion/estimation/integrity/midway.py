@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.data_checks.statistics import holm, sigmas
 from magfusion.estimation.integrity.held import (
     COVERED,
     HOPELESS,
@@ -20,7 +21,6 @@ from magfusion.estimation.integrity.held import (
     told_of,
 )
 from magfusion.estimation.integrity.score import answered
-from magfusion.estimation.integrity.statistics import holm, sigmas
 from magfusion.estimation.integrity.suspects import Inertial, Stream, Suspect, spoken_name, suspects
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
 from magfusion.model.parameters import (

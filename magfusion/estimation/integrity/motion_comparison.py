@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from magfusion.estimation.integrity.turning import convolved
+from magfusion.estimation.data_checks.turning import convolved
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
 from magfusion.estimation.snapshot.survey_error import whitened

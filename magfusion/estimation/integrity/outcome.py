@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from magfusion.estimation.convergence import pose_steps
+from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
-from magfusion.estimation.likeliest import AMBIGUOUS_CHI_SQUARE
+from magfusion.estimation.posterior.convergence import pose_steps
 from magfusion.model.trust import Finding, Verdict
 
 DIVERGED = 3.0  # whitened residual, one where noise and model are as declared

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from magfusion.estimation.integrity.statistics import (
+from magfusion.estimation.data_checks.statistics import (
     WITNESS_BUDGET,
     holm,
     log_p_chi_square,

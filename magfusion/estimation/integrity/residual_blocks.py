@@ -10,20 +10,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.batch import Smoothed
-from magfusion.estimation.graph import Estimate
-from magfusion.estimation.integrity.inertial_misfit import expected_squares, inertial_errors
-from magfusion.estimation.integrity.statistics import (
+from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.data_checks.statistics import (
     WITNESS_BUDGET,
     effective_number,
     holm,
     log_p_chi_square,
     sigmas,
 )
+from magfusion.estimation.graph.graph import Estimate
+from magfusion.estimation.graph.state import states_in
+from magfusion.estimation.integrity.inertial_misfit import expected_squares, inertial_errors
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.pose_fix import PoseFix
-from magfusion.estimation.state import states_in
 from magfusion.model.trust import Finding, Verdict
 from magfusion.units import Array, BoolArray
 

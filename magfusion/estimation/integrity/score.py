@@ -14,10 +14,12 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from magfusion.estimation.batch import Smoothed
-from magfusion.estimation.considered import steps_of_others
-from magfusion.estimation.factors import CALIBRATION_KEY, CONSIDERED_KEY, NUISANCE_KEY
-from magfusion.estimation.graph import Estimate
+from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.graph.considered import steps_of_others
+from magfusion.estimation.graph.factors import CALIBRATION_KEY, CONSIDERED_KEY, NUISANCE_KEY
+from magfusion.estimation.graph.graph import Estimate
+from magfusion.estimation.graph.measurement import Rows
+from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.integrity.held_columns import InertialColumns, inertial_columns
 from magfusion.estimation.integrity.score_chain import (
     Left,
@@ -26,13 +28,11 @@ from magfusion.estimation.integrity.score_chain import (
     responses_of_chain,
 )
 from magfusion.estimation.integrity.suspects import TOLERANCE, held_blocks
-from magfusion.estimation.marginals import is_chain
 from magfusion.estimation.measurements.earth import EarthField
-from magfusion.estimation.measurements.measurement import Rows
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.native_rows import NativeRows
+from magfusion.estimation.posterior.marginals import is_chain
+from magfusion.estimation.posterior.native_rows import NativeRows
 from magfusion.estimation.solve.bordered import eliminate_partial
-from magfusion.estimation.state import MOTION
 from magfusion.model.parameters import (
     Block,
     Calibration,

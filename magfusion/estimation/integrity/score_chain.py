@@ -4,14 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from magfusion.estimation.batch import Smoothed
-from magfusion.estimation.chain_left import left_over
-from magfusion.estimation.chain_system import column_groups, system_beside
+from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.integrity.held_columns import InertialColumns
-from magfusion.estimation.native_rows import Columns, NativeRows
+from magfusion.estimation.posterior.chain_left import left_over
+from magfusion.estimation.posterior.chain_system import column_groups, system_beside
+from magfusion.estimation.posterior.native_rows import Columns, NativeRows
 from magfusion.estimation.solve.chain import solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
-from magfusion.estimation.state import MOTION
 from magfusion.model.parameters import Block, dimension, placed, prior_sigma
 from magfusion.units import Array
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from magfusion.estimation.integrity.compasses import SPAN, still_means
-from magfusion.estimation.integrity.recording import beginning
-from magfusion.estimation.integrity.steady_field import OffEarth, off_earth
+from magfusion.estimation.data_checks.compasses import SPAN, still_means
+from magfusion.estimation.data_checks.recording import beginning
+from magfusion.estimation.data_checks.steady_field import OffEarth, off_earth
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray

@@ -7,14 +7,14 @@ import numpy as np
 from scipy.ndimage import binary_closing, binary_dilation
 from scipy.special import chdtri
 
-from magfusion.estimation.batch import Smoothed, solved_again
-from magfusion.estimation.integrity.separation import Separation, protection_levels, radii
+from magfusion.estimation.batch.batch import Smoothed, solved_again
+from magfusion.estimation.batch.log_graph import overlap
+from magfusion.estimation.graph.measurement import Measurement, robust_weight
+from magfusion.estimation.graph.state import states_in
 from magfusion.estimation.integrity.smoothed_separation import separate_smoothed
-from magfusion.estimation.log_graph import overlap
 from magfusion.estimation.measurements.joint_phasors import JointPhasors, at_nearest
-from magfusion.estimation.measurements.measurement import Measurement, robust_weight
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.state import states_in
+from magfusion.estimation.posterior.separation import Separation, protection_levels, radii
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict, alike
 from magfusion.units import Array, BoolArray, IntArray

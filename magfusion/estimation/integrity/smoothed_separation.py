@@ -5,17 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.estimation import chain_system as chains
-from magfusion.estimation.batch import Smoothed
-from magfusion.estimation.chain_parts import Parts, parts_of
-from magfusion.estimation.chain_system import Piece, chain_system, column_groups
-from magfusion.estimation.convergence import OPEN_ROTATION
-from magfusion.estimation.integrity.separation import Separation
+from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.posterior import chain_system as chains
+from magfusion.estimation.posterior.chain_parts import Parts, parts_of
+from magfusion.estimation.posterior.chain_system import Piece, chain_system, column_groups
+from magfusion.estimation.posterior.convergence import OPEN_ROTATION
+from magfusion.estimation.posterior.separation import Separation
 from magfusion.estimation.solve.chain import STRETCH, inverses, solve_chain
 from magfusion.estimation.solve.memory import give_back_memory
-from magfusion.estimation.state import MOTION
 from magfusion.units import Array, BoolArray
 
 # A prior that keeps what is open finite: far wider than anything that is of use.

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from magfusion.estimation.batch import Smoothed
+from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.integrity.score import Score
 from magfusion.model.samples import Log
 from magfusion.model.trust import Finding, Unverified

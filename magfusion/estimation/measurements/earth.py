@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magfusion.errors import InputError
-from magfusion.estimation.measurements.measurement import (
+from magfusion.estimation.graph.measurement import (
     Loss,
     Measurement,
     Rows,
@@ -22,12 +22,13 @@ from magfusion.estimation.measurements.measurement import (
     group_distances,
     robust_weight,
 )
+from magfusion.estimation.graph.state import State, States, states_of
 from magfusion.estimation.measurements.pose_fix import PoseFix
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
-from magfusion.estimation.state import State, States, states_of
 from magfusion.model.field import observe_earth
 from magfusion.model.noise import whitening
 from magfusion.model.parameters import Block, Calibration, SteadyView
+from magfusion.model.physics.earth import AMBIENT_SHARE
 from magfusion.model.rotation import rotations_of
 from magfusion.model.samples import SteadyFields
 from magfusion.model.site import MotionModel, Site
@@ -37,7 +38,6 @@ from magfusion.units import Array, BoolArray, IntArray
 EARTH_LOSS = "geman-mcclure"
 DISTURBED = 0.25  # weight below which the field is reported as disturbed
 GATE = 16.3  # chi square of three components, one in a thousand
-AMBIENT_SHARE = 0.005  # of the field's size: usual disturbance of each component, one sigma
 AMBIENT_TIME = 2.0  # s; over which it stays the same
 DEVIATION_SPAN = 5.0  # s; over which the deviation of the field's size is averaged
 LEAST_HORIZONTAL = 1e-6  # T; less gives no heading

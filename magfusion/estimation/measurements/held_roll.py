@@ -4,10 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.estimation.measurements.measurement import Measurement, Rows
-from magfusion.estimation.snapshot.axis_starts import least_turn
-from magfusion.estimation.state import States
-from magfusion.model.one_axis import axis_of, coil_lever
+from magfusion.estimation.graph.measurement import Measurement, Rows
+from magfusion.estimation.graph.state import States
+from magfusion.model.one_axis import axis_of, coil_lever, least_turn
 from magfusion.model.parameters import Block, Calibration
 from magfusion.model.quaternion import matrices, of_matrices
 from magfusion.model.rotation import vectors_of

@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.estimation.measurements.measurement import Loss, Measurement, Rows
+from magfusion.estimation.graph.measurement import Loss, Measurement, Rows
+from magfusion.estimation.graph.state import MOTION, State, States, states_of
 from magfusion.estimation.measurements.phasors import FieldPhasors
-from magfusion.estimation.state import MOTION, State, States, states_of
 from magfusion.model.field import skew
 from magfusion.model.parameters import Block, Calibration
 from magfusion.units import Array, BoolArray

@@ -13,7 +13,7 @@ epochs share is what the covariance claims where errors of variance A R have a g
 
 import numpy as np
 
-from magfusion.estimation.state import State
+from magfusion.estimation.graph.state import State
 from magfusion.model.noise import model_error
 from magfusion.model.site import Site
 from magfusion.units import Array, IntArray

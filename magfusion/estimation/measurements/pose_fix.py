@@ -1,17 +1,13 @@
-"""Fixes as a measurement of the pose (loose coupling), and the error that they have in common."""
+"""Fixes as a measurement of the pose (loose coupling)."""
 
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from magfusion.estimation.measurements.measurement import Loss, Measurement, Rows
-from magfusion.estimation.snapshot.problem import nuisance_blocks
-from magfusion.estimation.snapshot.survey_error import survey_jacobians
-from magfusion.estimation.state import States
-from magfusion.model.noise import measurement_cov, sensor_positions, whitening
+from magfusion.estimation.graph.measurement import Loss, Measurement, Rows
+from magfusion.estimation.graph.state import States
 from magfusion.model.parameters import Block, Calibration
-from magfusion.model.samples import FieldSamples
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
@@ -73,26 +69,3 @@ def pose_fixes(fixes: Trajectory, robust: str | None = None) -> PoseFix:
         np.linalg.inv(np.linalg.cholesky(fixes.pose_cov)),
         robust,
     )
-
-
-def survey_response(declared: Calibration, samples: FieldSamples, states: Trajectory) -> Array:
-    """Return what the survey's error does to every fix alike, shape (n, 6, parameters).
-
-    The graph takes the fixes' errors for independent, but no number of fixes averages it out.
-    Columns are of one sigma each.
-    """
-    cov = measurement_cov(
-        declared.site,
-        samples,
-        survey_error=True,
-        sensor_world=sensor_positions(declared.site, states),
-    )
-    by_found, by_survey = survey_jacobians(
-        declared,
-        nuisance_blocks(declared.site),
-        samples.time,
-        states.world_from_body,
-        states.position_world,
-        whitening(cov, samples.there),
-    )
-    return (np.linalg.pinv(by_found) @ by_survey)[:, :6]

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magfusion.estimation.measurements.measurement import Measurement, Rows
-from magfusion.estimation.state import States
+from magfusion.estimation.graph.measurement import Measurement, Rows
+from magfusion.estimation.graph.state import States
 from magfusion.model.parameters import Block, Calibration
 from magfusion.model.samples import ImuSamples
 from magfusion.units import Array, IntArray

@@ -4,7 +4,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.estimation.integrity.judgement import JudgedState, Judgement
+from magfusion.estimation.graph.state import ACCEL_BIAS as OWN_ACCEL_BIAS
+from magfusion.estimation.graph.state import GYRO_BIAS as OWN_GYRO_BIAS
+from magfusion.estimation.graph.state import MOTION, POSITION, ROTATION, VELOCITY
+from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
 from magfusion.estimation.orientation.filter import OrientationFilter
 from magfusion.estimation.orientation.layout import (
     ACCEL_BIAS,
@@ -15,9 +18,6 @@ from magfusion.estimation.orientation.layout import (
 )
 from magfusion.estimation.orientation.remarks import doubts, position_open, told_now
 from magfusion.estimation.orientation.stretch import GAP, STEP, Stretch, stretches
-from magfusion.estimation.state import ACCEL_BIAS as OWN_ACCEL_BIAS
-from magfusion.estimation.state import GYRO_BIAS as OWN_GYRO_BIAS
-from magfusion.estimation.state import MOTION, POSITION, ROTATION, VELOCITY
 from magfusion.model.parameters import initial_calibration
 from magfusion.model.site import MotionModel, Site
 from magfusion.units import Array

@@ -23,8 +23,8 @@ from magfusion.estimation.snapshot.coil_starts import (
     roots,
 )
 from magfusion.estimation.snapshot.problem import Problem, State
+from magfusion.model.one_axis import least_turn
 from magfusion.model.parameters import predict_channels
-from magfusion.model.rotation import rotations_of
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 KEPT = 24  # places of the grid that are refined roughly
@@ -94,19 +94,6 @@ def with_least_roll(problem: Problem, state: State) -> State:
     rotation[rows] = least_turn(axes, (state.rotation[rows] @ axes[..., None])[..., 0])
     position[rows] += (state.rotation[rows] - rotation[rows]) @ sensor.position_body
     return state._replace(rotation=rotation, position=position)
-
-
-def least_turn(from_vector: Array, to_vector: Array) -> Array:
-    """Return the smallest rotations that take directions to others, shape (..., 3, 3)."""
-    start = np.broadcast_to(from_vector, to_vector.shape)
-    across = np.cross(start, to_vector)
-    sine = np.linalg.norm(across, axis=-1, keepdims=True)
-    angle = np.arctan2(sine, np.sum(start * to_vector, axis=-1, keepdims=True))
-    smallest = np.eye(3)[np.argmin(np.abs(start), axis=-1)]
-    other = np.cross(start, smallest)  # any axis across, for the opposite direction
-    other = other / np.linalg.norm(other, axis=-1, keepdims=True)
-    about = np.where(sine > 1e-12, across / np.maximum(sine, 1e-300), other)
-    return rotations_of(about * angle)
 
 
 def phases_of(problem: Problem, state: State, free: BoolArray) -> Array:

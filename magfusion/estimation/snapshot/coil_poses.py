@@ -4,14 +4,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magfusion.estimation.integrity.fix_witness import rival_spread
-from magfusion.estimation.integrity.priors import unexplained
-from magfusion.estimation.integrity.statistics import FALSE_ALARMS, log_p_chi_square
-from magfusion.estimation.snapshot.axis_starts import least_turn
+from magfusion.estimation.data_checks.statistics import FALSE_ALARMS, log_p_chi_square
 from magfusion.estimation.snapshot.coil_fix import CoilFixes
 from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.estimation.snapshot.fix_witness import rival_spread
+from magfusion.estimation.snapshot.priors import unexplained
 from magfusion.model.field import skew
-from magfusion.model.one_axis import ANY_ROLL, CIRCLE, axis_of, coil_lever
+from magfusion.model.one_axis import ANY_ROLL, CIRCLE, axis_of, coil_lever, least_turn
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory, interpolate
 from magfusion.model.trust import Finding, StateTrust, Trust, Verdict

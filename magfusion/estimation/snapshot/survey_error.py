@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from magfusion.estimation.snapshot.problem import nuisance_blocks
+from magfusion.model.noise import measurement_cov, sensor_positions, whitening
 from magfusion.model.parameters import (
     CLOCK_OFFSET,
     Block,
@@ -12,6 +14,8 @@ from magfusion.model.parameters import (
     placed,
 )
 from magfusion.model.prior import prior_sqrt_covariance
+from magfusion.model.samples import FieldSamples
+from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
 SURVEY_GROUPS = ("beacons", "moments", "magnetometer", "extrinsics", "ground")
@@ -99,3 +103,26 @@ def honest_covariance(
     moved = inverse @ transposed @ by_survey
     cov = inverse @ spread @ inverse + moved @ np.swapaxes(moved, 1, 2)
     return 0.5 * (cov + np.swapaxes(cov, 1, 2))
+
+
+def survey_response(declared: Calibration, samples: FieldSamples, states: Trajectory) -> Array:
+    """Return what the survey's error does to every fix alike, shape (n, 6, parameters).
+
+    The graph takes the fixes' errors for independent, but no number of fixes averages it out.
+    Columns are of one sigma each.
+    """
+    cov = measurement_cov(
+        declared.site,
+        samples,
+        survey_error=True,
+        sensor_world=sensor_positions(declared.site, states),
+    )
+    by_found, by_survey = survey_jacobians(
+        declared,
+        nuisance_blocks(declared.site),
+        samples.time,
+        states.world_from_body,
+        states.position_world,
+        whitening(cov, samples.there),
+    )
+    return (np.linalg.pinv(by_found) @ by_survey)[:, :6]

@@ -68,6 +68,13 @@ _OF_FILE = {
     "accel": re.compile(r"acc"),
     "magnetometer": re.compile(r"mag"),
 }
+# Of each stream, whose columns may have no names of their own.
+_VECTORS = {
+    "imu": ("gyro", "accel"),
+    "gyro": ("gyro",),
+    "accel": ("accel",),
+    "magnetometer": ("field",),
+}
 _TYPICAL = {Dimension.FORCE: STANDARD_GRAVITY, Dimension.FIELD: 5e-5}  # SI
 FAST = 8.0  # rad/s; a body that turns so fast on the mean is more likely measured in degrees
 FAR = 500.0  # m
@@ -262,41 +269,61 @@ def by_place(
     dates : sequence of bool
         Whether a column holds dates.
     """
-    places = range(len(columns))
-    clocks = [k for k in places if dates[k] or (len(samples[k]) > 1 and _is_clock(samples[k]))]
-    found: dict[str, tuple[int, Unit]] = {}
-    if clocks:
-        iso = Unit(ISO, Dimension.TIME)
-        found[TIME] = (clocks[0], iso if dates[clocks[0]] else likely_time_unit(samples[clocks[0]]))
-    free = [k for k in places if k not in clocks[:1] and len(samples[k])]
-    stems = {
-        "imu": ("gyro", "accel"),
-        "gyro": ("gyro",),
-        "accel": ("accel",),
-        "magnetometer": ("field",),
-    }.get(stream, ())
-    for stem in stems:
-        dimension = STREAMS[stream][f"{stem}_x"]
-        units = {k: _unit_in(columns[k], dimension) for k in free}
-        tagged = [(k, unit) for k, unit in units.items() if unit is not None]
-        if len(tagged) == 3:
-            found |= {f"{stem}_{a}": one for a, one in zip("xyz", tagged, strict=True)}
-            free = [k for k in free if units[k] is None]
-    stems = tuple(stem for stem in stems if f"{stem}_x" not in found)
-    triples = [free[k : k + 3] for k in range(0, len(free) - len(free) % 3, 3)]
-    if not stems or len(triples) < len(stems):
-        return found
-    sizes = [_sizes([samples[k] for k in triple]) for triple in triples]
-    # Gravity keeps its size while a body moves.
-    steady = min(range(len(triples)), key=lambda k: float(np.std(sizes[k]) / np.mean(sizes[k])))
-    both = stems == ("gyro", "accel") and len(triples) == 2
-    order = [1 - steady, steady] if both else range(len(stems))
-    for stem, k in zip(stems, order, strict=False):
-        dimension = STREAMS[stream][f"{stem}_x"]
-        unit = likely_unit(dimension, sizes[k])
-        for axis, place in zip("xyz", triples[k], strict=True):
-            found[f"{stem}_{axis}"] = (place, unit)
+    found = _first_clock(samples, dates)
+    clocks = [place for place, _ in found.values()]
+    free = [k for k in range(len(columns)) if k not in clocks and len(samples[k])]
+    dimensions = {stem: STREAMS[stream][f"{stem}_x"] for stem in _VECTORS.get(stream, ())}
+    for stem in list(dimensions):
+        triple = _by_unit(columns, free, dimensions[stem])
+        if triple:
+            found |= _along_axes(stem, triple)
+            free = [k for k in free if k not in dict(triple)]
+            del dimensions[stem]
+    for stem, triple in _by_size(samples, free, dimensions).items():
+        found |= _along_axes(stem, triple)
     return found
+
+
+def _first_clock(samples: Sequence[Array], dates: Sequence[bool]) -> dict[str, tuple[int, Unit]]:
+    """Return the first column that holds dates, or that rises as stamps do."""
+    for place, (values, dated) in enumerate(zip(samples, dates, strict=True)):
+        if dated:
+            return {TIME: (place, Unit(ISO, Dimension.TIME))}
+        if len(values) > 1 and _is_clock(values):
+            return {TIME: (place, likely_time_unit(values))}
+    return {}
+
+
+def _along_axes(stem: str, triple: list[tuple[int, Unit]]) -> dict[str, tuple[int, Unit]]:
+    return {f"{stem}_{axis}": one for axis, one in zip("xyz", triple, strict=True)}
+
+
+def _by_unit(
+    columns: Sequence[Column], free: list[int], dimension: Dimension
+) -> list[tuple[int, Unit]]:
+    """Return the three columns whose units are of a dimension; none where there are not three."""
+    units = ((k, _unit_in(columns[k], dimension)) for k in free)
+    tagged = [(k, unit) for k, unit in units if unit is not None]
+    return tagged if len(tagged) == 3 else []
+
+
+def _by_size(
+    samples: Sequence[Array], free: list[int], dimensions: dict[str, Dimension]
+) -> dict[str, list[tuple[int, Unit]]]:
+    """Return, three columns after the other, vectors with the units that their sizes suggest."""
+    triples = [free[k : k + 3] for k in range(0, len(free) - len(free) % 3, 3)]
+    if not dimensions or len(triples) < len(dimensions):
+        return {}
+    sizes = [_sizes([samples[k] for k in triple]) for triple in triples]
+    order = list(range(len(dimensions)))
+    if tuple(dimensions) == _VECTORS["imu"] and len(triples) == 2:
+        # Gravity keeps its size while a body moves.
+        steady = min(order, key=lambda k: float(np.std(sizes[k]) / np.mean(sizes[k])))
+        order = [1 - steady, steady]
+    return {
+        stem: [(place, likely_unit(dimension, sizes[k])) for place in triples[k]]
+        for (stem, dimension), k in zip(dimensions.items(), order, strict=True)
+    }
 
 
 def _unit_in(column: Column, dimension: Dimension) -> Unit | None:

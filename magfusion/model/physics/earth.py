@@ -9,6 +9,7 @@ from magfusion.units import DEGREE, NANOTESLA, Array
 
 IGRF_FIRST = datetime.date(1900, 1, 1)
 IGRF_LAST = datetime.date(2030, 1, 1)
+AMBIENT_SHARE = 0.005  # of the field's size: usual disturbance of each component, one sigma
 
 # WGS84 (NIMA TR8350.2, tables 3.1 to 3.4): semi-major axis, flattening, first eccentricity
 # squared, normal gravity at the equator, Somigliana's constant, and omega^2 a^2 b / GM.

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from magfusion.estimation.integrity.separation import Separation, protection_levels
+from magfusion.estimation.posterior.separation import Separation, protection_levels
 from magfusion.model.parameters import (
     BeaconParameter,
     Block,

@@ -1,0 +1,1 @@
+"""One or several whole logs: preparation, start, graph, passes, self survey."""

@@ -1,0 +1,329 @@
+"""The whole offline estimate of one log: start, passes over the waveform, posterior."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.batch.chain import Start
+from magfusion.estimation.batch.log_graph import PreparedLog, noise_of
+from magfusion.estimation.batch.outer_iteration import (
+    advance,
+    begin_passes,
+    demodulate_about,
+    nothing_moved,
+    plan_pass,
+    relax,
+    retune,
+    solve_about,
+)
+from magfusion.estimation.batch.passes import PassFile
+from magfusion.estimation.batch.prepared import prepared
+from magfusion.estimation.batch.settings import SmootherSettings as SmootherSettings
+from magfusion.estimation.data_checks.mending import mended
+from magfusion.estimation.demodulation.hearing import heard_site
+from magfusion.estimation.graph.graph import Estimate, Graph, read_states
+from magfusion.estimation.graph.measurement import Measurement
+from magfusion.estimation.measurements.earth import EarthField, check_earth, disturbed
+from magfusion.estimation.measurements.field_error import field_errors
+from magfusion.estimation.measurements.phasors import FieldPhasors, alone
+from magfusion.estimation.measurements.signs import count_open
+from magfusion.estimation.measurements.zero_velocity import quiet_before
+from magfusion.estimation.posterior.convergence import last_move, refuse_open
+from magfusion.estimation.posterior.marginals import marginals
+from magfusion.estimation.posterior.noise_tuning import (
+    Tuned,
+)
+from magfusion.estimation.snapshot.survey_error import survey_response
+from magfusion.estimation.solve.bordered import Optimised, optimise
+from magfusion.estimation.solve.memory import give_back_memory
+from magfusion.model.parameters import Block, Calibration, placed
+from magfusion.model.progress import Report, quiet
+from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.without_imu import logged, require_motion_prior
+from magfusion.units import Array, BoolArray, IntArray
+
+QUIET = 0.3  # sigmas; a last pass that moved the poses by less has converged all the same
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """The posterior of one log.
+
+    Parameters
+    ----------
+    states : Trajectory
+        With velocity, biases and pose covariance, on the log's clock: at the fields, in gaps of
+        them, and where anything else was measured.
+    epoch : int ndarray, shape (n,)
+        States at which the fields are.
+    fields : FieldSamples
+        The phasors of the last pass.
+    declared, calibration : Calibration
+        Before and after.
+    blocks : tuple of Block
+        What was estimated.
+    considered : tuple of Block
+        What else is uncertain, and in the covariance.
+    field_errors : tuple of Block
+        Errors of the beacons' fields that are constant in place, likewise.
+    calibration_cov : ndarray, shape (dimension, dimension)
+    calibration_response : ndarray, shape (dimension, uncertain)
+        What one sigma of what is uncertain does to it; its part is in that covariance.
+    residual : ndarray, shape (n, channels, 6)
+        Whitened; NaN where a channel is missing, or with loose coupling.
+    graph : Graph
+        As it was last optimised.
+    estimate : Estimate
+        In it: the states, and the calibration of every segment of a long log.
+    rival_chi_square : float, optional
+        How much worse the best trajectory from another chain of hypotheses is, after its first
+        pass: a small figure means that the log leaves a mirrored trajectory possible.  None where
+        there was no other chain, or all came to the same.
+    converged : bool
+        Whether the last pass moved nothing, or little in units of its sigma.
+    last_move : float
+        Root mean square of what the last pass moved the poses by, in sigmas: the gauge of the
+        survey has a large one.
+    rival : Trajectory, optional
+        That trajectory.
+    dropped : mapping
+        Reason to number of windows.
+    bridged : int
+        Intervals with a gap in the inertial stream.
+    earth_residual : ndarray, shape (n, 3), optional
+        Whitened; None where the Earth field was not measured.
+    earth_disturbed : bool ndarray, shape (n,), optional
+        Where the motion contradicts it.
+    fix_response : ndarray, shape (states, 6, parameters), optional
+        What one sigma of the survey does to every pose alike, with loose coupling.
+    noise : tuple of Tuned
+        What was found of noise and model error; the site of ``calibration`` has it.
+    open_signs : int
+        Amplitudes that the last pass left out, since their sign was open.
+    standing : bool ndarray, shape (states,)
+        Where the platform stands.
+    """
+
+    states: Trajectory
+    epoch: IntArray
+    fields: FieldSamples
+    declared: Calibration
+    calibration: Calibration
+    blocks: tuple[Block, ...]
+    considered: tuple[Block, ...]
+    calibration_cov: Array
+    residual: Array
+    start: Start
+    graph: Graph
+    estimate: Estimate
+    rival_chi_square: float | None
+    dropped: Mapping[str, int]
+    bridged: int
+    cost: float
+    passes: int
+    iterations: int
+    converged: bool
+    last_move: float = 0.0
+    rival: Trajectory | None = None
+    earth_residual: Array | None = None
+    earth_disturbed: BoolArray | None = None
+    fix_response: Array | None = None
+    noise: tuple[Tuned, ...] = ()
+    open_signs: int = 0
+    field_errors: tuple[Block, ...] = ()
+    calibration_response: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    standing: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+    @property
+    def uncertain(self) -> tuple[Block, ...]:
+        """All that is in the covariance without being estimated."""
+        return placed((*self.considered, *self.field_errors))
+
+
+def smooth(
+    log: Log,
+    site: Site,
+    settings: SmootherSettings | None = None,
+    report: Report = quiet,
+    passes: PassFile | None = None,
+) -> Smoothed:
+    """Estimate the best trajectory of a log, with the calibration in the same solution.
+
+    Parameters
+    ----------
+    log : Log
+        With a waveform, or with phasors in the site's channel order.
+    report : callable, optional
+        Called with stage, steps done and steps in all.
+    passes : PassFile, optional
+        Keeps where the passes are, and knows where those of a run that was stopped were.
+
+    Raises
+    ------
+    InputError
+        Where the log holds nothing usable.
+    EstimationError
+        Where the graph cannot be solved.
+    """
+    settings = SmootherSettings() if settings is None else settings
+    log, site = logged(log, site)
+    require_motion_prior(site)
+    for beacon in site.beacons:
+        if beacon.unknown is not None:
+            raise InputError(
+                f"the {beacon.unknown} of beacon {beacon.name} is unknown; place it by"
+                " magfusion.estimation.batch.self_survey.smooth_and_place"
+            )
+    if settings.earth:
+        check_earth(site)
+    log, site = heard_site(log, site, settings.lockin)
+    known = mended(log, site)
+    return _solved(prepared(known, site, settings, report), settings, report, passes)
+
+
+def _solved(
+    log: PreparedLog, settings: SmootherSettings, report: Report, passes: PassFile | None = None
+) -> Smoothed:
+    """Solve a log, pass by pass until nothing moves, and return its posterior."""
+    first, time, steps = log.declared, log.states.time, settings.passes + 3
+    calm = quiet_before(log.imu, time - first.imu_offset(time), first.site.platform.motion)
+    known = None if passes is None else passes.begun(log)
+    now = begin_passes(log, settings) if known is None else known
+    log = replace(log, declared=now.declared)
+    while True:
+        report(f"pass {now.done + 1}", now.done + 2, steps)
+        plan, wave = plan_pass(log, now, settings), demodulate_about(log, now)
+        solved = solve_about(log, now, wave, calm, plan)
+        before, now = now, advance(now, solved)
+        settled = nothing_moved(before, now, solved)
+        if plan.finds_noise:
+            give_back_memory()
+            latest = noise_of(
+                log, solved.graph, solved.found.estimate, now.states, wave, first.site
+            )
+            now, settled = retune(before, now, latest, plan), False
+            log = replace(log, declared=now.declared)
+        if settled or now.done >= settings.passes:
+            break
+        now = relax(log, before, now, solved.graph.blocks)
+        del solved  # of a long log it is most of what there is
+        give_back_memory()
+        if passes is not None:
+            passes.keep(now, first, log.blocks)
+    report("posterior", steps - 1, steps)
+    # What the receiver keeps for another pass is not needed any more.
+    log = replace(log, demodulation=replace(log.demodulation, receiver=None))
+    give_back_memory()
+    found, fields = solved.found, log.samples if wave is None else wave.fields
+    result = posterior(log, solved.graph, found, fields, solved.gaps)
+    report("done", steps, steps)
+    refuse_open(result.states)
+    move = 0.0
+    if not (settled and found.converged):
+        unfinished = None if found.converged else (solved.graph, found.estimate)
+        move = last_move(before.states, result.states, unfinished)
+    return replace(
+        result,
+        noise=now.tuned,
+        standing=now.standing,
+        passes=now.done,
+        iterations=now.iterations,
+        converged=move < QUIET,
+        last_move=move,
+    )
+
+
+def solved_again(result: Smoothed, measurements: tuple[Measurement, ...]) -> Smoothed:
+    """Return a posterior with other measurements of the same states, from where it is.
+
+    Raises
+    ------
+    RuntimeError
+        GTSAM's own, of a system that these leave open.
+    """
+    graph = replace(result.graph, measurements=measurements)
+    found = optimise(graph, result.estimate)
+    pose_cov, calibration_cov, response = marginals(graph, found.estimate, result.uncertain)
+    states = read_states(found.estimate.values, result.states.time)
+    phasors = next(m for m in measurements if isinstance(m, FieldPhasors))
+    heard = np.any(phasors.sqrt_information != 0.0, axis=(2, 3))
+    error = graph.residual(phasors.alone(), found.estimate)
+    return replace(
+        result,
+        states=replace(states, pose_cov=pose_cov),
+        calibration=found.estimate.calibration,
+        calibration_cov=calibration_cov,
+        calibration_response=response,
+        residual=np.where(heard[..., None], error, np.nan),
+        graph=graph,
+        estimate=found.estimate,
+        cost=found.cost,
+        iterations=result.iterations + found.iterations,
+    )
+
+
+def posterior(
+    log: PreparedLog, graph: Graph, found: Optimised[Estimate], samples: FieldSamples, gaps: int
+) -> Smoothed:
+    """Return the posterior of a log whose graph was optimised.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        As they are measured in the graph.
+    gaps : int
+        Intervals that were bridged.
+    """
+    estimate = found.estimate
+    states, response = read_states(estimate.values, log.states.time), None
+    errors: tuple[Block, ...] = ()
+    if log.fixes is None:
+        measured = log.measured_at(graph.measurements)
+        here = Trajectory(**{k: v[measured] for k, v in vars(states).items() if v is not None})
+        errors = field_errors(estimate.calibration.site, here.time, here)
+    uncertain = placed((*log.considered, *errors))
+    pose_cov, calibration_cov, moved = marginals(graph, estimate, uncertain)
+    if log.fixes is not None:
+        there = survey_response(log.declared, log.samples, log.at_fields(states))
+        later = np.searchsorted(log.epoch, np.arange(len(states)))
+        response = there[np.minimum(later, len(there) - 1)]
+        pose_cov = pose_cov + response @ np.swapaxes(response, 1, 2)
+    left = {type(m): graph.residual(m, estimate) for m in map(alone, graph.measurements)}
+    error = left.get(FieldPhasors, np.nan)
+    residual = np.where(samples.told, error, np.nan)
+    earth_field = next((m for m in graph.measurements if isinstance(m, EarthField)), None)
+    earth = None if earth_field is None else left[EarthField][:, 0]
+    return Smoothed(
+        states=replace(states, pose_cov=pose_cov),
+        epoch=log.epoch,
+        fields=samples,
+        declared=log.declared,
+        calibration=estimate.calibration,
+        blocks=graph.blocks,
+        considered=log.considered,
+        calibration_cov=calibration_cov,
+        residual=residual,
+        start=log.start,
+        graph=graph,
+        estimate=estimate,
+        rival_chi_square=log.rival_chi_square,
+        rival=log.rival,
+        dropped=log.demodulation.dropped,
+        open_signs=count_open(log.samples, samples),
+        bridged=gaps,
+        cost=found.cost,
+        passes=1,
+        iterations=found.iterations,
+        converged=found.converged,
+        earth_residual=earth,
+        earth_disturbed=(
+            None if earth is None or earth_field is None else disturbed(earth, earth_field.repeats)
+        ),
+        fix_response=response,
+        field_errors=errors,
+        calibration_response=moved,
+    )

@@ -1,0 +1,169 @@
+"""One log among several of one site: what is kept of it between two rounds, and a round of it."""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.estimation.batch.batch import Smoothed, posterior
+from magfusion.estimation.batch.joint import Known, Said, Shared, as_prior, with_prior
+from magfusion.estimation.batch.log_graph import PreparedLog, graph_of
+from magfusion.estimation.batch.prepared import Begun, prepared_again
+from magfusion.estimation.batch.settings import SmootherSettings
+from magfusion.estimation.data_checks.mending import mended
+from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
+from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate, read_states
+from magfusion.estimation.graph.prior_factor import PriorShift
+from magfusion.estimation.measurements.field_error import field_errors
+from magfusion.estimation.posterior.condensed import columns_of, condensed
+from magfusion.estimation.posterior.noise_tuning import Tuned, with_noise
+from magfusion.estimation.solve.bordered import Optimised, eliminate, optimise
+from magfusion.model.parameters import Block, Calibration, difference, dimension, retract
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class OfLog:
+    """What is known of a log between two rounds: all of it can be written down.
+
+    Parameters
+    ----------
+    begun : Begun
+        Its states, and what was declared of it.
+    steps : ndarray, shape (segments, dimension)
+        From what was declared of it to the calibration of each segment of a long log.
+    noise : tuple of Tuned
+        Found when it was smoothed alone.
+    standing : bool ndarray, shape (states,)
+        Where the platform stands.
+    said : Said
+        What it says of the shared calibration.
+    """
+
+    begun: Begun
+    steps: Array
+    noise: tuple[Tuned, ...]
+    standing: BoolArray
+    said: Said
+
+
+class Round(NamedTuple):
+    """One log, solved with what the others say as its prior."""
+
+    log: PreparedLog
+    graph: Graph
+    found: Optimised[Estimate]
+    wave: MotionCompensated | None
+    gaps: int
+    shift: PriorShift
+
+
+def of_smoothed(result: Smoothed, shared: Shared) -> OfLog:
+    """Return what is kept of a log that was smoothed alone."""
+    begun = Begun(
+        replace(result.states, pose_cov=None),
+        result.declared,
+        result.start,
+        result.rival_chi_square,
+        result.rival,
+    )
+    part = condensed(result.graph, result.estimate, result.considered, result.field_errors)
+    said = Said(difference(shared.declared, result.calibration, shared.blocks), part)
+    steps = _steps(result.declared, result.estimate, result.blocks)
+    return OfLog(begun, steps, result.noise, result.standing, said)
+
+
+def solve_round(
+    log: Log, site: Site, settings: SmootherSettings, kept: OfLog, shared: Shared, prior: Known
+) -> Round:
+    """Solve a log from where it was, with what the survey and the other logs say as its prior.
+
+    The waveform is predicted anew from where it was; the noise stays as it was found alone.
+
+    Parameters
+    ----------
+    prior : Known
+        Of all other logs and the survey.
+
+    Raises
+    ------
+    EstimationError
+        Where the log is not the one that was smoothed, or cannot be solved.
+    """
+    declared = with_noise(kept.begun.declared, kept.noise)
+    ready = prepared_again(mended(log, site), site, settings, kept.begun)
+    blocks, states = ready.blocks, ready.states
+    every = tuple(retract(declared, blocks, step) for step in kept.steps)
+    ready = replace(
+        ready,
+        declared=with_prior(prior, shared, declared),
+        blocks=as_prior(prior, shared, blocks),
+    )
+    segments = every if len(every) > 1 else ()
+    calibration = every[len(every) // 2]
+    by_waveform = ready.demodulation.anew
+    wave = ready.compensated(calibration, states) if by_waveform else None
+    graph, gaps = graph_of(ready, states, calibration, wave, kept.standing)
+    start = initial_estimate(states, calibration, segments)
+    found = optimise(graph, start)
+    if found.converged:  # a cost tells steps below its own rounding no better from none
+        step = eliminate(graph.linearized(found.estimate), graph.ordering).optimize()
+        found = replace(found, estimate=graph.moved(found.estimate, step))
+    return Round(ready, graph, found, wave, gaps, _shift(prior, ready))
+
+
+def _shift(prior: Known, log: PreparedLog) -> PriorShift:
+    """Return what is considered does to the prior of a log that the others made."""
+    rows = columns_of(log.blocks, own=False)
+    by_considered = np.zeros((len(rows), dimension(log.considered)))
+    columns = columns_of(log.considered, own=False)
+    if prior.by_common.shape[1]:
+        by_considered[np.ix_(rows, columns)] = prior.by_common
+    apart = np.zeros((len(rows), len(prior.step)))
+    value, vector = np.linalg.eigh(prior.apart)
+    apart[rows] = vector * np.sqrt(np.maximum(value, 0.0))
+    return PriorShift(by_considered, apart)
+
+
+def after_round(kept: OfLog, done: Round, shared: Shared) -> OfLog:
+    """Return what is kept of a log after a round."""
+    estimate, log = done.found.estimate, done.log
+    states = read_states(estimate.values, log.states.time)
+    measured = log.measured_at(done.graph.measurements)
+    here = Trajectory(**{k: v[measured] for k, v in vars(states).items() if v is not None})
+    errors = field_errors(estimate.calibration.site, here.time, here)
+    part = condensed(done.graph, estimate, log.considered, errors)
+    said = Said(difference(shared.declared, estimate.calibration, shared.blocks), part)
+    begun = replace(kept.begun, states=states)
+    return replace(
+        kept, begun=begun, steps=_steps(kept.begun.declared, estimate, log.blocks), said=said
+    )
+
+
+def joint_posterior(kept: OfLog, done: Round, blocks: tuple[Block, ...]) -> Smoothed:
+    """Return the posterior of a log in the joint solution, against what the site declares.
+
+    Parameters
+    ----------
+    blocks : tuple of Block
+        With the sigmas that the site declares.
+    """
+    samples = done.log.samples if done.wave is None else done.wave.fields
+    graph = replace(done.graph, shift=done.shift)
+    result = posterior(done.log, graph, done.found, samples, done.gaps)
+    return replace(
+        result,
+        declared=with_noise(kept.begun.declared, kept.noise),
+        blocks=blocks,
+        noise=kept.noise,
+        standing=kept.standing,
+    )
+
+
+def _steps(declared: Calibration, estimate: Estimate, blocks: tuple[Block, ...]) -> Array:
+    every = estimate.segments or (estimate.calibration,)
+    steps = [difference(declared, calibration, blocks) for calibration in every]
+    return np.array(steps).reshape(len(every), dimension(blocks))

@@ -1,0 +1,318 @@
+"""The graph of a whole log at an estimate: the inertial stream, and all that was measured."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.estimation.batch.chain import Start
+from magfusion.estimation.data_checks.detection import (
+    DETECTION_CHI_SQUARE_ONLINE,
+    above_noise,
+    only,
+)
+from magfusion.estimation.demodulation.close_log import looked_at, without_silent
+from magfusion.estimation.demodulation.demodulation import Demodulation
+from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
+from magfusion.estimation.graph.drift_segments import segments_of
+from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate
+from magfusion.estimation.graph.imu_decimation import preintegrate_stream
+from magfusion.estimation.graph.inertial import Link, Preintegrated, inertial_graph, links_between
+from magfusion.estimation.graph.measurement import Measurement
+from magfusion.estimation.graph.preintegration import low_passed_rate_at
+from magfusion.estimation.measurements.earth import earth_measurement, unheld
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
+from magfusion.estimation.measurements.model_error import alike_in_batch
+from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
+from magfusion.estimation.measurements.pose_fix import pose_fixes
+from magfusion.estimation.measurements.signs import with_signs
+from magfusion.estimation.measurements.zero_velocity import zero_velocity
+from magfusion.estimation.posterior.noise_tuning import Tuned, tune
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.one_axis import roll_is_open
+from magfusion.model.parameters import Block, Calibration, corrected_imu, dimension, placed
+from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, BoolArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedLog:
+    """A log with a start found.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        Of the fields, before anything is known of the motion.
+    steady : SteadyFields, optional
+        Of the same epochs, where the Earth field is measured.
+    epoch : int ndarray, shape (n,)
+        States at which the fields are.
+    fixes : Fixes, optional
+        Where they enter the graph and not the phasors.
+    states : Trajectory
+        The start at all epochs.
+    blocks, considered : tuple of Block
+        What is estimated of the calibration, and what else is uncertain; of fixes the survey's
+        part is added at the end.
+    loss : {None, 'huber', 'cauchy'}
+        Of the fields.
+    others : tuple of (ndarray, Measurement)
+        Anything else that was measured, with the times of its rows (s).
+    rival_chi_square, rival : float, Trajectory, optional
+        As of `Smoothed`.
+    silence : tuple of ndarray, optional
+        Where gaps of the inertial stream begin and end in which what the fields tell of the motion
+        stands in (s).
+    """
+
+    demodulation: Demodulation
+    samples: FieldSamples
+    steady: SteadyFields | None
+    epoch: IntArray
+    fixes: Fixes | None
+    start: Start
+    states: Trajectory
+    declared: Calibration
+    blocks: tuple[Block, ...]
+    considered: tuple[Block, ...]
+    loss: str | None
+    others: tuple[tuple[Array, Measurement], ...]
+    rival_chi_square: float | None = None
+    rival: Trajectory | None = None
+    silence: tuple[Array, Array] | None = None
+
+    @property
+    def imu(self) -> ImuSamples:
+        """The inertial stream, with what stands in for it."""
+        return self.demodulation.log.imu
+
+    def at_fields(self, states: Trajectory) -> Trajectory:
+        """Return the states at which the fields are."""
+        rows = {k: v[self.epoch] for k, v in vars(states).items() if v is not None}
+        return Trajectory(**rows)
+
+    def measured_at(self, measurements: tuple[Measurement, ...]) -> IntArray:
+        """Return the states at which fields were measured, in long windows or short ones."""
+        short = [m.epoch for m in measurements if isinstance(m, JointPhasors)]
+        return np.unique(np.concatenate([self.epoch, *short])) if short else self.epoch
+
+    def compensated(self, calibration: Calibration, states: Trajectory) -> MotionCompensated:
+        """Return the phasors with the motion taken off, by the stream that a calibration corrects.
+
+        With those of the beacons that the motion hid.
+
+        Parameters
+        ----------
+        states : Trajectory
+            At all epochs.
+        """
+        log = self.demodulation.log
+        imu = calibration.on_log_rate(corrected_imu(calibration, self.blocks, self.imu))
+        known = replace(self.demodulation, log=log if imu is log.imu else replace(log, imu=imu))
+        path = None if known.close is None else states
+        wave = known.compensated(calibration, self.at_fields(states), path)
+        heard, hidden = self.samples.valid, self.demodulation.drowned
+        if hidden is not None and np.any(hidden):
+            heard = heard | hidden & above_noise(wave.fields, DETECTION_CHI_SQUARE_ONLINE)
+        return replace(wave, fields=only(wave.fields, heard))
+
+    def with_signs(
+        self, calibration: Calibration, states: Trajectory, *, first: bool
+    ) -> MotionCompensated:
+        """Return amplitudes with the signs that states give them, as if motion were taken off."""
+        here = self.at_fields(states)
+        return MotionCompensated.of_slots(with_signs(self.samples, here, calibration, first=first))
+
+    def rests(self, standing: BoolArray) -> Measurement:
+        """Return the zero velocities of some epochs."""
+        motion = self.declared.site.platform.motion
+        return zero_velocity(np.flatnonzero(standing), motion.rest_speed_sigma)
+
+    def zero_rates(
+        self, standing: BoolArray, time: Array, calibration: Calibration
+    ) -> list[Measurement]:
+        """Return what the gyroscope shows at the epochs of whole rests (s), where there are any."""
+        chosen = np.flatnonzero(standing & self.samples.at_rest(time))
+        if not len(chosen) or not self.declared.site.platform.inertial:
+            return []
+        offset = calibration.imu_offset(time[chosen])
+        noise = self.declared.site.platform.imu.gyro_noise
+        within = self.samples.rest_about(time[chosen])
+        from magfusion.estimation.measurements.zero_rate import zero_rate
+
+        found = zero_rate(chosen, time[chosen], within, self.imu, offset, noise)
+        return [] if found is None else [found]
+
+
+def graph_of(
+    log: PreparedLog,
+    states: Trajectory,
+    calibration: Calibration,
+    wave: MotionCompensated | None = None,
+    standing: BoolArray | None = None,
+    *,
+    roughly: bool = False,
+) -> tuple[Graph, int]:
+    """Return the graph at an estimate, and the number of intervals bridged.
+
+    Parameters
+    ----------
+    wave : MotionCompensated, optional
+        Phasors that an estimate has been taken off from; those of before where there are none.
+    standing : bool ndarray, shape (states,), optional
+        Where the platform is known to stand.
+    roughly : bool
+        Whether another graph will follow, and the noise that stays is not found by this one: the
+        sigmas of the inertial factors may be a tenth off.
+    """
+    links, bridged = _links(log, states, calibration, roughly=roughly)
+    measurements = [
+        replace(measurement, epoch=np.searchsorted(states.time, time)[measurement.epoch])
+        for time, measurement in log.others
+    ]
+    if roll_is_open(log.declared.site):
+        from magfusion.estimation.measurements.held_roll import held_roll
+
+        measurements.append(held_roll(log.declared.site, states))
+    if standing is not None and np.any(standing):
+        measurements.append(log.rests(standing))
+        measurements += log.zero_rates(standing, states.time, calibration)
+    if log.fixes is not None:
+        measurements.append(_fixes(log, log.fixes))
+    else:
+        measurements += _fields(log, states, calibration, wave, standing)
+        measurements = _with_short(log, states, calibration, wave, standing, measurements)
+    native = inertial_graph([link.measurement for link in links], log.declared.site.platform)
+    acting = links if links[0].by_calibration is not None else ()
+    segments = segments_of(states.time, log.declared, log.blocks)
+    graph = Graph(
+        native, tuple(measurements), log.declared, log.blocks, len(states), acting, segments
+    )
+    return graph, bridged
+
+
+def _links(
+    log: PreparedLog, states: Trajectory, calibration: Calibration, *, roughly: bool
+) -> tuple[tuple[Link, ...], int]:
+    """Return the inertial stream between the states, and the number of intervals bridged.
+
+    Its derivatives are by what is estimated, then by what is considered.
+    """
+    site, applied = log.declared.site, calibration
+    accel, gyro = states.accel_bias_body, states.gyro_bias_body
+    assert accel is not None
+    assert gyro is not None
+    blocks, bridged = (*log.blocks, *placed(log.considered, dimension(log.blocks))), []
+
+    def preintegrated(calibration: Calibration) -> list[Preintegrated]:
+        imu = applied.on_log_rate(corrected_imu(calibration, blocks, log.imu))
+        offset, model, gravity = applied.time_offset, site.platform.imu, site.gravity
+        found, gaps = preintegrate_stream(
+            imu, offset, states.time, model, gravity, accel, gyro, log.silence, roughly=roughly
+        )
+        bridged.append(int(np.sum(gaps)))
+        return found
+
+    links = links_between(
+        preintegrated, calibration, blocks, lambda _: initial_estimate(states, calibration).values
+    )
+    return tuple(links), bridged[0]
+
+
+def _fixes(log: PreparedLog, fixes: Fixes) -> Measurement:
+    """Return the fixes of the start as poses that were measured."""
+    cov = fixes.pose_cov[np.arange(len(fixes)), log.start.chosen] * overlap(log.samples)
+    return replace(pose_fixes(replace(log.start.states, pose_cov=cov), log.loss), epoch=log.epoch)
+
+
+def _fields(
+    log: PreparedLog,
+    states: Trajectory,
+    calibration: Calibration,
+    wave: MotionCompensated | None,
+    standing: BoolArray | None,
+) -> list[Measurement]:
+    """Return the phasors, and the Earth field where it is measured."""
+    samples = log.samples if wave is None else wave.fields
+    here, site = log.at_fields(states), calibration.site
+    if not samples.signed:
+        samples = with_signs(samples, here, calibration, every=wave is None)
+    assert here.gyro_bias_body is not None
+    imu = calibration.on_log_rate(corrected_imu(calibration, log.blocks, log.imu))
+    rate_body = low_passed_rate_at(imu, calibration.time_offset, samples.time)
+    rate_body -= here.gyro_bias_body
+    offset = calibration.imu_offset(samples.time)
+    by_offset = None if wave is None else wave.by_time_offset
+    phasors = field_phasors(
+        site,
+        samples,
+        log.epoch,
+        here,
+        rate_body,
+        offset,
+        overlap(samples),
+        by_offset,
+        standing=None if standing is None else standing[log.epoch],
+        beside=False,  # its modes are considered
+    )
+    out: list[Measurement] = [replace(phasors, robust=log.loss)]
+    if log.steady is not None:
+        steady, step = log.steady if wave is None else wave.steady, _step(samples)
+        out.append(earth_measurement(site, steady, log.epoch, rate_body, offset, step))
+        detected = np.any(samples.valid, axis=1)
+        out += unheld(states, log.epoch, detected, step, log.declared.site.platform.motion)
+    return out
+
+
+def _with_short(
+    log: PreparedLog,
+    states: Trajectory,
+    calibration: Calibration,
+    wave: MotionCompensated | None,
+    standing: BoolArray | None,
+    measurements: list[Measurement],
+) -> list[Measurement]:
+    """Return measurements with those of short windows, where the tones are close."""
+    close = log.demodulation.close
+    if close is None or wave is None or wave.unexplained_sensor is None:
+        return measurements
+    assert wave.wanted is not None
+    imu = calibration.on_log_rate(corrected_imu(calibration, log.blocks, log.imu))
+    left, nodes = wave.unexplained_sensor, wave.wanted
+    joint = close.measured(left, nodes, states, calibration, imu, standing)
+    joint = without_silent(joint, wave.fields, log.at_fields(states), calibration)
+    length = float(np.median(wave.fields.window))
+    out = [looked_at(m, joint, length) if isinstance(m, FieldPhasors) else m for m in measurements]
+    return [*out, replace(joint, robust=log.loss)]
+
+
+def overlap(samples: FieldSamples) -> float:
+    """Return how many windows hold each sample: their information must not be counted twice."""
+    if samples.magnetometers:
+        names = dict.fromkeys(samples.magnetometers)
+        each = [samples.of_magnetometer(name) for name in names]
+        return max((overlap(own) for own in each if len(own) > 1), default=1.0)
+    if samples.of_rests:
+        return 1.0
+    return max(1.0, float(np.median(samples.window)) / _step(samples))
+
+
+def _step(samples: FieldSamples) -> float:
+    return float(np.median(np.diff(samples.time)))
+
+
+def noise_of(
+    log: PreparedLog,
+    graph: Graph,
+    estimate: Estimate,
+    states: Trajectory,
+    wave: MotionCompensated | None,
+    declared: Site,
+) -> tuple[Tuned, ...]:
+    """Return the noise of a log whose graph was solved with some phasors; see `tune`."""
+    samples, here = log.samples if wave is None else wave.fields, log.at_fields(states)
+    alike = alike_in_batch(here.position_world, declared.model_error_length)
+    blind = log.demodulation.blind
+    windows, held = overlap(samples), log.considered
+    return tune(graph, estimate, samples, here, declared, windows, alike, blind, held)

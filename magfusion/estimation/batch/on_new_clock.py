@@ -1,0 +1,47 @@
+"""States that follow the IMU's clock when it is found to be another."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.batch.log_graph import PreparedLog
+from magfusion.estimation.graph.preintegration import low_passed_rate_at
+from magfusion.model.parameters import Calibration, corrected_imu
+from magfusion.model.quaternion import matrices, of_vectors
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import BoolArray
+
+
+def on_new_clock(
+    log: PreparedLog, states: Trajectory, old: Calibration, new: Calibration, standing: BoolArray
+) -> Trajectory:
+    """Return the states that the platform had where a new clock puts the log's epochs.
+
+    The inertial stream was cut by the old clock, and states carry it: a pass tells apart where the
+    platform was at an epoch by the state and the lag between both clocks.  The next pass cuts by
+    the new clock and follows the motion inside its windows from there; without the lag it would
+    follow a motion that comes late by what the pass has just found.
+
+    Parameters
+    ----------
+    states : Trajectory
+        With velocity and bias, by the old clock.
+    standing : bool ndarray, shape (states,)
+        Where the platform is known to stand, and no clock moves it.
+    """
+    lag = np.where(standing, 0.0, new.imu_offset(states.time) - old.imu_offset(states.time))
+    velocity, bias = states.velocity_world, states.gyro_bias_body
+    if not np.any(lag) or velocity is None or bias is None:
+        return states
+    imu = old.on_log_rate(corrected_imu(old, log.blocks, log.imu))
+    rate = low_passed_rate_at(imu, old.time_offset, states.time) - bias
+    later = -lag[:, None]
+    gained = np.zeros_like(velocity)
+    if len(states) > 1:
+        gained = np.gradient(velocity, states.time, axis=0)
+    return replace(
+        states,
+        world_from_body=states.world_from_body @ matrices(of_vectors((later * rate).T)),
+        position_world=states.position_world + later * velocity,
+        velocity_world=velocity + later * gained,
+    )

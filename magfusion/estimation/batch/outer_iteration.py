@@ -1,0 +1,202 @@
+"""One pass over a log: its graph about the states of the pass before, solved."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from gtsam.symbol_shorthand import V
+
+from magfusion.estimation.batch.log_graph import PreparedLog, graph_of
+from magfusion.estimation.batch.on_new_clock import on_new_clock
+from magfusion.estimation.batch.passes import Passed
+from magfusion.estimation.batch.settings import SmootherSettings
+from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
+from magfusion.estimation.graph.graph import Estimate, Graph, initial_estimate, read_states
+from magfusion.estimation.measurements.zero_velocity import may_stand
+from magfusion.estimation.posterior.convergence import settled_at
+from magfusion.estimation.posterior.noise_tuning import (
+    Tuned,
+    as_declared,
+    plausible,
+    with_noise,
+)
+from magfusion.estimation.posterior.noise_tuning import settled as same_noise
+from magfusion.estimation.posterior.relaxation import Step, part_of_the_way
+from magfusion.estimation.solve.bordered import Optimised, eliminate, marginal, optimise
+from magfusion.estimation.solve.memory import give_back_memory
+from magfusion.model.parameters import Block
+from magfusion.model.site import MotionModel
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import BoolArray
+
+TUNINGS = 3  # passes after which the noise is found anew; then it stays as it is
+ON_THE_WAY, CONVERGED = 1e-4, 1e-6  # relative decrease of the cost at which a pass ends
+
+
+class SolvedPass(NamedTuple):
+    """The graph of a pass, and what was found in it.
+
+    Parameters
+    ----------
+    states : Trajectory
+        Without covariance.
+    gaps : int
+        Intervals that were bridged.
+    stood : bool ndarray, shape (states,)
+        Where the platform was found at rest.
+    iterations : int
+        Of the optimiser, with those before the rests were known.
+    """
+
+    graph: Graph
+    found: Optimised[Estimate]
+    states: Trajectory
+    gaps: int
+    stood: BoolArray
+    iterations: int
+
+
+def begin_passes(log: PreparedLog, settings: SmootherSettings) -> Passed:
+    """Return where a log begins of which no pass was made."""
+    return Passed(
+        done=0,
+        iterations=0,
+        tuning=settings.tune and log.fixes is None and log.samples.signed,
+        states=log.states,
+        declared=log.declared,
+        calibration=log.declared,
+        segments=(),
+        standing=log.samples.at_rest(log.states.time),
+        tuned=(),
+    )
+
+
+class Plan(NamedTuple):
+    """How the next pass is made.
+
+    Parameters
+    ----------
+    short : bool
+        Whether the optimiser may end early.
+    finds_noise : bool
+        Whether noise and model error are found from its residuals.
+    roughly : bool
+        Whether its graph may be a rough one.
+    """
+
+    short: bool
+    finds_noise: bool
+    roughly: bool
+
+
+def plan_pass(log: PreparedLog, now: Passed, settings: SmootherSettings) -> Plan:
+    """Return how the next pass is made."""
+    # Another pass is sure to come.
+    short = (now.done == 0 or now.tuning) and now.done + 1 < settings.passes
+    # The noise that stays is told from the residuals by the sigmas as they are.
+    finds = now.tuning and (now.done > 0 or not by_waveform(log))
+    return Plan(short, finds, short and not (finds and now.done >= TUNINGS))
+
+
+def by_waveform(log: PreparedLog) -> bool:
+    """Return whether each pass demodulates a log anew."""
+    return log.fixes is None and log.demodulation.anew
+
+
+def demodulate_about(log: PreparedLog, now: Passed) -> MotionCompensated | None:
+    """Return the phasors as the states of the last pass have them; None for those of the log."""
+    if now.done > 0 and by_waveform(log):
+        wave = log.compensated(now.calibration, now.states)
+        give_back_memory()
+        return wave
+    if not log.samples.signed:
+        return log.with_signs(now.calibration, now.states, first=now.done == 0)
+    return None
+
+
+def solve_about(
+    log: PreparedLog,
+    now: Passed,
+    wave: MotionCompensated | None,
+    calm: BoolArray,
+    plan: Plan,
+) -> SolvedPass:
+    """Solve the graph about the states of the last pass.
+
+    Parameters
+    ----------
+    calm : bool ndarray, shape (states,)
+        Where the IMU is quiet, so that the platform may be at rest.
+    """
+    time, motion = now.states.time, log.declared.site.platform.motion
+    tolerance = ON_THE_WAY if plan.short else CONVERGED
+    roughly = plan.roughly
+    graph, gaps = graph_of(log, now.states, now.calibration, wave, now.standing, roughly=roughly)
+    begun = initial_estimate(now.states, now.calibration, now.segments)
+    found = optimise(graph, begun, tolerance=tolerance)
+    iterations, after = found.iterations, read_states(found.estimate.values, time)
+    stood = _at_rest(graph, found.estimate, after, calm & ~now.standing, motion)
+    if np.any(stood):  # at once: it costs no preintegration
+        graph = replace(graph, measurements=(*graph.measurements, log.rests(stood)))
+        found = optimise(graph, found.estimate, tolerance=tolerance)
+        iterations += found.iterations
+        after = read_states(found.estimate.values, time)
+    return SolvedPass(graph, found, after, gaps, stood, iterations)
+
+
+def advance(now: Passed, solved: SolvedPass) -> Passed:
+    """Return where a log is after a pass."""
+    estimate = solved.found.estimate
+    return replace(
+        now,
+        done=now.done + 1,
+        iterations=now.iterations + solved.iterations,
+        states=solved.states,
+        calibration=estimate.calibration,
+        segments=estimate.segments,
+        standing=now.standing | solved.stood,
+    )
+
+
+def nothing_moved(before: Passed, after: Passed, solved: SolvedPass) -> bool:
+    """Return whether a pass that is not the first came to where the one before was."""
+    if before.done == 0 or np.any(solved.stood):
+        return False
+    return settled_at(before.states, after.states, before.calibration, after.calibration)
+
+
+def retune(before: Passed, after: Passed, latest: tuple[Tuned, ...], plan: Plan) -> Passed:
+    """Return where a log is after a pass, with the noise of its residuals if it can be noise."""
+    noise = latest if plausible(latest) else as_declared(latest)
+    moves = before.done < TUNINGS and not same_noise(before.tuned, latest)
+    return replace(
+        after,
+        tuning=(plan.roughly or moves) and plausible(latest),
+        declared=with_noise(after.declared, noise),
+        calibration=with_noise(after.calibration, noise),
+        segments=tuple(with_noise(segment, noise) for segment in after.segments),
+        tuned=noise,
+    )
+
+
+def relax(log: PreparedLog, before: Passed, after: Passed, blocks: tuple[Block, ...]) -> Passed:
+    """Return from where the next pass goes on: from this one's states, or from before them."""
+    moved = before.states, after.states, before.calibration, after.calibration
+    step = Step.of(before.step, *moved)
+    states, calibration = part_of_the_way(*moved, blocks, step.share)
+    states = on_new_clock(log, states, before.calibration, calibration, after.standing)
+    return replace(after, states=states, calibration=calibration, step=step)
+
+
+def _at_rest(
+    graph: Graph, estimate: Estimate, states: Trajectory, asked: BoolArray, motion: MotionModel
+) -> BoolArray:
+    """Return at which of some epochs with a quiet IMU the platform is at rest."""
+    out = np.zeros(len(asked), dtype=bool)
+    if np.any(asked):
+        assert states.velocity_world is not None
+        tree = eliminate(graph.linearized(estimate), graph.ordering)
+        rows = np.flatnonzero(asked)
+        cov = np.array([marginal(tree, V(i), 3) for i in rows.tolist()])
+        out[rows] = may_stand(states.velocity_world[rows], cov, motion)
+    return out

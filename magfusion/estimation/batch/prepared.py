@@ -1,0 +1,202 @@
+"""A log made ready to be smoothed: demodulated, with a start that was found, or known before."""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.errors import EstimationError
+from magfusion.estimation.batch.bridged_log import bridged
+from magfusion.estimation.batch.chain import Start
+from magfusion.estimation.batch.likeliest import likeliest
+from magfusion.estimation.batch.log_graph import PreparedLog
+from magfusion.estimation.batch.offline import begin, carried, unbiased, with_rest_bias
+from magfusion.estimation.batch.settings import SmootherSettings
+from magfusion.estimation.data_checks.detection import detected, only
+from magfusion.estimation.demodulation.demodulation import Demodulation, demodulated
+from magfusion.estimation.measurements.zero_velocity import quiet_before
+from magfusion.estimation.snapshot.fix import Fixes
+from magfusion.model.one_axis import roll_is_open
+from magfusion.model.parameters import Calibration, initial_calibration
+from magfusion.model.progress import Report
+from magfusion.model.samples import FieldSamples, ImuSamples, Log, SteadyFields
+from magfusion.model.site import MotionModel, Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.receiver.cycles import whole_cycles
+from magfusion.receiver.slots import has_schedule
+from magfusion.units import Array
+
+LONGEST_STEP = 5.0  # s; without any field a state is made after so long
+REST_STEP = 2.0  # s; and so long at rest, where each has a zero velocity
+SPARSE = 2.5  # intervals; a longer one than so many usual ones is a gap
+
+
+@dataclass(frozen=True, eq=False)
+class Begun:
+    """Where an estimate of a log begins that was smoothed before.
+
+    Parameters
+    ----------
+    states : Trajectory
+        At all its epochs, without covariance.
+    declared : Calibration
+        Before it was smoothed, with what was declared of its own.
+    start : Start
+        Of which those came.
+    rival_chi_square, rival : float, Trajectory, optional
+        As of `magfusion.estimation.batch.batch.Smoothed`.
+    """
+
+    states: Trajectory
+    declared: Calibration
+    start: Start
+    rival_chi_square: float | None = None
+    rival: Trajectory | None = None
+
+
+class _Demodulated(NamedTuple):
+    """A log before it has a start, with the times at which states are made (s)."""
+
+    log: Log
+    demodulation: Demodulation
+    samples: FieldSamples
+    steady: SteadyFields | None
+    time: Array
+    calibration: Calibration
+
+
+def prepared(log: Log, site: Site, settings: SmootherSettings, report: Report) -> PreparedLog:
+    """Return a log with the start that the motion prefers.
+
+    Raises
+    ------
+    InputError
+        Where the log holds nothing usable.
+    EstimationError
+        Where it has too few epochs.
+    """
+    report("demodulating", 0, settings.passes + 3)
+    heard = _demodulated(log, site, settings)
+    report("finding a start", 1, settings.passes + 3)
+    imu, offset = heard.log.imu, heard.calibration.time_offset
+    beginnings = begin(heard.samples, heard.steady, heard.log, heard.calibration)
+    imu = unbiased(imu, heard.samples, offset)
+    starts = [
+        _with_start(
+            heard,
+            settings,
+            Begun(
+                with_rest_bias(
+                    _one_roll(
+                        carried(beginning.states, imu, offset, heard.time),
+                        site,
+                        signed=heard.samples.signed,
+                    ),
+                    heard.log.imu,
+                    heard.calibration,
+                ),
+                beginning.declared,
+                beginning.start,
+            ),
+            beginning.fixes,
+        )
+        for beginning in beginnings
+    ]
+    return bridged(likeliest(starts))
+
+
+def _one_roll(states: Trajectory, site: Site, *, signed: bool) -> Trajectory:
+    """Return states whose rolls, where nothing tells them, are those of one that does not turn."""
+    if not roll_is_open(site):
+        return states
+    from magfusion.estimation.measurements.held_roll import without_roll
+
+    return without_roll(states, site, signed=signed)
+
+
+def prepared_again(log: Log, site: Site, settings: SmootherSettings, known: Begun) -> PreparedLog:
+    """Return a log that was smoothed before, at the states that it had then."""
+    heard = _demodulated(log, site, settings)
+    rows = np.isin(known.states.time, heard.time)
+    if not np.sum(rows) == len(heard.time):
+        raise EstimationError(f"log {log.name} is not the one that was smoothed before")
+    own = {k: v[rows] for k, v in vars(known.states).items() if v is not None}
+    at_start = replace(known, states=Trajectory(**own))
+    ready = bridged(_with_start(heard, settings, at_start, None))
+    if np.array_equal(ready.states.time, known.states.time):
+        ready = replace(ready, states=known.states)
+    return ready
+
+
+def _demodulated(log: Log, site: Site, settings: SmootherSettings) -> _Demodulated:
+    loose = settings.coupling == "loose"
+    heard = demodulated
+    if log.waveforms:
+        from magfusion.estimation.demodulation.several_demodulation import (
+            demodulated_several as heard,
+        )
+    demodulation = heard(log, site, settings.lockin)
+    samples = demodulation.fields
+    if loose and has_schedule(site):
+        samples = whole_cycles(samples, log.imu, site)
+    if len(samples) < 2:
+        raise EstimationError(
+            f"log {log.name} has {len(samples)} field epoch; at least 2 are needed"
+        )
+    begin_imu = float(log.imu.time[0])
+    calibration = initial_calibration(site, float(np.mean(samples.time)), begin_imu)
+    steady = None
+    log = replace(log, imu=calibration.on_log_rate(log.imu))
+    if settings.earth:
+        steady, samples = demodulation.steady(calibration), only(samples, detected(samples))
+    between = _in_gaps(samples, log.imu, calibration.time_offset, site.platform.motion)
+    others = [time for time, _ in settings.measurements]
+    if demodulation.close is not None and not loose:
+        others.append(demodulation.close.windows.centre)
+    time = np.unique(np.concatenate([samples.time, between, *others]))
+    return _Demodulated(log, demodulation, samples, steady, time, calibration)
+
+
+def _with_start(
+    heard: _Demodulated, settings: SmootherSettings, begun: Begun, fixes: Fixes | None
+) -> PreparedLog:
+    loose = settings.coupling == "loose"
+    blocks, considered = ((), ()) if loose else settings.blocks(heard.calibration.site)
+    return PreparedLog(
+        demodulation=heard.demodulation,
+        samples=heard.samples,
+        steady=heard.steady,
+        epoch=np.searchsorted(heard.time, heard.samples.time),
+        fixes=fixes if loose else None,
+        start=begun.start,
+        states=begun.states,
+        declared=begun.declared,
+        blocks=blocks,
+        considered=considered,
+        loss=settings.loss,
+        others=settings.measurements,
+        rival_chi_square=begun.rival_chi_square,
+        rival=begun.rival,
+    )
+
+
+def _in_gaps(
+    samples: FieldSamples, imu: ImuSamples, time_offset: float, motion: MotionModel
+) -> Array:
+    """Return when states are made where no field comes (s), more of them where the IMU is quiet.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        What comes; between whole rests, and in them, nothing does.
+    time_offset : float
+        (s)
+    """
+    time = samples.time
+    step, out = np.diff(time), [np.zeros(0)]
+    usual = 0.0 if samples.of_rests else SPARSE * float(np.median(step))
+    for k in np.flatnonzero(step > max(LONGEST_STEP, usual)):
+        inner = np.linspace(time[k], time[k + 1], int(np.ceil(step[k] / REST_STEP)) + 1)[1:-1]
+        every = np.arange(1, len(inner) + 1) % int(LONGEST_STEP / REST_STEP) == 0
+        out.append(inner[every | quiet_before(imu, inner - time_offset, motion)])
+    return np.concatenate(out)

@@ -1,0 +1,389 @@
+"""Starts that the inertial stream joins: tracks of every hypothesis, to the end and back.
+
+A track that took the wrong turn where two mirrored poses meet is worse from there on than one that
+begins anew on the other side, for a price.  What is worse by little at the end is a rival, be it
+for the whole log or for a stretch of it.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.estimation.batch.strides import Strides, strides_between
+from magfusion.estimation.batch.tracks import (
+    MOTION,
+    Heard,
+    Tracks,
+    carried,
+    heard,
+    rows_at,
+    updated,
+)
+from magfusion.estimation.snapshot.fix import Fixes, Gravity
+from magfusion.estimation.snapshot.likelihood import fix_epochs
+from magfusion.model.channel_effects import of_all_sensors
+from magfusion.model.parameters import Calibration
+from magfusion.model.samples import FieldSamples, ImuSamples
+from magfusion.model.site import Site
+from magfusion.model.strapdown import attitude_at, attitude_from_gyro, mean_about
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, BoolArray, IntArray
+
+STEP = 0.1  # s; of the epochs that tracks take in, unless windows are longer
+VISITS = 6000  # at most; a longer log has longer steps
+LONGEST_STEP = 2.0  # s; over which an inertial stream still joins fixes
+ANEW = 1.0  # s; between epochs at which tracks may begin anew
+FIRST_ANEW = 4  # of these, at which drive phases may begin anew too
+LEAP = 60.0  # chi square; price of beginning anew
+MOST = 12  # tracks at a time
+WORSE = 250.0  # chi square; a track worse by more is given up
+SAME_PLACE, SAME_TURN = 0.03, 0.03  # m, rad; within which two tracks are one
+RETURNING = 4  # tracks that go back
+OTHERWISE, STRETCH = 0.1, 0.5  # m or rad, and s; a rival is so far off for so long
+RIVALS = 3
+FIRST_ROTATION, FIRST_POSITION, FIRST_PHASE = 0.5, 1.0, 1.0  # rad, m, rad; where a fix is open
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A trajectory that a track took.
+
+    Parameters
+    ----------
+    states : Trajectory
+        At some of the epochs, with velocity.
+    phase : ndarray, shape (n, channels)
+        Drive phase beyond the calibration's (rad).
+    cost : float
+        Of its track.
+    """
+
+    states: Trajectory
+    phase: Array
+    cost: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """What tracks are followed through."""
+
+    samples: FieldSamples
+    hearing: Heard
+    strides: Strides
+    fixes: Fixes
+    gravity: Gravity
+
+    @property
+    def site(self) -> Site:
+        return self.hearing.site
+
+
+@dataclass(frozen=True)
+class _Meeting:
+    """Two tracks that became one at a visited epoch: rows of the epoch before."""
+
+    visit: int
+    kept: int
+    lost: int
+    worse: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Followed:
+    """Tracks of every visited epoch, and those that were given up since they met others."""
+
+    visits: list[Tracks]
+    meetings: list[_Meeting]
+
+    def path(self, row: int, visit: int) -> list[tuple[int, int]]:
+        """Return visit and row of a track's history, the latest first."""
+        out = []
+        for i in range(visit, -1, -1):
+            out.append((i, row))
+            row = int(self.visits[i].parent[row])
+        return out
+
+
+def search(
+    samples: FieldSamples, fixes: Fixes, imu: ImuSamples, calibration: Calibration
+) -> list[Found]:
+    """Return the trajectories that explain a log best, the likeliest first.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        Epochs of the fixes.
+    imu : ImuSamples
+        The gyro's bias at rest taken off.
+    """
+    kept = thinned(samples)
+    some = samples.rows(kept)
+    offset, site = calibration.time_offset, calibration.site
+    at = Fixes(**{name: value[kept] for name, value in vars(fixes).items()})
+    asked = _Search(
+        some,
+        heard(some, calibration),
+        strides_between(imu, offset, some.time),
+        at,
+        _upright(imu, offset, some.time, site),
+    )
+    count = len(some)
+    ahead = _follow(asked, _seeds(asked, 0), range(count))
+    last = ahead.visits[-1]
+    best = last.rows(np.argsort(last.cost)[:RETURNING])
+    # What the way there has told is told again on the way back: it is only where to begin.
+    again = replace(best, cov=4.0 * best.cov, cost=np.zeros(len(best)))
+    back = _follow(asked, replace(again, parent=np.arange(len(again))), range(count - 1, -1, -1))
+    return _trajectories(asked, back)
+
+
+def can_search(samples: FieldSamples) -> bool:
+    """Tell whether a log is long enough, and not too long, for tracks."""
+    return len(samples) > 2 and float(np.ptp(samples.time)) <= VISITS * LONGEST_STEP
+
+
+def thinned(samples: FieldSamples) -> IntArray:
+    """Return which epochs are taken: no two windows share a sample."""
+    usual = float(np.median(np.diff(samples.time)))
+    wanted = max(STEP, float(np.median(samples.window)), float(np.ptp(samples.time)) / VISITS)
+    stride = min(round(wanted / usual), len(samples) - 1)  # of the shortest log both ends
+    return np.arange(0, len(samples), max(1, stride))
+
+
+def _upright(imu: ImuSamples, time_offset: float, time: Array, site: Site) -> Gravity:
+    """Return the direction of the mean specific force, which motion disturbs."""
+    stamps, motion = imu.time + time_offset, site.platform.motion
+    chain = attitude_from_gyro(stamps, imu.gyro_body)
+    turned = mean_about(stamps, chain.apply(imu.accel_body), time, motion.accel_span)
+    if not site.platform.inertial:
+        return Gravity(np.tile([0.0, 0.0, 1.0], (len(time), 1)), np.full(len(time), np.inf))
+    up = attitude_at(chain, stamps, imu.gyro_body, time).inv().apply(turned)
+    sigma = np.full(len(time), motion.accel_sigma / site.gravity)
+    return Gravity(up / np.linalg.norm(up, axis=1, keepdims=True), sigma)
+
+
+def _seeds(asked: _Search, k: int) -> Tracks:
+    """Return tracks that begin at the fixes of an epoch, drive phases and all."""
+    hearing, rows = asked.hearing, np.array([k])
+    fixes = fix_epochs(
+        asked.samples.rows(rows), hearing.calibration, gravity=asked.gravity.rows(rows)
+    )
+    good = np.flatnonzero(np.isfinite(fixes.cost[0]))
+    free, none = int(np.sum(hearing.free)), np.zeros((len(good), 3))
+    clock = asked.site.clock.drift_sigma * 2.0 * np.pi * _frequencies(asked.site)[hearing.free]
+    phases = [np.full(free, FIRST_PHASE), np.maximum(clock, 1e-9)]
+    sigma = np.concatenate([_motion_sigma(asked.site), *phases])
+    mine = asked.site.of_sensor(0)
+    own = hearing.calibration.drive_phase(hearing.time[k])[mine]
+    tracks = Tracks(
+        rotation=fixes.world_from_body[0, good],
+        position=fixes.position_world[0, good],
+        velocity=none,
+        accel_bias=none,
+        gyro_bias=none,
+        phase=own + fixes.phase[0, good][:, mine],
+        rate=np.zeros((len(good), len(hearing.free))),
+        cov=np.tile(np.diag(sigma**2), (len(good), 1, 1)),
+        cost=fixes.cost[0, good] - fixes.cost[0, 0],
+        parent=np.arange(len(good)),
+    )
+    _, by = rows_at(tracks, hearing, k)
+    information = np.diag(1.0 / sigma**2) + np.swapaxes(by, 1, 2) @ by
+    return replace(tracks, cov=np.asarray(np.linalg.inv(information), dtype=np.float64))
+
+
+def _motion_sigma(site: Site) -> Array:
+    """Return how well a track's motion is known before anything is heard, shape (15,)."""
+    imu = site.platform.imu
+    sigma = [
+        FIRST_ROTATION,
+        FIRST_POSITION,
+        site.platform.motion.speed_sigma,
+        max(imu.accel_bias_sigma, 1e-6),
+        max(imu.gyro_bias_sigma, 1e-8),
+    ]
+    return np.repeat(sigma, 3)
+
+
+def _frequencies(site: Site) -> Array:
+    return np.concatenate([beacon.tone_frequencies_hz for beacon in site.beacons])
+
+
+def _follow(asked: _Search, tracks: Tracks, order: Sequence[int]) -> _Followed:
+    hearing, backward = asked.hearing, order[0] > order[-1]
+    time = hearing.time
+    visits, meetings = [_light(tracks)], list[_Meeting]()
+    anew, begun = time[order[0]], 0
+    spent, taken = 0.0, 0.0
+    for i in range(1, len(order)):
+        k = order[i]
+        before = float(np.min(tracks.cost))
+        tracks = carried(tracks, asked.strides, min(k, order[i - 1]), hearing, backward)
+        tracks = replace(tracks, parent=np.arange(len(tracks)))
+        tracks = updated(tracks, hearing, k)
+        spent, taken = spent + float(np.min(tracks.cost)) - before, taken + hearing.components[k]
+        # Where the noise is larger than declared, so is every difference.
+        level = max(1.0, spent / max(taken, 1.0))
+        if abs(time[k] - anew) >= ANEW and hearing.components[k] > 0.0:
+            anew, begun = time[k], begun + 1
+            fresh = not backward and begun <= FIRST_ANEW and bool(np.any(hearing.free))
+            tracks = _with_others(asked, tracks, k, level, fresh=fresh)
+        tracks, met = _merged(tracks, i)
+        meetings += [m for m in met if m.worse < WORSE * level]
+        keep = np.argsort(tracks.cost)[:MOST]
+        keep = keep[tracks.cost[keep] < tracks.cost[keep[0]] + WORSE * level]
+        tracks = tracks.rows(keep)
+        visits.append(_light(tracks))
+    return _Followed([*visits[:-1], tracks], meetings)
+
+
+def _light(tracks: Tracks) -> Tracks:
+    """Return tracks without their covariance, to be kept."""
+    return replace(tracks, cov=np.zeros((len(tracks), 0, 0)))
+
+
+def _with_others(asked: _Search, tracks: Tracks, k: int, level: float, *, fresh: bool) -> Tracks:
+    """Return tracks, and new ones at the hypotheses of an epoch where no track is."""
+    best = int(np.argmin(tracks.cost))
+    price = tracks.cost[best] + LEAP * level
+    others = [_anew(asked, tracks, best, k)]
+    if fresh:
+        others.append(_seeds(asked, k))
+    for other in others:
+        if len(other):
+            parent = np.full(len(other), tracks.parent[best])
+            other = replace(other, cost=price + other.cost, parent=parent)
+            elsewhere = ~np.any(_same(other, tracks), axis=1)
+            tracks = tracks.joined(other.rows(elsewhere))
+    return tracks
+
+
+def _anew(asked: _Search, tracks: Tracks, best: int, k: int) -> Tracks:
+    """Return tracks at the fixes of an epoch, with the drive phases of the best track.
+
+    What else it has made of the motion may be what led it astray.
+    """
+    hearing = asked.hearing
+    fixes, row = asked.fixes, k
+    if np.any(hearing.free) and not np.all(fixes.determined[row, np.isfinite(fixes.cost[row])]):
+        # With the track's drive phases no azimuth is open.
+        site = hearing.site
+        known = tuple(replace(beacon, synchronised=True) for beacon in site.beacons)
+        calibration = replace(
+            hearing.calibration,
+            site=replace(site, beacons=known),
+            phase=of_all_sensors(site, tracks.phase[best]),
+            drift=np.zeros(len(known)),
+            reference_time=float(hearing.time[k]),
+        )
+        fixes, row = fix_epochs(asked.samples.rows(np.array([k])), calibration), 0
+    cost = fixes.cost[row] - fixes.cost[row, 0]
+    good = np.flatnonzero((cost < 2.0 * LEAP) & fixes.determined[row])
+    new = tracks.rows(np.full(len(good), best))
+    rotation = fixes.world_from_body[row, good]
+    to_world = np.tile(np.eye(6), (len(good), 1, 1))
+    to_world[:, 3:, 3:] = rotation
+    cov = new.cov.copy()
+    cov[:, :MOTION, :] = cov[:, :, :MOTION] = 0.0
+    cov[:, :MOTION, :MOTION] = np.diag(_motion_sigma(asked.site) ** 2)
+    cov[:, :6, :6] = to_world @ fixes.pose_cov[row, good] @ np.swapaxes(to_world, 1, 2)
+    none = np.zeros((len(good), 3))
+    return replace(
+        new,
+        rotation=rotation,
+        position=fixes.position_world[row, good],
+        velocity=none,
+        accel_bias=none,
+        gyro_bias=none,
+        cov=cov,
+        cost=cost[good],
+    )
+
+
+def _same(some: Tracks, others: Tracks) -> BoolArray:
+    """Tell which tracks are where others are, shape (some, others)."""
+    away = np.linalg.norm(some.position[:, None] - others.position, axis=-1)
+    turn = np.swapaxes(some.rotation, 1, 2)[:, None] @ others.rotation
+    near = (away < SAME_PLACE) & (_angle(turn) < SAME_TURN)
+    lag = np.angle(np.exp(1j * (some.phase[:, None] - others.phase)))
+    return np.asarray(near & np.all(np.abs(lag) < 2.0 * SAME_TURN, axis=-1))
+
+
+def _angle(turn: Array) -> Array:
+    """Return the angle of rotation matrices, shape (...,)."""
+    off = np.stack(
+        [turn[..., i, j] - turn[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=-1
+    )
+    return np.arctan2(np.linalg.norm(off, axis=-1), np.einsum("...ii->...", turn) - 1.0)
+
+
+def _merged(tracks: Tracks, visit: int) -> tuple[Tracks, list[_Meeting]]:
+    """Return tracks without those that have come to where a better one is."""
+    if len(tracks) == 1:
+        return tracks, []
+    tracks = tracks.rows(np.argsort(tracks.cost))
+    same, gone, met = _same(tracks, tracks), np.zeros(len(tracks), dtype=bool), []
+    for j in range(1, len(tracks)):
+        better = np.flatnonzero(same[j, :j] & ~gone[:j])
+        if len(better):
+            i, gone[j] = int(better[0]), True
+            worse = float(tracks.cost[j] - tracks.cost[i])
+            kept, lost = int(tracks.parent[i]), int(tracks.parent[j])
+            if kept != lost:
+                met.append(_Meeting(visit - 1, kept, lost, worse))
+    return tracks.rows(~gone), met
+
+
+def _trajectories(asked: _Search, followed: _Followed) -> list[Found]:
+    """Return the best way, and what differs from it for a while and is not much worse."""
+    last = len(followed.visits) - 1
+    order = np.argsort(followed.visits[-1].cost)
+    paths = [(float(followed.visits[-1].cost[r]), followed.path(int(r), last)) for r in order]
+    best = float(paths[0][0])
+    paths += list(_by_stretch(followed, paths[0][1], best))
+    out: list[Found] = []
+    for cost, path in sorted(paths, key=lambda pair: pair[0]):
+        found = _read(asked, followed, path, cost)
+        if len(out) <= RIVALS and all(differ(found.states, other.states) for other in out):
+            out.append(found)
+    return out
+
+
+def _by_stretch(
+    followed: _Followed, path: list[tuple[int, int]], cost: float
+) -> Iterator[tuple[float, list[tuple[int, int]]]]:
+    """Yield ways that part from the best before one of its meetings."""
+    row_at = dict(path)
+    for meeting in followed.meetings:
+        if row_at.get(meeting.visit) == meeting.kept:
+            earlier = followed.path(meeting.lost, meeting.visit)
+            yield cost + meeting.worse, [p for p in path if p[0] > meeting.visit] + earlier
+
+
+def differ(some: Trajectory, others: Trajectory) -> bool:
+    """Tell whether two trajectories of the same epochs are apart, or turned, for long enough."""
+    away = np.linalg.norm(some.position_world - others.position_world, axis=1)
+    between = np.swapaxes(some.world_from_body, 1, 2) @ others.world_from_body
+    other = (away > OTHERWISE) | (_angle(between) > OTHERWISE)
+    step = float(np.median(np.diff(some.time)))
+    return bool(np.sum(other) * step > STRETCH)
+
+
+def _read(asked: _Search, followed: _Followed, path: list[tuple[int, int]], cost: float) -> Found:
+    """Return a way as a trajectory; it was followed backward."""
+    rows = [(followed.visits[visit], row) for visit, row in path]
+
+    def values(name: str) -> Array:
+        return np.array([getattr(tracks, name)[row] for tracks, row in rows])
+
+    time = asked.samples.time
+    own = asked.hearing.calibration.drive_phase(time)[:, asked.site.of_sensor(0)]
+    states = Trajectory(
+        time=time,
+        world_from_body=values("rotation"),
+        position_world=values("position"),
+        velocity_world=values("velocity"),
+    )
+    phase = np.where(asked.hearing.free, values("phase") - own, 0.0)
+    return Found(states, of_all_sensors(asked.site, phase), cost)

@@ -1,0 +1,284 @@
+"""Hypotheses of the motion side by side, each an error-state filter, all in the same calls.
+
+Tangent of a track: rotation (body axes, right perturbation), position and velocity (world),
+accelerometer and gyro bias, then phase and rate of phase of every tone whose drive is not known.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.batch.strides import Strides
+from magfusion.estimation.graph.preintegration import BRIDGE_ACCEL_NOISE, BRIDGE_GYRO_NOISE
+from magfusion.estimation.snapshot.problem import nuisance_blocks
+from magfusion.estimation.snapshot.survey_error import whitened
+from magfusion.model.channel_effects import of_all_sensors
+from magfusion.model.field import skew
+from magfusion.model.noise import measurement_cov, stacked, whitening
+from magfusion.model.parameters import Block, Calibration, linearize_channels
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.units import Array, BoolArray, IntArray
+
+ROTATION, POSITION, VELOCITY = slice(0, 3), slice(3, 6), slice(6, 9)
+ACCEL, GYRO = slice(9, 12), slice(12, 15)
+MOTION = 15
+ROUNDS = 3  # of linearising anew in one update: the first prediction may be wide
+LOUD = 16.0  # times the expected chi square, from which a channel counts less
+LEAST_WALK = 1e-9  # of a bias: without any a covariance may become singular
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """Filters at one epoch, a row each.
+
+    Parameters
+    ----------
+    rotation : ndarray, shape (h, 3, 3)
+        world_from_body.
+    position, velocity : ndarray, shape (h, 3)
+        World (m, m/s).
+    accel_bias, gyro_bias : ndarray, shape (h, 3)
+        Body (m/s^2, rad/s).
+    phase, rate : ndarray, shape (h, channels of a magnetometer)
+        Drive phase at this epoch (rad), and what it gains in a second beyond the nominal.
+    cov : ndarray, shape (h, 15 + 2 free, 15 + 2 free)
+    cost : ndarray, shape (h,)
+        Minus twice the logarithm of the likelihood, but for what all have in common.
+    parent : int ndarray, shape (h,)
+        Row at the epoch before; at the first its own.
+    """
+
+    rotation: Array
+    position: Array
+    velocity: Array
+    accel_bias: Array
+    gyro_bias: Array
+    phase: Array
+    rate: Array
+    cov: Array
+    cost: Array
+    parent: IntArray
+
+    def __len__(self) -> int:
+        return len(self.cost)
+
+    def rows(self, chosen: IntArray | BoolArray) -> "Tracks":
+        """Return some tracks, or tracks repeated."""
+        return Tracks(**{name: value[chosen] for name, value in vars(self).items()})
+
+    def joined(self, other: "Tracks") -> "Tracks":
+        """Return these and others."""
+        return Tracks(**{k: np.concatenate([v, getattr(other, k)]) for k, v in vars(self).items()})
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """The phasors of all epochs as tracks take them in.
+
+    Parameters
+    ----------
+    measured : ndarray, shape (n, channels, 6)
+        (T); zero where missing.
+    sqrt_information : ndarray, shape (n, channels, 3, 3)
+        Whitening, the survey's error in it.
+    components : ndarray, shape (n,)
+        How many are there.
+    free : bool ndarray, shape (channels of a magnetometer,)
+        Whose drive phase is not known.
+    blocks : tuple of Block
+        Of those phases.
+    """
+
+    calibration: Calibration
+    time: Array
+    measured: Array
+    sqrt_information: Array
+    components: Array
+    free: BoolArray
+    blocks: tuple[Block, ...]
+
+    @property
+    def site(self) -> Site:
+        """As declared."""
+        return self.calibration.site
+
+
+def heard(samples: FieldSamples, calibration: Calibration) -> Heard:
+    """Return phasors as tracks take them in."""
+    site = calibration.site
+    cov = measurement_cov(site, samples, survey_error=True)
+    synchronised = {beacon.name: beacon.synchronised for beacon in site.beacons}
+    return Heard(
+        calibration=calibration,
+        time=samples.time,
+        measured=stacked(samples.phasor_sensor),
+        sqrt_information=whitening(cov, samples.there),
+        components=np.sum(samples.numbers, axis=1).astype(np.float64),
+        free=np.array(
+            [not synchronised[name] for name, _ in samples.channels[site.of_sensor(0)]], dtype=bool
+        ),
+        blocks=nuisance_blocks(site),
+    )
+
+
+def moved(tracks: Tracks, step: Array, free: BoolArray) -> Tracks:
+    """Return tracks moved by a tangent vector each, shape (h, 15 + 2 free)."""
+    phase, rate = tracks.phase.copy(), tracks.rate.copy()
+    count = int(np.sum(free))
+    phase[:, free] += step[:, MOTION : MOTION + count]
+    rate[:, free] += step[:, MOTION + count :]
+    return replace(
+        tracks,
+        rotation=tracks.rotation @ _turn(step[:, ROTATION]),
+        position=tracks.position + step[:, POSITION],
+        velocity=tracks.velocity + step[:, VELOCITY],
+        accel_bias=tracks.accel_bias + step[:, ACCEL],
+        gyro_bias=tracks.gyro_bias + step[:, GYRO],
+        phase=phase,
+        rate=rate,
+    )
+
+
+def _turn(vector: Array) -> Array:
+    return Rotation.from_rotvec(vector).as_matrix()
+
+
+def carried(tracks: Tracks, strides: Strides, k: int, hearing: Heard, backward: bool) -> Tracks:
+    """Carry tracks over a stride: to its end, or from its end to its beginning."""
+    site, free = hearing.site, hearing.free
+    dt, lever = float(strides.dt[k]), strides.lever[k]
+    sign = -1.0 if backward else 1.0
+    turn = strides.turn[k] @ _turn(-dt * tracks.gyro_bias)
+    gained = strides.velocity[k] - tracks.accel_bias @ lever.T
+    shift = strides.displacement[k] - 0.5 * dt * tracks.accel_bias @ lever.T
+    down = np.array([0.0, 0.0, -site.gravity])
+    back = np.swapaxes(turn, 1, 2)
+    first = tracks.rotation @ back if backward else tracks.rotation
+    by_force, fallen = _applied(first, gained) + down * dt, _applied(first, shift)
+    begin = tracks.velocity - by_force if backward else tracks.velocity
+    way = begin * dt + 0.5 * down * dt**2 + fallen
+    later = replace(
+        tracks,
+        rotation=first if backward else first @ turn,
+        position=tracks.position + sign * way,
+        velocity=tracks.velocity + sign * by_force,
+        phase=tracks.phase + sign * dt * tracks.rate,
+    )
+    size = tracks.cov.shape[1]
+    step = np.tile(np.eye(size), (len(tracks), 1, 1))
+    step[:, ROTATION, ROTATION] = back
+    step[:, ROTATION, GYRO] = -dt * np.eye(3)
+    step[:, POSITION, ROTATION] = -first @ np.real(skew(shift))
+    step[:, VELOCITY, ROTATION] = -first @ np.real(skew(gained))
+    step[:, POSITION, VELOCITY] = dt * np.eye(3)
+    step[:, POSITION, ACCEL] = -0.5 * dt * first @ lever
+    step[:, VELOCITY, ACCEL] = -first @ lever
+    # The attitude errs by the gyro's bias more and more within the stride.
+    step[:, POSITION, GYRO] = first @ np.real(skew(shift)) * dt / 3.0
+    step[:, VELOCITY, GYRO] = first @ np.real(skew(gained)) * dt / 2.0
+    count = int(np.sum(free))
+    number = np.arange(count)
+    step[:, MOTION + number, MOTION + count + number] = dt
+    noise = _noise(site, dt, size, bool(strides.bridged[k]))
+    if backward:
+        inverse = np.linalg.inv(step)
+        cov = inverse @ (tracks.cov + noise) @ np.swapaxes(inverse, 1, 2)
+    else:
+        cov = step @ tracks.cov @ np.swapaxes(step, 1, 2) + noise
+    return replace(later, cov=cov)
+
+
+def _applied(rotation: Array, vector: Array) -> Array:
+    return (rotation @ vector[..., None])[..., 0]
+
+
+def _noise(site: Site, dt: float, size: int, bridged: bool) -> Array:
+    """Return what a stride adds, but for what the gyro's noise makes of the velocity within it."""
+    imu, noise = site.platform.imu, np.zeros((size, size))
+    gyro = max(imu.gyro_noise, BRIDGE_GYRO_NOISE) if bridged else imu.gyro_noise
+    accel = max(imu.accel_noise, BRIDGE_ACCEL_NOISE) if bridged else imu.accel_noise
+    index = np.arange(3)
+    noise[index, index] = gyro**2 * dt
+    noise[3 + index, 3 + index] = accel**2 * dt**3 / 3.0
+    noise[6 + index, 6 + index] = accel**2 * dt
+    noise[3 + index, 6 + index] = noise[6 + index, 3 + index] = 0.5 * accel**2 * dt**2
+    walk = max(imu.gyro_bias_walk, LEAST_WALK)
+    noise[index, index] += walk**2 * dt**3 / 3.0
+    noise[index, 12 + index] = noise[12 + index, index] = -0.5 * walk**2 * dt**2
+    noise[9 + index, 9 + index] = max(imu.accel_bias_walk, LEAST_WALK) ** 2 * dt
+    noise[12 + index, 12 + index] = walk**2 * dt
+    return noise
+
+
+def rows_at(tracks: Tracks, hearing: Heard, k: int) -> tuple[Array, Array]:
+    """Return whitened error (h, rows) and its derivative (h, rows, tangent) at an epoch."""
+    time, free = hearing.time[k], hearing.free
+    known = replace(
+        hearing.calibration,
+        phase=of_all_sensors(hearing.site, tracks.phase),
+        drift=np.zeros_like(hearing.calibration.drift),
+        reference_time=float(time),
+    )
+    value, by_pose, by_phase = linearize_channels(
+        known,
+        hearing.blocks,
+        np.full(len(tracks), time),
+        tracks.rotation,
+        tracks.position,
+    )
+    back = np.swapaxes(tracks.rotation, 1, 2)[:, None]
+    none = np.zeros((*value.shape, 9))
+    still = np.zeros((*value.shape, int(np.sum(free))))
+    error = (value - hearing.measured[k])[..., None]
+    columns = [by_pose[..., :3], by_pose[..., 3:] @ back, none, by_phase, still, error]
+    root = np.broadcast_to(
+        hearing.sqrt_information[k], (len(tracks), *hearing.sqrt_information.shape[1:])
+    )
+    both = whitened(root, np.concatenate(columns, axis=-1))
+    return both[..., -1], both[..., :-1]
+
+
+def updated(tracks: Tracks, hearing: Heard, k: int) -> Tracks:
+    """Take in the phasors of an epoch.
+
+    A channel that is explained badly costs, but tears no track away.
+    """
+    if hearing.components[k] == 0.0:
+        return tracks
+    step, there = np.zeros((len(tracks), tracks.cov.shape[1])), tracks
+    for _ in range(ROUNDS):
+        error, by = rows_at(there, hearing, k)
+        # From the prediction, which holds what is known.
+        error = error - (by @ step[..., None])[..., 0]
+        excess = _excess(error, by, tracks.cov)
+        root = np.repeat(1.0 / np.sqrt(np.maximum(excess, 1.0)), 6, axis=1)
+        error, by = root * error, root[..., None] * by
+        across = tracks.cov @ np.swapaxes(by, 1, 2)
+        spread = by @ across + np.eye(by.shape[1])
+        solved = np.linalg.solve(spread, error[..., None])
+        before, step = step, -(across @ solved)[..., 0]
+        there = moved(tracks, step, hearing.free)
+        if np.max(np.abs(step - before)[:, : POSITION.stop]) < 1e-2:
+            break
+    gain = np.linalg.solve(spread, np.swapaxes(across, 1, 2))
+    cov = tracks.cov - across @ gain
+    square = np.einsum("hi,hi->h", error, solved[..., 0])
+    # As of a loss that grows with the logarithm beyond what is credible.
+    lost = 6.0 * LOUD * np.sum(np.log(np.maximum(excess, 1.0)), axis=1)
+    _, volume = np.linalg.slogdet(spread)
+    return replace(
+        there,
+        cov=0.5 * (cov + np.swapaxes(cov, 1, 2)),
+        cost=tracks.cost + square + lost + volume,
+    )
+
+
+def _excess(error: Array, by: Array, cov: Array) -> Array:
+    """Return each channel's chi square against its prediction, of what is credible."""
+    apart = error.reshape(len(error), -1, 6)
+    blocks = by.reshape(*apart.shape, -1)
+    spread = blocks @ cov[:, None] @ np.swapaxes(blocks, -1, -2) + np.eye(6)
+    solved = np.linalg.solve(spread, apart[..., None])[..., 0]
+    return np.asarray(np.sum(apart * solved, axis=-1) / (6.0 * LOUD))

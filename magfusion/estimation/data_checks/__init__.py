@@ -1,0 +1,1 @@
+"""Checks of samples, spectra and stamps, before any estimate."""

@@ -1,0 +1,110 @@
+"""Iron or a magnet on the body: what the steady field does as the body turns.
+
+A field that stands still is turned by the gyroscope from one span to the next.  A matrix ``1 + E``
+and an offset ``o`` between it and the instrument leave
+``u' - T u = (E T - T E) b + (1 - T) o``, linear in both, with T that turn.  What a room's iron
+does goes with the place instead and is not explained so; at rest nothing is.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from magfusion.estimation.data_checks.compasses import StillMeans
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import Array
+
+IRON_SPAN = 0.5  # s; in which the body turns little
+USUAL_MATRIX, USUAL_OFFSET = 0.1, 1.0  # relative to the field's size; of iron, one sigma
+LEAST_STEPS = 20
+LEAST_TURN = 0.1  # rad/s, rms
+USUAL_BIAS = 0.02  # rad/s; of the gyroscope, one sigma
+LIMIT = 8.5  # sigma of twelve numbers, 6 of one
+USUAL_MOUNTING = 0.1  # rad
+LEAST_SHARE = 0.01  # of the field's size, from which iron is said
+EXPLAINED = 0.8  # share of what the turn leaves
+CORRELATED = 2.0  # spans in a row are alike
+# What a turn of the mounting does to matrix and offset, by its three components.
+_MOUNTING = np.zeros((12, 3))
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    _MOUNTING[3 * _i + _j, _k], _MOUNTING[3 * _j + _i, _k] = -1.0, 1.0
+
+
+def iron_on_body(means: StillMeans, site: Site) -> Iterator[Finding]:
+    """Yield a matrix or an offset that the declared calibration does not allow.
+
+    Parameters
+    ----------
+    means : StillMeans
+        Over spans of `IRON_SPAN`.
+    """
+    if len(means) < LEAST_STEPS or not np.all(np.isfinite(means.field_body)):
+        return
+    size = float(np.median(np.linalg.norm(means.field_body, axis=1)))
+    following = np.diff(means.time) < 1.5 * IRON_SPAN
+    field = means.field_body / size
+    attitude = means.still_from_body
+    turn = np.swapaxes(attitude[1:], 1, 2) @ attitude[:-1]
+    turn, before, after = turn[following], field[:-1][following], field[1:][following]
+    if len(turn) < LEAST_STEPS:
+        return
+    angle = np.arccos(np.clip(0.5 * (np.trace(turn, axis1=1, axis2=2) - 1.0), -1.0, 1.0))
+    if not np.sqrt(np.mean(angle**2)) > LEAST_TURN * IRON_SPAN:
+        return
+    left = after - np.einsum("nij,nj->ni", turn, before)
+    found, cov, explained = _fitted(turn, before, left)
+    sensor = site.platform.magnetometer.sigma
+    matrix, hard = found[:9].reshape(3, 3), found[9:]
+    soft = 0.5 * (matrix + matrix.T)
+    sigma = np.repeat([np.max(sensor.matrix), np.max(sensor.offset) / size], [9, 3])
+    # A mounting that is off is no iron.
+    allowed = cov + np.diag(sigma**2) + USUAL_MOUNTING**2 * _MOUNTING @ _MOUNTING.T
+    weight = float(np.sqrt(found @ np.linalg.solve(allowed, found)))
+    share = max(float(np.max(np.abs(soft))), float(np.linalg.norm(hard)))
+    if not (weight > LIMIT and explained > EXPLAINED and share > LEAST_SHARE):
+        return
+    of_matrix, of_offset = float(np.sqrt(np.mean(soft**2))), size * float(np.linalg.norm(hard))
+    yield Finding(
+        "body_iron",
+        "magnetometer: as the body turns the steady field does not only turn: there is iron or a"
+        f" magnet on the body that its declared calibration does not have ({weight:.0f} sigma;"
+        f" offset {1e6 * of_offset:.2g} uT, matrix {100.0 * of_matrix:.2g} %). Calibrate it by"
+        " magfusion calibrate magnetometer, or declare platform.magnetometer.sigma as matrix:"
+        f" {max(of_matrix, 1e-3):.2g}, offset_t: {max(of_offset, 1e-8):.2g}.",
+        Verdict.DOUBTFUL,
+        150.0 + min(weight, 100.0),
+    )
+
+
+def _fitted(turn: Array, before: Array, left: Array) -> tuple[Array, Array, float]:
+    """Return matrix (9, row by row) and offset (3), their covariance, and the explained share.
+
+    Parameters
+    ----------
+    turn : ndarray, shape (n, 3, 3)
+    before, left : ndarray, shape (n, 3)
+        Fields in units of their size.
+    """
+    turned = np.einsum("nij,nj->ni", turn, before)
+    eye = np.eye(3)
+    # E T b: row i of E meets T b; T E b: column i of T meets row i of E.
+    by_matrix = np.einsum("ki,nj->nkij", eye, turned) - np.einsum("nki,nj->nkij", turn, before)
+    by_offset = eye - turn
+    by_bias = -IRON_SPAN * np.cross(turned[:, :, None], eye, axisa=1, axisb=0, axisc=1)
+    parts = [by_matrix.reshape(-1, 3, 9), by_offset, by_bias]
+    design = np.concatenate(parts, axis=2).reshape(-1, 15)
+    right = left.ravel()
+    prior = np.repeat([USUAL_MATRIX, USUAL_OFFSET, USUAL_BIAS], [9, 3, 3]) ** -2.0
+    noise = 1e-4
+    found, inverse = np.zeros(15), np.zeros((15, 15))
+    for _ in range(3):
+        information = design.T @ design / noise**2 / CORRELATED + np.diag(prior)
+        inverse = np.linalg.inv(information)
+        found = inverse @ (design.T @ right / noise**2 / CORRELATED)
+        noise = max(float(np.sqrt(np.mean((right - design @ found) ** 2))), 1e-6)
+    # What the bias alone explains is no iron.
+    right = right - design[:, 12:] @ found[12:]
+    after = float(np.sum((right - design[:, :12] @ found[:12]) ** 2))
+    explained = 1.0 - after / max(float(np.sum(right**2)), 1e-30)
+    return np.asarray(found[:12]), np.asarray(inverse[:12, :12]), explained

@@ -1,0 +1,108 @@
+"""An instrument that hangs, noticed as its samples come: it repeats its last one for too long."""
+
+import numpy as np
+
+from magfusion.estimation.data_checks.samples import CHANCE, SHORTEST_FREEZE
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import Array, BoolArray
+
+SAMPLES = 1e7  # of a stream, among which the chance of a false alarm is `CHANCE`
+FEWEST = 6  # samples alike in a row, at least
+
+
+class Freeze:
+    """Of one instrument, by its samples in the order in which they come.
+
+    Attributes
+    ----------
+    since : float
+        Stamp of the first sample that is as the newest is (s).
+    found : bool
+        Whether the newest sample is of an instrument that hangs.
+    """
+
+    since: float
+    found: bool
+    _sample: Array
+    _repeats: int
+    _alike: int
+    _seen: int
+
+    def __init__(self) -> None:
+        self.since, self.found = -np.inf, False
+        self._sample = np.full(3, np.nan)
+        self._repeats, self._alike, self._seen = 0, 0, 0
+
+    def stretches(self, time: Array, samples: Array) -> list[tuple[float, float]]:
+        """Return after which sample and up to which (s) samples (k, 3) only repeat it."""
+        out: dict[float, float] = {}
+        if len(time) == 0:
+            return []
+        same = np.empty(len(time), dtype=bool)
+        same[0] = (samples[0] == self._sample).all()
+        np.equal(samples[1:, 0], samples[:-1, 0], out=same[1:])
+        if same[1:].any():
+            np.logical_and.reduce(samples[1:] == samples[:-1], axis=1, out=same[1:])
+        self._sample = samples[-1].copy()
+        if self._passed(time, same):
+            return []
+        for k in range(len(time)):
+            if same[k]:
+                self._repeats += 1
+                self.found = self.found or self._too_long(float(time[k]))
+            else:
+                self._seen += 1 if self.found else 1 + self._repeats
+                self._alike += 0 if self.found else self._repeats
+                self.since, self.found, self._repeats = float(time[k]), False, 0
+            if self.found:
+                out[self.since] = float(time[k])
+        return list(out.items())
+
+    def _passed(self, time: Array, same: BoolArray) -> bool:
+        """Count samples none of which is repeated for long, as nearly always; else do nothing."""
+        if not (self.found or same.any() or self._repeats >= FEWEST):
+            self._seen, self._alike = (
+                self._seen + len(same) + self._repeats,
+                self._alike + self._repeats,
+            )
+            self._repeats, self.since = 0, float(time[-1])
+            return True
+        changed = np.flatnonzero(~same)
+        ends = np.concatenate([changed, [len(same)]])
+        repeats = np.diff(ends, prepend=-1 - self._repeats) - 1
+        if self.found or np.max(repeats) >= FEWEST:
+            return False
+        closed = int(np.sum(repeats[:-1]))
+        self._seen, self._alike = self._seen + len(changed) + closed, self._alike + closed
+        self._repeats = int(repeats[-1])
+        if len(changed):
+            self.since = float(time[changed[-1]])
+        return True
+
+    def _too_long(self, time: float) -> bool:
+        # Instruments have steps, and may be read faster than they measure.
+        usual = min(max(self._alike / max(self._seen, 1), 1e-3), 0.97)
+        by_chance = np.log(CHANCE / SAMPLES) / np.log(usual)
+        return self._repeats >= max(by_chance, FEWEST) and time - self.since >= SHORTEST_FREEZE
+
+
+def imu_remarks(
+    since: float | None, begin: float, end: float, *, bridged: bool
+) -> tuple[Finding, ...]:
+    """Return what is to be said of the IMU between two epochs (s).
+
+    Parameters
+    ----------
+    since : float, optional
+        When it hung (s); None where it does not now.
+    bridged : bool
+        Whether samples are missing there.
+    """
+    if since is not None and end > since:
+        text = f"all axes stand still since {since:.2f} s: the sensor or its driver hung. What it"
+        text += " repeats is left out, and bridged by the fields."
+        return (Finding("frozen_imu", f"IMU: {text}", Verdict.TRUSTWORTHY),)
+    if not bridged:
+        return ()
+    text = f"samples are missing between {begin:.2f} and {end:.2f} s. They are bridged by the"
+    return (Finding("gap", f"IMU: {text} fields.", Verdict.TRUSTWORTHY),)

@@ -1,0 +1,81 @@
+"""Several magnetometers: a log as some of them recorded it, and without those that hear nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.data_checks.detection import DETECTION_CHI_SQUARE_ONLINE, above_noise
+from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding
+
+FEWEST = 10  # epochs, before one is called silent
+
+
+def without_magnetometer(log: Log, site: Site, which: int) -> tuple[Log, Site]:
+    """Return a log and its site as if one of several magnetometers were not there."""
+    kept = [k for k in range(len(site.platform.magnetometers)) if k != which]
+    return _only(log, site, kept)
+
+
+def first_magnetometer(log: Log, site: Site) -> tuple[Log, Site]:
+    """Return what the first of several magnetometers recorded, and its site."""
+    return _only(log, site, [0]) if site.platform.further else (log, site)
+
+
+def _only(log: Log, site: Site, kept: list[int]) -> tuple[Log, Site]:
+    every = tuple(enumerate(site.platform.magnetometers))
+    sensors = tuple(sensor for k, sensor in every if k in kept)
+    gone = tuple((k, sensor) for k, sensor in reversed(every) if k not in kept)
+    platform = site.platform.carrying(sensors)
+    left = replace(site, platform=replace(platform, left_out=(*platform.left_out, *gone)))
+    fields = None if log.fields is None else of_sensors(log.fields, site, kept)
+    waves = {s.name: log.waveforms[s.name] for s in sensors if s.name in log.waveforms}
+    if waves and len(kept) == 1:  # as a log of one has it, by the log's clock
+        wave = waves[sensors[0].name]
+        wave = replace(wave, time=wave.time + sensors[0].clock_offset)
+        return replace(log, fields=None, waveform=wave, waveforms={}), left
+    return replace(log, fields=fields, waveforms=waves), left
+
+
+def of_sensors(fields: FieldSamples, site: Site, kept: list[int]) -> FieldSamples:
+    """Return the phasors of some magnetometers, at the epochs that hold any of them."""
+    columns = np.concatenate([np.arange(len(site.channels))[site.of_sensor(k)] for k in kept])
+    named = tuple(fields.magnetometers[c] for c in columns.tolist())
+    alone = replace(
+        fields,
+        channels=tuple(fields.channels[c] for c in columns.tolist()),
+        phasor_sensor=fields.phasor_sensor[:, columns],
+        phasor_cov=fields.phasor_cov[:, columns],
+        ahead=None if fields.ahead is None else fields.ahead[:, columns],
+        magnetometers=named if len(kept) > 1 else (),
+    )
+    return alone.rows(np.any(alone.valid, axis=1))
+
+
+def without_silent(log: Log, site: Site) -> tuple[Log, Site]:
+    """Return a log without magnetometers that hear nothing where another does, and its site.
+
+    ``noticed`` of the log names them.
+    """
+    if not site.platform.further or log.fields is None:
+        return log, site
+    heard = above_noise(log.fields, DETECTION_CHI_SQUARE_ONLINE)
+    sensors = site.platform.magnetometers
+    mine = [site.of_sensor(k) for k in range(len(sensors))]
+    there = [int(np.sum(np.any(log.fields.valid[:, own], axis=1))) for own in mine]
+    share = [float(np.mean(np.any(heard[:, own], axis=1))) for own in mine]
+    silent = [k for k, n in enumerate(there) if share[k] == 0.0 and (n == 0 or n >= FEWEST)]
+    if not silent or len(silent) == len(sensors):
+        return log, site
+    noticed = [
+        Finding(
+            "magnetometer_silent",
+            f"Magnetometer {sensors[k].name} hears no beacon in {there[k]} epochs, where others do:"
+            " it is left out. Check its supply, its cable and its channel.",
+        )
+        for k in silent
+    ]
+    kept = [k for k in range(len(sensors)) if k not in silent]
+    log, site = _only(log, site, kept)
+    return replace(log, noticed=(*log.noticed, *noticed)), site

@@ -1,0 +1,63 @@
+"""A recording as the estimators take it: on even clocks, without samples that are false.
+
+What is mended is said, and no reason for doubt: a sample that is left out is bridged by its
+neighbours, as one that was lost, and an IMU that hung by the fields, as one that fell silent.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.data_checks.samples import (
+    false_rows,
+    false_samples,
+    frozen_rows,
+    frozen_samples,
+    streams,
+)
+from magfusion.model.samples import ImuSamples, Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Verdict
+from magfusion.receiver.even_clocks import on_even_clocks
+
+
+def mended(log: Log, site: Site) -> Log:
+    """Return a log with what is wrong with single stamps and samples mended.
+
+    ``clocks`` and ``noticed`` of the result say what was.
+    """
+    log = _without_freeze(on_even_clocks(log, site), site)
+    found = {stream.name: false_rows(stream, site) for stream in streams(log)}
+    if not any(len(rows) for rows in found.values()):
+        return log
+    noticed = [replace(f, verdict=Verdict.TRUSTWORTHY) for f in false_samples(log, site)]
+    noticed = [replace(f, text=f"{f.text} They are left out.") for f in noticed]
+    wave, imu = log.waveform, log.imu
+    inertial = np.union1d(found["gyroscope"], found["accelerometer"])
+    kept = np.delete(np.arange(len(imu)), inertial)
+    imu = ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept])
+    if wave is not None:
+        kept = np.delete(np.arange(len(wave)), found["magnetometer"])
+        wave = wave.rows(kept)
+    return replace(log, imu=imu, waveform=wave, noticed=(*log.noticed, *noticed))
+
+
+def _without_freeze(log: Log, site: Site) -> Log:
+    """Return a log without the inertial samples of an IMU that hung."""
+    hung = [frozen_rows(s) for s in streams(log) if s.name in ("gyroscope", "accelerometer")]
+    rows = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *hung]))
+    if len(rows) == 0 or len(rows) >= len(log.imu) - 1:
+        return log
+    noticed = [
+        replace(
+            f,
+            text=f"{f.text} Here it is left out, and bridged by the fields.",
+            verdict=Verdict.TRUSTWORTHY,
+        )
+        for f in frozen_samples(log, site)
+        if f.code == "frozen_imu"
+    ]
+    kept = np.delete(np.arange(len(log.imu)), rows)
+    imu = log.imu
+    imu = ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept])
+    return replace(log, imu=imu, noticed=(*log.noticed, *noticed))

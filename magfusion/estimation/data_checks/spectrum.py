@@ -1,0 +1,357 @@
+"""Lines in the spectrum of the field that nobody declared: mains, neighbours, other beacons.
+
+The samples are first turned into axes that stand still, so that the Earth field and the tones stay
+narrow while the body turns.  What a line does to a tone is what the lock-in leaks of it: of its
+amplitude ``1 / (pi |df| window)``, all of it where it is nearer.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from magfusion.errors import InputError
+from magfusion.estimation.data_checks.turning import field_body
+from magfusion.model.quaternion import turned
+from magfusion.model.samples import ImuSamples, Log
+from magfusion.model.site import Site
+from magfusion.model.strapdown import turn_at, turn_from_gyro
+from magfusion.model.trust import Finding, Verdict
+from magfusion.receiver.design import separable
+from magfusion.receiver.receivers import usual_lockin
+from magfusion.receiver.slots import has_schedule
+from magfusion.receiver.windows import LockinSettings
+from magfusion.units import Array
+
+SEGMENT, SHORTEST, SHARE = 8.0, 2.0, 0.35  # s, s, of the log
+LEAST_SEGMENTS = 3
+LOWEST_HZ = 3.0  # below, the motion of the field is no line
+STAND_OUT = 30.0  # times the power beside it, a line has
+BESIDE_HZ = 2.5  # on either side, where that power is measured
+WIDTH_HZ = 0.3  # of a line that motion modulates, on either side
+APART_HZ = 0.5  # of two lines
+TELLABLE = 3.0  # resolutions from a tone at which a line is told from it
+SIDEBAND_HZ = 4.0  # on either side of a tone, what motion makes of it
+MIRRORED = 0.1  # of a sideband's power, at least, the one across or one of another tone has
+MAINS_HZ = (50.0, 60.0)
+MAINS_OFF = 0.008  # relative; more is no mains
+HARMONICS = 6
+FORGOTTEN = 3.0  # times what is at a beacon's tone, a line beside it is the beacon itself
+ALIASED = 3  # harmonics of the mains that are sought where they are folded back
+CONSEQUENCE = 3.0  # times the model's error of a tone, from which a leak casts doubt
+FITTED_CONSEQUENCE = 25.0  # the same of mains, which the noise beside the tones accounts for
+LEAST_MODEL_ERROR = 2e-3
+LISTED = 4
+BEGINNING = 60.0  # s; in which the lines are found that are fitted beside the tones
+MOST_FITTED = 6  # of them
+LONGER = 2.0  # times the usual window, by which a line is told from a tone
+SEPARATED = 1.5  # over the window, the least distance of a fitted line from a tone
+
+
+class Spectrum(NamedTuple):
+    """Mean power of a field.
+
+    Parameters
+    ----------
+    frequency_hz : ndarray, shape (n,)
+    power : ndarray, shape (n,)
+        Square of the amplitude that a line in the middle of a bin has, over all axes (T^2).
+    """
+
+    frequency_hz: Array
+    power: Array
+    rate_hz: float
+
+    @property
+    def resolution_hz(self) -> float:
+        """Between two bins."""
+        return float(self.frequency_hz[1])
+
+    def amplitude(self, frequency_hz: float) -> float:
+        """Return the amplitude about a frequency, with what modulates it (T)."""
+        near = np.abs(self.frequency_hz - frequency_hz) <= WIDTH_HZ
+        # The bins of a Hann window hold one and a half times the power of a line.
+        return float(np.sqrt(np.sum(self.power[near]) / 1.5))
+
+    def peak(self, frequency_hz: float) -> float:
+        """Return the largest power close to a frequency (T^2)."""
+        near = np.abs(self.frequency_hz - frequency_hz) <= 1.5 * self.resolution_hz
+        return float(np.max(self.power[near], initial=1e-300))
+
+
+class Line(NamedTuple):
+    """One line of a spectrum (Hz, T)."""
+
+    frequency_hz: float
+    amplitude: float
+
+
+def still_field(log: Log, site: Site | None) -> Array:
+    """Return the field of a waveform in axes that stand still, shape (n, 3) (T).
+
+    Without a site nobody knows how magnetometer and gyroscope are mounted, and of fewer than three
+    axes nothing can be turned: the axes are the body's.
+    """
+    field = field_body(log, site)
+    if log.vectors is None or site is None or len(log.imu) < 2:
+        return field
+    imu, offset = log.imu, site.platform.imu.time_offset
+    turns = turn_from_gyro(imu.time, imu.gyro_body)
+    at = turn_at(turns, imu.time, imu.gyro_body, log.vectors.time - offset)
+    return np.ascontiguousarray(turned(at, field.T).T)
+
+
+def spectrum(log: Log, site: Site | None) -> Spectrum | None:
+    """Return the mean spectrum of a waveform in axes that stand still; None of a short one."""
+    wave = log.waveform
+    if wave is None or len(wave) < 2:
+        return None
+    step = float(np.median(np.diff(wave.time)))
+    duration = float(wave.time[-1] - wave.time[0])
+    length = int(np.clip(SHARE * duration, SHORTEST, SEGMENT) / step)
+    count = int(duration / step) + 1
+    if 2 * count // length - 1 < LEAST_SEGMENTS:
+        return None
+    field = still_field(log, site)
+    if np.max(np.abs(np.diff(wave.time) - step)) > 1e-3 * step:
+        even = wave.time[0] + step * np.arange(count)
+        field = np.stack([np.interp(even, wave.time, c) for c in field.T], axis=1)
+    window = np.hanning(length + 1)[:-1, None]
+    first = np.arange(0, len(field) - length + 1, length // 2)
+    power = np.zeros(length // 2 + 1)
+    for k in first:
+        piece = field[k : k + length]
+        found = np.fft.rfft((piece - np.mean(piece, axis=0)) * window, axis=0)
+        power += np.sum(np.abs(found) ** 2, axis=1)
+    scale = (2.0 / float(np.sum(window))) ** 2 / max(len(first), 1)
+    frequency = np.asarray(np.fft.rfftfreq(length, step), dtype=np.float64)
+    return Spectrum(frequency, scale * power, 1.0 / step)
+
+
+def lines(found: Spectrum) -> tuple[Line, ...]:
+    """Return what stands out of a spectrum, strongest first."""
+    power, resolution = found.power, found.resolution_hz
+    reach = 2 * int(BESIDE_HZ / resolution) + 1
+    beside = median_filter(power, reach, mode="nearest")
+    inner = np.arange(1, len(power) - 1)
+    top = (power[inner] >= power[inner - 1]) & (power[inner] > power[inner + 1])
+    peaks = inner[top & (power[inner] > STAND_OUT * beside[inner])]
+    peaks = peaks[found.frequency_hz[peaks] > LOWEST_HZ]
+    out: list[Line] = []
+    for k in peaks[np.argsort(-power[peaks])]:
+        before, here, after = np.log(np.maximum(power[k - 1 : k + 2], 1e-300))
+        finer = 0.5 * (before - after) / min(before - 2.0 * here + after, -1e-9)
+        frequency = float((k + finer) * resolution)
+        if all(abs(frequency - one.frequency_hz) > APART_HZ for one in out):
+            out.append(Line(frequency, found.amplitude(frequency)))
+    return tuple(out)
+
+
+def _tones(site: Site) -> list[tuple[str, float]]:
+    return [(b.name, float(f)) for b in site.beacons for f in b.tone_frequencies_hz]
+
+
+def aliased(frequency_hz: float, rate_hz: float) -> float:
+    """Return where a frequency appears when it is sampled at a rate (Hz)."""
+    return abs(frequency_hz - rate_hz * round(frequency_hz / rate_hz))
+
+
+def mains_of(frequency_hz: float, rate_hz: float) -> tuple[float, int] | None:
+    """Return of which mains (Hz), and which harmonic of it, a line is; None of none."""
+    for mains in MAINS_HZ:
+        for order in range(1, HARMONICS + 1):
+            folded = aliased(order * mains, rate_hz)
+            if order > ALIASED and folded != order * mains:
+                continue
+            if abs(frequency_hz - folded) < MAINS_OFF * min(order, 2) * mains:
+                return mains, order
+    return None
+
+
+def named_lines(found: Spectrum, site: Site | None) -> tuple[Line, ...]:
+    """Return tones and undeclared lines, without what motion makes of the tones of a site."""
+    tones = [] if site is None else [f for _, f in _tones(site)]
+    return tuple(line for line in lines(found) if not is_sideband(found, line, tones))
+
+
+def undeclared(found: Spectrum, site: Site) -> tuple[Line, ...]:
+    """Return the lines that are neither a declared tone nor what its motion makes of it."""
+    tones = [f for _, f in _tones(site)]
+    out = []
+    for line in lines(found):
+        apart = [abs(line.frequency_hz - f) for f in tones]
+        if min(apart, default=np.inf) < TELLABLE * found.resolution_hz:
+            continue
+        if not is_sideband(found, line, tones):
+            out.append(line)
+    return tuple(out)
+
+
+def is_sideband(found: Spectrum, line: Line, tones: list[float]) -> bool:
+    """Tell whether a line is what motion makes of a tone: its mirror is there too."""
+    own = found.peak(line.frequency_hz)
+    for tone in tones:
+        off = line.frequency_hz - tone
+        if abs(off) < SIDEBAND_HZ and found.peak(tone) > own:
+            share = own / found.peak(tone)
+            mirrors = [(tone, -off), *((f, d) for f in tones if f != tone for d in (off, -off))]
+            if any(found.peak(f + d) > MIRRORED * share * found.peak(f) for f, d in mirrors):
+                return True
+    return False
+
+
+def leaked(line: Line, tone_hz: float, window: float) -> float:
+    """Return what a lock-in takes of a line for a tone (T)."""
+    turns = np.pi * abs(line.frequency_hz - tone_hz) * window
+    return float(line.amplitude / max(turns, 1.0))
+
+
+def beside_lines(log: Log, site: Site, lockin: LockinSettings | None) -> LockinSettings | None:
+    """Return settings by which the lines that would disturb the tones are fitted beside them.
+
+    By the beginning of the log; as given where nothing disturbs, or the tones are of slots.
+
+    Parameters
+    ----------
+    lockin : LockinSettings, optional
+        As asked for: its window is kept.  One that is chosen by the tones is chosen by the lines,
+        too.
+    """
+    wave = log.waveform
+    if wave is None or len(wave) < 2 or has_schedule(site) or not site.beacons:
+        return lockin
+    end = float(wave.time[0]) + BEGINNING
+    few, first = wave.time < end, log.imu.time < end
+    imu = ImuSamples(log.imu.time[first], log.imu.gyro_body[first], log.imu.accel_body[first])
+    wave = wave.rows(few)
+    found = spectrum(replace(log, waveform=wave, imu=imu), site)
+    try:
+        settings = usual_lockin(site) if lockin is None else lockin
+    except InputError:
+        return lockin
+    if found is None:
+        return lockin
+    tones = np.array([f for _, f in _tones(site)])
+    chosen: list[float] = []
+    for line in undeclared(found, site):
+        apart = float(np.min(np.abs(line.frequency_hz - np.array([*tones, *chosen]))))
+        needed = SEPARATED / apart if lockin else 2.0 / apart
+        most = settings.window if lockin else LONGER * usual_lockin(site).window
+        if _consequence(found, line, site, settings)[0] <= CONSEQUENCE or needed > most:
+            continue
+        longer = max(settings.window, needed)
+        step = settings.step if lockin else longer / 2.0
+        lines_hz = (*chosen, line.frequency_hz)
+        trial = replace(settings, window=longer, step=step, lines_hz=lines_hz)
+        if len(chosen) < MOST_FITTED and separable(1.0 / found.rate_hz, trial, tones):
+            settings, chosen = trial, [*lines_hz]
+    return settings if chosen else lockin
+
+
+def undeclared_lines(
+    log: Log, site: Site | None, lockin: LockinSettings | None = None
+) -> Iterator[Finding]:
+    """Yield the lines that the site does not declare, with what they do to its tones."""
+    if site is None or has_schedule(site) or len(site.beacons) == 0:
+        return
+    found = spectrum(log, site)
+    if found is None:
+        return
+    try:
+        settings = beside_lines(log, site, lockin) or usual_lockin(site)
+    except InputError:
+        return
+    yield from judged_lines(found, site, settings)
+
+
+def judged_lines(found: Spectrum, site: Site, settings: LockinSettings) -> Iterator[Finding]:
+    """Yield what undeclared lines of a spectrum do to the tones of a site."""
+    doubtful: list[tuple[float, Line, str]] = []
+    seen: list[tuple[float, Line, str]] = []
+    fitted: list[str] = []
+    for line in undeclared(found, site):
+        if any(abs(line.frequency_hz - one) < APART_HZ for one in settings.lines_hz):
+            fitted.append(_named(line, site, found, settings))
+            continue
+        worst, words = _consequence(found, line, site, settings)
+        limit = FITTED_CONSEQUENCE if mains_of(line.frequency_hz, found.rate_hz) else CONSEQUENCE
+        (doubtful if worst > limit else seen).append((worst, line, words))
+    if fitted:
+        yield Finding(
+            "fitted_line",
+            f"magnetometer: undeclared lines: {'; '.join(fitted)}. They are fitted beside the"
+            f" tones, by a window of {settings.window:.3g} s. Declare what transmits, or switch it"
+            " off.",
+            Verdict.TRUSTWORTHY,
+        )
+    for group, verdict in ((doubtful, Verdict.DOUBTFUL), (seen, Verdict.TRUSTWORTHY)):
+        if not group:
+            continue
+        worst = max(one[0] for one in group)
+        named = [_named(line, site, found, settings) for _, line, _ in group]
+        more = f" and {len(named) - LISTED} more" if len(named) > LISTED else ""
+        only_mains = all(mains_of(line.frequency_hz, found.rate_hz) for _, line, _ in group)
+        most = max(group, key=lambda one: one[0])[2]
+        yield Finding(
+            "mains" if only_mains else "undeclared_line",
+            f"magnetometer: undeclared lines: {'; '.join(named[:LISTED])}{more}. {most}",
+            verdict,
+            (200.0 if verdict is Verdict.DOUBTFUL else 0.0) + min(worst, 500.0),
+        )
+
+
+def _consequence(
+    found: Spectrum, line: Line, site: Site, settings: LockinSettings
+) -> tuple[float, str]:
+    """Return how much a line leaks in units of the model's error, and into what, in words."""
+    error = max(site.model_error, LEAST_MODEL_ERROR)
+    mains = settings.mains_hz
+    order = max(round(line.frequency_hz / mains), 1) if mains > 0.0 else 1
+    # What is fitted beside the tones leaks only by as much as its frequency is off.
+    off = abs(line.frequency_hz - order * mains) * settings.window if mains > 0.0 else np.inf
+    fitted = min(1.0, float(np.pi * off)) if off < 1.0 else 1.0
+    worst, where, share = 0.0, "", 0.0
+    for name, tone in _tones(site):
+        tone_amplitude = max(found.amplitude(tone), 1e-30)
+        leak = fitted * leaked(line, tone, settings.window) / tone_amplitude
+        if leak / error > worst:
+            worst, where, share = leak / error, f"beacon {name} ({tone:g} Hz)", leak
+    if not where:
+        return 0.0, ""
+    if worst > CONSEQUENCE:
+        return worst, (
+            f"By the window of {settings.window:.3g} s they change the field of {where} by up to"
+            f" {100.0 * share:.2g} %. Declare what transmits, switch it off, or give a longer"
+            " --window."
+        )
+    return worst, f"They change {where} by {100.0 * share:.2g} % at most."
+
+
+def _named(line: Line, site: Site, found: Spectrum, settings: LockinSettings) -> str:
+    """Return a line in words: where, how strong, and what it probably is."""
+    size = f"{line.frequency_hz:.2f} Hz ({1e9 * line.amplitude:.3g} nT)"
+    strongest = max((found.amplitude(f) for _, f in _tones(site)), default=0.0)
+    mains = mains_of(line.frequency_hz, found.rate_hz)
+    for name, tone in _tones(site):
+        near = abs(line.frequency_hz - tone) * settings.window < 2.0 and not mains
+        if near and line.amplitude > FORGOTTEN * found.amplitude(tone):
+            return (
+                f"{size}, probably beacon {name} itself, whose frequency_hz is said to be {tone:g}"
+            )
+        if near:
+            return f"{size}, a neighbour of beacon {name} ({tone:g} Hz)"
+        for order in range(2, HARMONICS + 1):
+            at = aliased(order * tone, found.rate_hz)
+            weak = line.amplitude < 0.3 * found.amplitude(tone)
+            if abs(line.frequency_hz - at) < TELLABLE * found.resolution_hz and weak and not mains:
+                return f"{size}, {order} times the tone of beacon {name}: its drive is distorted"
+    if mains is not None:
+        base, order = mains
+        which = f"mains of {base:g} Hz" if order == 1 else f"{order} times mains of {base:g} Hz"
+        other = "" if base == settings.mains_hz else f", give --mains-hz {base:g}"
+        return f"{size}, {which}{other}"
+    if line.amplitude > 0.1 * strongest:
+        return f"{size}, as strong as a beacon"
+    return size

@@ -1,0 +1,175 @@
+"""What transmits in a recording: the tones of beacons that nobody has declared yet.
+
+The frequency of a tone comes from the turning of ``P . P``, the sum of the squares of a phasor's
+components: no rotation of the sensor changes it, and twice the drive's phase is its phase where the
+field oscillates along a line.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.estimation.data_checks.spectrum import (
+    HARMONICS,
+    TELLABLE,
+    Line,
+    Spectrum,
+    aliased,
+    is_sideband,
+    lines,
+    mains_of,
+    spectrum,
+    still_field,
+)
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.receiver.ellipse import semi_axes
+from magfusion.units import Array, ComplexArray
+
+FAINTEST = 3e-3  # of the strongest line; a weaker one is not taken for a beacon
+DISTORTION = 0.3  # of a tone, below which its multiple is a harmonic
+LONGEST, SHORTEST = 1.0, 0.25  # s, of a window
+CYCLES_APART = 4.0  # of the beat with the nearest line, a window holds
+# Two equal coils in quadrature give an ellipse of axes from 1:1 to 1:2, a single one a line.
+ROTATING = 0.25  # ratio of the axes, above which there are two coils
+CRYSTALS = 5e-5  # relative; drive and recorder may differ by that from what was meant
+ROUND = (1.0, 0.5, 0.1, 0.01)  # Hz; what is meant is a multiple of one of these
+
+
+@dataclass(frozen=True)
+class Tone:
+    """A tone that is probably a beacon's.
+
+    Parameters
+    ----------
+    frequency_hz, sigma_hz : float
+        As measured, one sigma.
+    amplitude : float
+        (T)
+    roundness : float
+        Median ratio of the axes of the ellipse that the field draws: 0 for a single coil, 0.5 to 1
+        for two in quadrature.
+    """
+
+    frequency_hz: float
+    sigma_hz: float
+    amplitude: float
+    roundness: float
+
+    @property
+    def rotating(self) -> bool:
+        """Whether two coils in quadrature drive it."""
+        return self.roundness > ROTATING
+
+    @property
+    def meant_hz(self) -> float:
+        """The round number that is probably meant, or the frequency to a tenth of its sigma."""
+        near = 3.0 * self.sigma_hz + CRYSTALS * self.frequency_hz
+        for unit in ROUND:
+            meant = round(self.frequency_hz / unit) * unit
+            if abs(meant - self.frequency_hz) < min(near, 0.2 * unit):
+                return round(meant, 2)
+        return round(self.frequency_hz, 5)
+
+
+@dataclass(frozen=True)
+class Transmitted:
+    """What a recording holds: beacons, and lines that are none."""
+
+    tones: tuple[Tone, ...]
+    others: tuple[str, ...]
+
+
+def transmitted(log: Log, site: Site | None) -> Transmitted | None:
+    """Return the tones of a waveform; None where it is too short for a spectrum.
+
+    Parameters
+    ----------
+    site : Site, optional
+        How the magnetometer is mounted; its beacons have no part in it.
+    """
+    found = spectrum(log, site)
+    if found is None or log.waveform is None:
+        return None
+    taken: list[Line] = []
+    others: list[str] = []
+    for line in lines(found):
+        mains = mains_of(line.frequency_hz, found.rate_hz)
+        if mains is not None:
+            others.append(f"{line.frequency_hz:.2f} Hz is mains of {mains[0]:g} Hz")
+        elif (taken and line.amplitude < FAINTEST * taken[0].amplitude) or is_sideband(
+            found, line, [one.frequency_hz for one in taken]
+        ):
+            continue
+        elif (base := _distorted(line, taken, found)) is not None:
+            others.append(f"{line.frequency_hz:.2f} Hz is a multiple of {base:.2f} Hz")
+        else:
+            taken.append(line)
+    field = still_field(log, site)
+    every = np.array([line.frequency_hz for line in lines(found)])
+    tones = [_tone(line, every, log.waveform.time, field) for line in taken]
+    tones.sort(key=lambda tone: tone.frequency_hz)
+    return Transmitted(tuple(tones), tuple(others))
+
+
+def _distorted(line: Line, taken: list[Line], found: Spectrum) -> float | None:
+    """Return the tone of which a line is a harmonic."""
+    for one in taken:
+        for order in range(2, HARMONICS + 1):
+            off = line.frequency_hz - aliased(order * one.frequency_hz, found.rate_hz)
+            near = abs(off) < TELLABLE * found.resolution_hz
+            if near and line.amplitude < DISTORTION * one.amplitude:
+                return one.frequency_hz
+    return None
+
+
+def _tone(line: Line, every: Array, time: Array, field: Array) -> Tone:
+    apart = np.abs(every[every != line.frequency_hz] - line.frequency_hz)
+    nearest = float(np.min(apart, initial=line.frequency_hz))
+    window = float(np.clip(CYCLES_APART / nearest, SHORTEST, LONGEST))
+    frequency, sigma = line.frequency_hz, 1.0 / float(time[-1] - time[0])
+    for _ in range(2):
+        centre, phasor = _phasors(time, field, frequency, window)
+        step, sigma = _turning(centre, phasor)
+        frequency += step
+    axes = semi_axes(phasor)
+    loud = axes[:, 1] >= np.median(axes[:, 1])
+    roundness = float(np.median(axes[loud, 0] / axes[loud, 1]))
+    return Tone(frequency, sigma, line.amplitude, roundness)
+
+
+def _phasors(
+    time: Array, field: Array, frequency_hz: float, window: float
+) -> tuple[Array, ComplexArray]:
+    """Return centres (n,) and phasors (n, 3) of windows of a Hann shape, half overlapping."""
+    length = max(8, round(window / float(np.median(np.diff(time)))))
+    first = np.arange(0, len(time) - length + 1, max(1, length // 2))
+    whole = time[first + length - 1] - time[first] < 1.5 * window  # no gap within
+    rows = first[whole, None] + np.arange(length)
+    weight = np.hanning(length + 2)[1:-1]
+    piece = field[rows]
+    piece = piece - np.mean(piece, axis=1, keepdims=True)
+    turn = np.exp(-2j * np.pi * frequency_hz * time[rows]) * weight
+    phasor = 2.0 / np.sum(weight) * np.einsum("nk,nkc->nc", turn, piece)
+    return np.mean(time[rows], axis=1), phasor
+
+
+def _turning(centre: Array, phasor: ComplexArray) -> tuple[float, float]:
+    """Return by how much a frequency is off, and its sigma (Hz)."""
+    square = np.sum(phasor**2, axis=1)
+    pair = square[1:] * np.conj(square[:-1])
+    # The coarse step by the mean turn between neighbours, the fine one along the whole.
+    step = np.diff(centre)
+    usual = float(np.median(step))
+    even = np.abs(step - usual) < 0.1 * usual
+    coarse = float(np.angle(np.sum(pair[even])) / usual)
+    phase = np.unwrap(np.angle(square * np.exp(-1j * coarse * centre)))
+    weight = np.abs(square)
+    mean = float(np.average(centre, weights=weight))
+    away = centre - mean
+    spread = float(np.sum(weight * away**2))
+    fine = float(np.sum(weight * away * phase)) / spread
+    left = phase - float(np.average(phase, weights=weight)) - fine * away
+    # What is left wanders with the motion: ten windows in a row count as one.
+    sigma = float(np.sqrt(10.0 * np.sum((weight * away * left) ** 2)) / spread)
+    return (coarse + fine) / (4.0 * np.pi), sigma / (4.0 * np.pi)

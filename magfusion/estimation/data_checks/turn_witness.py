@@ -1,0 +1,252 @@
+"""What the gyroscope and the steady field say against each other: axes, signs, units, clocks."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from magfusion.estimation.data_checks.turning import (
+    CONTRADICTED,
+    EXPLAINED,
+    LEAST_TURN,
+    Clocks,
+    Turning,
+    axes,
+    field_body,
+    turning,
+)
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import DEGREE, Array
+
+NOT_AT_ALL = 5.0  # times more slowly than the gyroscope says, a field stands still
+BETTER = 2.0  # times less is left by what is named than by the next
+LEAST_LAG = 0.03  # s
+LAG_LIMIT = 4.0  # sigma of the declared time offset
+LEAST_ANGLE = 6.0 * DEGREE
+# Deviation of the gyroscope's scale from which it is said; iron on the body looks like tenths.
+SCALE = 0.5
+SCALE_EXPLAINED = 0.9  # of the turn by it
+LIMIT = 6.0  # sigma
+
+
+def turned_otherwise(log: Log, site: Site | None) -> Iterator[Finding]:
+    """Yield how the gyroscope and the steady field contradict each other.
+
+    Without a site nothing is known of the mounting, so that only sign, scale and clock are judged.
+    """
+    if log.vectors is None or len(log.imu) < 2:
+        return
+    time, field = log.vectors.time, field_body(log, site)
+    offset = 0.0 if site is None else site.platform.imu.time_offset
+    found = turning(log.imu, time, field, offset)
+    if len(found.change) < 12:
+        return
+    if not found.speed > LEAST_TURN:
+        yield from _turns_alone(log, site, found)
+        return
+    if site is None:
+        # Of unknown axes the best there are.
+        best = max(axes(), key=found.agreement)
+        if found.agreement(best) > EXPLAINED:
+            field = field @ (best if np.linalg.det(best) > 0.0 else -best)
+            found = turning(log.imu, time, field, offset)
+    scaled = found.explained(found.scale * np.eye(3))
+    # Noise in the rates lets the scale seem smaller, noise in the field the inverse.
+    apart = min(abs(found.scale - 1.0), abs(found.scale / max(scaled, 1e-6) - 1.0))
+    if apart > SCALE and scaled > SCALE_EXPLAINED:
+        yield _other_scale(found.scale, scaled)
+        return
+    clock = Clocks(log, time, field, offset)
+    sigma = 0.01 if site is None else site.platform.imu.time_offset_sigma
+    late = _other_clock(clock, found, max(LEAST_LAG, LAG_LIMIT * sigma), offset)
+    if late is not None:
+        yield late
+    elif found.explained(np.eye(3)) > CONTRADICTED:
+        yield from _turned_little(found, site)
+    else:
+        yield from _contradicted(found)
+
+
+def _contradicted(found: Turning) -> Iterator[Finding]:
+    """Yield what explains a turn of the field that the gyroscope does not, as declared."""
+    declared = found.explained(np.eye(3))
+    ranked = sorted(axes(), key=found.explained)[::-1]
+    best, explained = ranked[0], found.explained(ranked[0])
+    if explained > EXPLAINED and BETTER * (1.0 - explained) < 1.0 - declared:
+        yield _other_axes(found, best, single=_single(found, ranked, explained))
+    elif found.said > LEAST_TURN:
+        yield Finding(
+            "gyro_field",
+            f"gyroscope: {_words(found)}, and no exchange of axes or sign explains more than"
+            f" {_percent(max(explained, 0.0))}. An axis is dead, the clocks differ, or something"
+            " magnetic moves with the platform. Compare both at a slow turn about each axis.",
+            Verdict.DOUBTFUL,
+            100.0,
+        )
+
+
+def _words(found: Turning) -> str:
+    return (
+        f"as declared, the gyroscope explains {_percent(found.explained(np.eye(3)))} of the turn of"
+        f" the steady field (rms {found.speed / DEGREE:.0f} deg/s)"
+    )
+
+
+def _turned_little(found: Turning, site: Site | None) -> Iterator[Finding]:
+    """Yield a mounting that is off by degrees, which explains the turn far better."""
+    if site is None:
+        return
+    turn, sigma, better = found.mounting()
+    angle = float(np.linalg.norm(turn))
+    known = float(np.max(site.platform.magnetometer.sigma.rotation_sensor))
+    if better > BETTER and angle > max(LEAST_ANGLE, LIMIT * float(np.hypot(known, sigma))):
+        yield Finding(
+            "mounting",
+            f"magnetometer and gyroscope are turned against each other by {angle / DEGREE:.0f} deg"
+            f" from what body_from_sensor declares, about ({_three(turn / angle)}) in body axes: so"
+            f" the turn of the steady field is explained {better:.0f} times better. Correct"
+            " rpy_deg of platform.magnetometer.body_from_sensor.",
+            Verdict.DOUBTFUL,
+            angle / LEAST_ANGLE,
+        )
+
+
+def _three(vector: Array) -> str:
+    return ", ".join(f"{v:+.2f}" for v in vector)
+
+
+def _turns_alone(log: Log, site: Site | None, found: Turning) -> Iterator[Finding]:
+    """Name a gyroscope that turns while the field stands still: a bias, or another unit."""
+    mean, said = np.mean(log.imu.gyro_body, axis=0), found.said
+    words = (
+        f"gyroscope: it says that the field turns by {said / DEGREE:.2g} deg/s (rms), and the field"
+        " stands still"
+    )
+    if not said > max(LEAST_TURN, NOT_AT_ALL * found.speed) or site is None:
+        return
+    imu = site.platform.imu
+    rate_hz = 1.0 / float(np.median(np.diff(log.imu.time)))
+    noise = float(np.median(np.abs(np.diff(log.imu.gyro_body, axis=0)))) / 0.6745 / np.sqrt(2.0)
+    usual = imu.gyro_noise * np.sqrt(rate_hz / 2.0)
+    bias = float(np.linalg.norm(mean))
+    if usual and 0.5 < noise / usual * DEGREE < 2.0:
+        yield Finding(
+            "gyro_units",
+            f"{words}; its noise is {noise / usual:.0f} times the declared one: it is in deg/s."
+            " Multiply it by pi/180.",
+            Verdict.FAILED,
+            1e3,
+        )
+    elif bias > max(LIMIT * imu.gyro_bias_sigma, 0.5 * said):
+        yield Finding(
+            "imu_bias",
+            f"{words}: a bias of ({', '.join(f'{v:+.3g}' for v in mean)}) rad/s,"
+            f" {bias / imu.gyro_bias_sigma:.0f} sigma of the declared one. Remove it, or declare"
+            " platform.imu.gyro_bias_sigma as large as it is.",
+            Verdict.DOUBTFUL,
+            bias / imu.gyro_bias_sigma,
+        )
+
+
+def _single(found: Turning, ranked: list[Array], explained: float) -> bool:
+    """Tell whether the motion tells the best axes from the next."""
+    return BETTER * (1.0 - explained) < 1.0 - found.explained(ranked[1])
+
+
+def _other_clock(clock: Clocks, found: Turning, least: float, offset: float) -> Finding | None:
+    """Name a shift of the stamps that explains the turn far better, if it is at least so long."""
+    (lag, by_lag), declared = clock.lag(), found.explained(np.eye(3))
+    otherwise = max(found.explained(one) for one in axes()[1:])
+    if not (
+        abs(lag) > least
+        and by_lag > max(EXPLAINED, otherwise)
+        and BETTER * (1.0 - by_lag) < 1.0 - declared
+    ):
+        return None
+    rate = clock.rate_error()
+    if abs(rate) * clock.time[-1] > 0.5 * abs(lag) and abs(rate) > 1e-3:
+        return Finding(
+            "imu_clock",
+            f"imu: its clock runs {100.0 * rate:+.2g} % off the magnetometer's, so that the streams"
+            f" drift apart: {_words(found)}. Stamp both streams by one clock, or correct the"
+            " sampling rate with which one was stamped.",
+            Verdict.FAILED,
+            1e3,
+        )
+    late = "late" if lag < 0.0 else "early"
+    return Finding(
+        "time_offset",
+        f"imu: stamped {abs(lag):.2f} s too {late}: {_words(found)}, and {_percent(by_lag)} with"
+        f" its samples shifted by {lag:+.3f} s. Stamp both streams by one clock, or declare"
+        f" platform.imu.time_offset_s: {offset + lag:.3f}.",
+        Verdict.FAILED,
+        1e3,
+    )
+
+
+def _other_scale(scale: float, explained: float) -> Finding:
+    cause, code = f"its scale is wrong by a factor of {1.0 / scale:.3g}", "gyro_scale"
+    remedy = "Give rad/s, and check its range"
+    if 0.8 < scale / DEGREE < 1.25:
+        cause, remedy, code = "it is in deg/s", "Multiply it by pi/180", "gyro_units"
+    elif 0.8e3 < scale < 1.25e3:
+        cause, remedy, code = "it is a thousand times too small", "Give rad/s", "gyro_units"
+    elif scale < 0.0:
+        cause, remedy, code = "its sign is reversed", "Multiply it by -1", "gyro_sign"
+    return Finding(
+        code,
+        f"gyroscope: {cause}: the steady field turns {scale:.3g} times as fast as it says, which"
+        f" explains {_percent(explained)} of that turn. {remedy}.",
+        Verdict.FAILED,
+        1e3,
+    )
+
+
+def _other_axes(found: Turning, matrix: Array, *, single: bool) -> Finding:
+    """Name axes that explain the turn; those of the gyroscope, or of the magnetometer."""
+    words, explained = _words(found), found.explained(matrix)
+    names = ", ".join(_named(row) for row in matrix)
+    if np.linalg.det(matrix) < 0.0 and np.count_nonzero(np.diagonal(matrix)) == 3:
+        wrong = ", ".join(a for a, sign in zip("xyz", np.diagonal(matrix), strict=True) if sign < 0)
+        return Finding(
+            "gyro_sign",
+            f"gyroscope: the sign of {wrong} is reversed: {words}, and so {_percent(explained)}."
+            " Correct the driver.",
+            Verdict.FAILED,
+            1e3,
+        )
+    if np.linalg.det(matrix) < 0.0:
+        return Finding(
+            "imu_axes",
+            f"gyroscope: its axes are left-handed, x, y, z being {names} as recorded: {words}, and"
+            f" so {_percent(explained)}. Exchange them in the driver.",
+            Verdict.FAILED,
+            1e3,
+        )
+    how = _in_words(matrix) if single else "by 90 or 180 deg"
+    return Finding(
+        "mounting",
+        f"magnetometer and gyroscope are turned against each other {how} from what"
+        f" body_from_sensor declares, or axes of one are permuted: {words}, and so turned"
+        f" {_percent(explained)}. Correct rpy_deg of platform.magnetometer.body_from_sensor, or"
+        " the driver's axes.",
+        Verdict.FAILED,
+        1e3,
+    )
+
+
+def _in_words(matrix: Array) -> str:
+    """Return a turn by quarters in words."""
+    angle = float(np.arccos(np.clip(0.5 * (np.trace(matrix) - 1.0), -1.0, 1.0))) / DEGREE
+    names = ", ".join(_named(row) for row in matrix)
+    return f"by {angle:.0f} deg (x, y, z are {names})"
+
+
+def _named(row: Array) -> str:
+    k = int(np.argmax(np.abs(row)))
+    return f"{'-' if row[k] < 0.0 else ''}{'xyz'[k]}"
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * max(share, 0.0):.0f} %"

@@ -1,0 +1,31 @@
+"""What a magnetometer gave, as the estimator takes it: its own axes alone, at one temperature."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.demodulation.warming import heard_at_reference, heard_fields_at_reference
+from magfusion.estimation.measurements.signs import along_axis
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.units import Array
+
+
+def samples_heard(site: Site, time: Array, measured_sensor: Array) -> Array:
+    """Return raw samples (k, 3) (T) without what stands for axes that are not there."""
+    known, sensor = site.temperatures, site.platform.magnetometer
+    if sensor.lacking:
+        measured_sensor = np.array(measured_sensor, dtype=np.float64)
+        measured_sensor[..., sensor.lacking] = 0.0
+    return heard_at_reference(known, sensor, time, measured_sensor)
+
+
+def fields_heard(site: Site, samples: FieldSamples) -> FieldSamples:
+    """Return phasors without what stands for axes that are not there."""
+    known, sensor = site.temperatures, site.platform.magnetometer
+    samples = along_axis(samples, site)
+    if sensor.lacking:
+        phasor = samples.phasor_sensor.copy()
+        phasor[..., sensor.lacking] = np.nan
+        samples = replace(samples, phasor_sensor=phasor, axes=sensor.axes)
+    return heard_fields_at_reference(known, sensor, samples)

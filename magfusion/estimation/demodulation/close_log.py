@@ -1,0 +1,150 @@
+"""A log of close tones: its short windows tell of the motion, its long ones of each beacon.
+
+Samples count once.  The long windows, in which the tones are told apart, keep next to no say in the
+estimate, but all that judges beacon by beacon looks at them.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.estimation.data_checks.detection import (
+    DETECTION_CHI_SQUARE_ONLINE,
+    LOUD,
+    above_noise,
+)
+from magfusion.estimation.data_checks.spectrum import beside_lines
+from magfusion.estimation.demodulation.close_tones import joint_phasors
+from magfusion.estimation.graph.preintegration import low_passed_rate_at
+from magfusion.estimation.measurements.joint_phasors import JointPhasors, at_nearest
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.model.noise import whitening
+from magfusion.model.parameters import Calibration, initial_calibration, predict_channels
+from magfusion.model.samples import FieldSamples, ImuSamples, Log
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory, interpolated
+from magfusion.receiver.admission import Windows
+from magfusion.receiver.joint import JointReceiver, joint_settings
+from magfusion.receiver.turn import on_clock
+from magfusion.receiver.windows import LockinSettings
+from magfusion.units import Array, BoolArray
+
+NO_SAY = 1e6  # times the variance: a window that is looked at, and does not count
+
+
+class CloseLog(NamedTuple):
+    """The short windows of a log.
+
+    Parameters
+    ----------
+    time : ndarray, shape (samples,)
+        Of its waveform (s).
+    """
+
+    receiver: JointReceiver
+    windows: Windows
+    time: Array
+
+    @staticmethod
+    def of(log: Log, site: Site, asked: LockinSettings | None) -> "CloseLog | None":
+        """Return the short windows of a log of close tones; None of any other."""
+        settings = None if log.waveform is None else joint_settings(site, asked)
+        if settings is None or log.waveform is None:
+            return None
+        receiver = JointReceiver(site, settings)
+        receiver.beside_lines(beside_lines(log, site, asked))
+        imu = initial_calibration(site, 0.0, float(log.imu.time[0])).on_log_rate(log.imu)
+        windows = receiver.admitted(log.waveform, imu)
+        return CloseLog(receiver, windows, log.waveform.time) if len(windows) else None
+
+    @property
+    def nodes(self) -> Array:
+        """Times in the windows at which the motion is looked at, one after the other (s)."""
+        return np.asarray((self.windows.centre[:, None] + self.receiver.nodes).ravel())
+
+    def measured(
+        self,
+        unexplained_sensor: Array,
+        nodes: Trajectory,
+        states: Trajectory,
+        calibration: Calibration,
+        imu: ImuSamples,
+        standing: BoolArray | None,
+    ) -> JointPhasors:
+        """Return what the short windows tell.
+
+        Parameters
+        ----------
+        unexplained_sensor : ndarray, shape (samples, 3)
+            What a prediction along the states leaves of the samples (T).
+        nodes : Trajectory
+            The motion at `nodes`.
+        states : Trajectory
+            At all epochs, among which the centres of the windows are.
+        imu : ImuSamples
+            As the calibration corrects it.
+        standing : bool ndarray, shape (states,), optional
+        """
+        assert states.gyro_bias_body is not None
+        centre = self.windows.centre
+        epoch = np.searchsorted(states.time, centre)
+        rows = {k: v[epoch] for k, v in vars(states).items() if v is not None}
+        here, offset = Trajectory(**rows), calibration.time_offset
+        assert here.gyro_bias_body is not None
+        rate_body = low_passed_rate_at(imu, offset, centre) - here.gyro_bias_body
+        bias = interpolated(imu.time + offset, states.time, states.gyro_bias_body)
+        found, _ = joint_phasors(
+            self.receiver.designs,
+            self.windows,
+            self.time,
+            unexplained_sensor,
+            here,
+            nodes,
+            calibration,
+            on_clock(imu, offset, bias),
+            epoch,
+            rate_body,
+            calibration.imu_offset(centre),
+            standing=None if standing is None else standing[epoch],
+        )
+        return found
+
+
+def looked_at(phasors: FieldPhasors, joint: JointPhasors, window: float) -> FieldPhasors:
+    """Return phasors that are judged, and have no say where short windows have it.
+
+    Parameters
+    ----------
+    window : float
+        Length of those of the phasors (s): a gap of the short ones may be as long.
+    """
+    before = np.ones(phasors.measured.shape[:2]) if phasors.excess is None else phasors.excess
+    middle = 0.5 * (joint.time[1:] + joint.time[:-1])
+    apart = np.abs(joint.time[np.searchsorted(middle, phasors.time)] - phasors.time)
+    less = np.where(apart < 0.25 * window, NO_SAY, 1.0)[:, None]
+    root = phasors.sqrt_information / np.sqrt(less)[..., None, None]
+    return replace(phasors, sqrt_information=root, excess=less * before)
+
+
+def without_silent(
+    joint: JointPhasors, samples: FieldSamples, states: Trajectory, calibration: Calibration
+) -> JointPhasors:
+    """Return short windows without the beacons that long ones nearby should hear, and do not.
+
+    Parameters
+    ----------
+    samples, states : FieldSamples, Trajectory
+        Of the long windows.
+    """
+    every = np.ones((*samples.valid.shape, 3), dtype=bool)
+    expected = predict_channels(
+        calibration, states.time, states.world_from_body, states.position_world
+    )
+    root = whitening(samples.phasor_cov, every)
+    power = np.sum(np.abs((root @ expected[..., None])[..., 0]) ** 2, axis=-1)
+    silent = ~above_noise(samples, DETECTION_CHI_SQUARE_ONLINE)
+    silent &= power > LOUD * DETECTION_CHI_SQUARE_ONLINE
+    if not np.any(silent):
+        return joint
+    return joint.leaving_out(at_nearest(samples.time, silent, joint.time))

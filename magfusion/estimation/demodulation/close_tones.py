@@ -1,0 +1,236 @@
+"""From samples that a prediction leaves to what they tell of close tones together."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.demodulation.sending import Sending
+from magfusion.estimation.measurements.joint_phasors import JointPhasors, in_directions
+from magfusion.model.audibility import largest_fields, tones_of
+from magfusion.model.noise import cholesky, measurement_cov, sensor_positions
+from magfusion.model.parameters import Calibration, linearize_channels
+from magfusion.model.quaternion import inverse, matrices, turned
+from magfusion.model.samples import FieldSamples, ImuSamples
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.receiver.admission import Windows
+from magfusion.receiver.joint import NODES, JointDesigns
+from magfusion.receiver.noise import not_below, smoothed_over_windows
+from magfusion.receiver.turn import body_turn_of, measured_from_body
+from magfusion.receiver.windows import LONGEST_WINDOW
+from magfusion.units import Array, BoolArray, IntArray
+
+AT_ONCE = 128  # windows, whose covariances fit the cache
+
+
+def joint_phasors(
+    designs: JointDesigns,
+    windows: Windows,
+    time: Array,
+    left_sensor: Array,
+    states: Trajectory,
+    nodes: Trajectory,
+    calibration: Calibration,
+    imu: ImuSamples,
+    epoch: IntArray,
+    rate_body: Array,
+    applied_offset: Array,
+    *,
+    alike: Array | float = 1.0,
+    standing: BoolArray | None = None,
+    noise: Array | None = None,
+) -> tuple[JointPhasors, Array]:
+    """Return what short windows tell of all tones, weighed at poses that are about right.
+
+    Parameters
+    ----------
+    time : ndarray, shape (samples,)
+        (s)
+    left_sensor : ndarray, shape (samples, 3)
+        What the prediction leaves of the samples (T), measured axes.
+    states : Trajectory
+        At the centres of the windows, as predicted.
+    nodes : Trajectory
+        The motion at the nodes of the windows, likewise.
+    imu : ImuSamples
+        As from `magfusion.receiver.turn.on_clock`, without the gyro's bias.
+    epoch : int ndarray, shape (n,)
+        States that the windows belong to.
+    rate_body : ndarray, shape (n, 3)
+        Angular rate without its bias (rad/s).
+    applied_offset : ndarray, shape (n,)
+        IMU time offset with which the inertial data were cut (s).
+    alike, standing
+        As of `magfusion.estimation.measurements.phasors.field_phasors`.
+    noise : ndarray, shape (k, 3, 3), optional
+        Of samples in the windows before, to be averaged with what is seen.
+
+    Returns
+    -------
+    JointPhasors
+    ndarray, shape (n, 3, 3)
+        Noise of a sample as each window shows it alone (T^2).
+    """
+    assert states.velocity_world is not None
+    site, n = calibration.site, len(windows)
+    seen, tones, shown = _seen(designs, windows, time, left_sensor, imu, site)
+    known = shown if noise is None else np.concatenate([noise, shown])
+    if noise is None:
+        settings = designs.settings
+        smooth = smoothed_over_windows(
+            known[:, None], windows.centre, settings.step, settings.noise_windows, None
+        )[:, 0]
+    else:
+        smooth = np.mean(known, axis=0, keepdims=True)
+    nyquist_hz = 0.5 / float(np.median(np.diff(time)))
+    declared = site.platform.magnetometer.noise_density * float(np.sqrt(nyquist_hz))
+    smooth = not_below(smooth, declared)
+
+    felt = _felt(calibration, states)
+    basis = _of_channels(tones, windows.centre, site, felt)
+    elapsed, shift = _at_nodes(nodes, states, site)
+    value, strength = _foreseen(calibration, states, elapsed, shift, felt)
+    centre = in_directions(basis, value[..., None])[..., 0]
+    found = JointPhasors(
+        epoch=epoch,
+        time=states.time,
+        measured=seen.reshape(n, -1) + centre,
+        basis=basis,
+        whitening=np.zeros((n, 0, 0)),
+        elapsed=elapsed,
+        shift_body=shift,
+        strength=strength,
+        rate_body=rate_body,
+        applied_offset=applied_offset,
+        moving=np.ones(n, dtype=bool) if standing is None else ~standing,
+        felt=felt,
+    )
+    at_centre = value.reshape(n, elapsed.shape[1], *felt.shape[1:], 6)[:, len(NODES) // 2]
+    whitening = _whitening(site, states, at_centre, found, smooth, alike)
+    return replace(found, whitening=whitening), shown
+
+
+def _at_nodes(nodes: Trajectory, states: Trajectory, site: Site) -> tuple[Array, Array]:
+    """Return when the nodes are, and by how much the sensor moves beyond a steady velocity."""
+    n = len(states)
+    assert states.velocity_world is not None
+    elapsed = nodes.time.reshape(n, -1) - states.time[:, None]
+    steady = elapsed[..., None] * states.velocity_world[:, None]
+    moved_world = nodes.position_world.reshape(n, -1, 3) - states.position_world[:, None] - steady
+    body_from_world = np.swapaxes(states.world_from_body, 1, 2)[:, None]
+    turn = body_from_world @ nodes.world_from_body.reshape(n, -1, 3, 3)
+    swung = (turn - np.eye(3)) @ site.platform.magnetometer.position_body
+    return elapsed, (body_from_world @ moved_world[..., None])[..., 0] + swung
+
+
+def _foreseen(
+    calibration: Calibration, states: Trajectory, elapsed: Array, shift_body: Array, felt: BoolArray
+) -> tuple[Array, Array]:
+    """Return the phasors at the nodes (n nodes, channels, 6), and how strong each is there.
+
+    As a share of what it is at the centre, shape (n, nodes, channels).
+    """
+    assert states.velocity_world is not None
+    n, count = elapsed.shape
+    every = np.repeat(np.arange(n), count)
+    turn = states.world_from_body[every]
+    place = states.position_world[every] + (turn @ shift_body.reshape(-1, 3, 1))[..., 0]
+    place += elapsed.reshape(-1, 1) * states.velocity_world[every]
+    value, _, _ = linearize_channels(
+        calibration, (), states.time[every], turn, place, heard=felt[every]
+    )
+    size = np.linalg.norm(value, axis=2).reshape(n, count, -1)
+    middle = size[:, count // 2][:, None]
+    share = np.divide(size, middle, out=np.ones_like(size), where=middle > 0.0)
+    return value, share
+
+
+def _seen(
+    designs: JointDesigns,
+    windows: Windows,
+    time: Array,
+    left_sensor: Array,
+    imu: ImuSamples,
+    site: Site,
+) -> tuple[Array, Array, Array]:
+    """Return the directions of windows, what tones are there, and the noise beside."""
+    turn, from_body = body_turn_of(imu), measured_from_body(site)
+    back = from_body @ matrices(inverse(turn(windows.centre)))
+    in_body = np.linalg.inv(from_body)
+    still = turned(turn(time), in_body @ left_sensor.T).T
+    seen, tones, noise = [], [], []
+    for k, (first, count) in enumerate(zip(windows.first, windows.count, strict=True)):
+        rows = slice(int(first), int(first + count))
+        design = designs.of(time[rows] - windows.centre[k])
+        field = still[rows] @ back[k].T
+        seen.append(design.across.T @ field)
+        tones.append(design.tones)
+        beside = design.beside.T @ field
+        noise.append(beside.T @ beside / len(beside))
+    return np.array(seen), np.array(tones), np.array(noise)
+
+
+def _felt(calibration: Calibration, states: Trajectory) -> BoolArray:
+    """Return which channels are predicted at states, shape (n, channels)."""
+    site, sending = calibration.site, Sending.of(calibration, LONGEST_WINDOW)
+    if sending.least is None:
+        return np.ones((len(states), len(site.channels)), dtype=bool)
+    largest = largest_fields(site, sensor_positions(site, states)[:, 0])
+    felt = np.asarray(largest > sending.least)
+    felt[~np.any(felt, axis=1), 0] = True
+    return felt
+
+
+def _of_channels(by_tone: Array, centre: Array, site: Site, felt: BoolArray) -> Array:
+    """Return directions by cosines and sines as those by real and imaginary part of phasors."""
+    tones = tones_of(site)
+    count = len(tones.frequencies_hz)
+    angle = 2.0 * np.pi * tones.frequencies_hz * centre[:, None, None, None]
+    cosine, sine = np.cos(angle), np.sin(angle)
+    along, across = by_tone[..., :count], by_tone[..., count:]
+    real = along * cosine - across * sine
+    imaginary = -along * sine - across * cosine
+    both = np.stack([real, imaginary], axis=-1)[..., tones.of_channel[: felt.shape[1]], :]
+    both = np.where(felt[:, None, None, :, None], both, 0.0)
+    return np.asarray(np.swapaxes(both.reshape(*both.shape[:3], -1), 1, 2))
+
+
+def _whitening(
+    site: Site,
+    states: Trajectory,
+    value: Array,
+    found: JointPhasors,
+    noise: Array,
+    alike: Array | float,
+) -> Array:
+    """Return the whitening of directions: noise of the samples, and the error of the model."""
+    felt, basis = found.felt, found.basis
+    n, directions, nodes, _ = basis.shape
+    phasor = value[..., :3] + 1j * value[..., 3:]
+    samples = FieldSamples(
+        time=states.time,
+        window=np.ones(n),
+        channels=site.channels,
+        phasor_sensor=np.where(felt[..., None], phasor, np.nan),
+        phasor_cov=np.zeros((*felt.shape, 3, 3)),
+    )
+    model = measurement_cov(
+        site, samples, sensor_world=sensor_positions(site, states), alike=alike, beside=False
+    )
+    model = np.where(felt[..., None, None], np.nan_to_num(model), 0.0)
+    factor = np.mean([beacon.noise_factor**2 for beacon in site.beacons])
+    out = np.empty((n, 3 * directions, 3 * directions))
+    for begin in range(0, n, AT_ONCE):
+        rows = slice(begin, begin + AT_ONCE)
+        each = basis[rows].reshape(-1, directions, nodes, felt.shape[1], 2)
+        parts = np.einsum("nrkcp,nkc->ncrp", each, found.strength[rows])
+        shape = parts @ np.swapaxes(parts, 2, 3)  # (n, channels, directions, directions)
+        size = model[rows].reshape(len(shape), shape.shape[1], 9)
+        wide = np.swapaxes(shape.reshape(*shape.shape[:2], -1), 1, 2) @ size
+        wide = wide.reshape(-1, directions, directions, 3, 3)
+        own = np.arange(directions)
+        wide[:, own, own] += factor * noise[rows][:, None]
+        cov = np.swapaxes(wide, 2, 3).reshape(-1, 3 * directions, 3 * directions)
+        scale = np.sqrt(np.trace(cov, axis1=1, axis2=2) / cov.shape[1])[:, None, None]
+        out[rows] = np.linalg.inv(cholesky(cov / scale**2)) / scale
+    return out

@@ -1,0 +1,77 @@
+"""Which of many beacons a log hears: the others stay as they are declared."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.data_checks.detection import DETECTION_CHI_SQUARE_ONLINE, above_noise
+from magfusion.model.audibility import are_many, largest_fields, phasor_sigma, tones_of
+from magfusion.model.parameters import beacons_of, channels_of, samples_of
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Verdict
+from magfusion.receiver.cells import way_of
+from magfusion.receiver.lockin_receiver import LockinReceiver
+from magfusion.receiver.receivers import receiver_of
+from magfusion.receiver.slots import has_schedule
+from magfusion.receiver.windows import LockinSettings
+from magfusion.units import IntArray
+
+HEARD = 1.0  # sigmas of a phasor: a beacon that is nowhere so loud is not heard
+
+
+def heard_site(log: Log, site: Site, settings: LockinSettings | None = None) -> tuple[Log, Site]:
+    """Return a log and its site with those beacons that it hears, where the site has many.
+
+    Those that are not heard are kept beside them (`Site.unheard`).
+
+    Raises
+    ------
+    InputError
+        Where no beacon is heard.
+    """
+    known = [beacon.unknown is None for beacon in site.beacons]
+    if not are_many(site) or site.unheard or has_schedule(site) or not all(known):
+        return log, site
+    heard = _heard(log, site, settings)
+    if len(heard) == len(site.beacons):
+        return log, site
+    if len(heard) == 0:
+        raise InputError(
+            f"none of the {len(site.beacons)} beacons of the site is heard; bring the sensor nearer"
+        )
+    every, kept = dict(enumerate(site.beacons)), set(heard.tolist())
+    some = replace(
+        site,
+        beacons=tuple(every[k] for k in sorted(kept)),
+        unheard=tuple((k, beacon) for k, beacon in every.items() if k not in kept),
+    )
+    fields = log.fields
+    if fields is not None:
+        fields = samples_of(fields, channels_of(site, heard))
+    text = (
+        f"{len(heard)} of the site's {len(every)} beacons are heard. Of the others nothing is"
+        " learnt: they stay as declared."
+    )
+    said = Finding("beacons_unheard", text, Verdict.TRUSTWORTHY, 0.0)
+    return replace(log, fields=fields, noticed=(*log.noticed, said)), some
+
+
+def _heard(log: Log, site: Site, settings: LockinSettings | None) -> IntArray:
+    """Return the numbers of the beacons that a log hears."""
+    if log.waveform is None:
+        assert log.fields is not None
+        loud = above_noise(log.fields, DETECTION_CHI_SQUARE_ONLINE)
+        return beacons_of(site, np.any(loud, axis=0))
+    receiver = receiver_of(site, settings)
+    assert isinstance(receiver, LockinReceiver)
+    samples = receiver.sent(log.waveform, log.imu)
+    if not tones_of(site).reused:
+        loud = above_noise(samples, DETECTION_CHI_SQUARE_ONLINE)
+        return beacons_of(site, np.any(loud, axis=0))
+    way = way_of(samples, site)
+    place, margin = way.at(way.time)
+    largest = np.max(largest_fields(site, place, margin[:, None]), axis=0)
+    sigma = phasor_sigma(site, float(np.median(samples.window)))
+    return beacons_of(site, np.asarray(largest > HEARD * sigma))

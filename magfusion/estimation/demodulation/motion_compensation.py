@@ -1,0 +1,327 @@
+"""What the lock-in makes of motion inside its window, predicted and taken off."""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.linalg import norm
+
+from magfusion.errors import InputError
+from magfusion.estimation.data_checks.detection import only
+from magfusion.estimation.demodulation.motion_shape import MotionShape
+from magfusion.estimation.demodulation.motion_stretches import joined, only_stretch, stretches
+from magfusion.estimation.demodulation.sending import Sending
+from magfusion.estimation.graph.state import State, as_trajectory
+from magfusion.model.audibility import Owned, only_owned, owned_at
+from magfusion.model.field import predict_earth
+from magfusion.model.noise import calibration_error, model_error, sensor_positions
+from magfusion.model.parameters import Calibration, linearize_channels, predict_channels
+from magfusion.model.quaternion import unit
+from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.waveform import Motion, carriers, predicted_waveform
+from magfusion.receiver.cells import owned_by
+from magfusion.receiver.lockin import WindowOperator
+from magfusion.receiver.lockin_receiver import LockinReceiver
+from magfusion.receiver.turn import BodyTurn, on_clock
+from magfusion.units import Array, BoolArray, ComplexArray
+
+# By how much a motion that was found without an IMU errs within a window, one sigma.
+MISSED_SPIN, MISSED_PUSH = 1.5, 3.0  # rad/s^2, m/s^2
+
+
+@dataclass(frozen=True, eq=False)
+class MotionCompensated:
+    """Phasors at the centres of the windows, freed of what motion inside the window does.
+
+    Parameters
+    ----------
+    by_time_offset : complex ndarray, shape (n, channels, 3)
+        Derivative of what was taken off by the IMU's time offset at fixed states (T/s).
+    steady : SteadyFields
+        The Earth field and the offset.
+    unseen : bool
+        Whether nothing was known of the motion, and nothing taken off.
+    unexplained_sensor : ndarray, shape (samples, 3), optional
+        What the prediction leaves of the samples (T), where it is asked for with
+    wanted : Trajectory, optional
+        the motion at other times.
+    """
+
+    fields: FieldSamples
+    by_time_offset: ComplexArray
+    steady: SteadyFields
+    unseen: bool = False
+    unexplained_sensor: Array | None = None
+    wanted: Trajectory | None = None
+
+    @staticmethod
+    def of_slots(fields: FieldSamples) -> "MotionCompensated":
+        """Return phasors of slots: too short for motion, and without a steady field."""
+        none = np.full((len(fields), 3), np.nan)
+        steady = SteadyFields(fields.time, none, np.full((*none.shape, 3), np.nan))
+        return MotionCompensated(fields, np.zeros_like(fields.phasor_sensor), steady)
+
+
+class TakenOff(NamedTuple):
+    """What a prediction leaves of samples.
+
+    Parameters
+    ----------
+    unexplained_sensor, change_sensor : ndarray, shape (samples, 3)
+        What is left (T), and the prediction's derivative by the IMU's time offset (T/s).
+    wanted : Trajectory, optional
+        The motion at other times that were asked for.
+    """
+
+    unexplained_sensor: Array
+    change_sensor: Array
+    sending: Sending
+    earth_world: Array
+    wanted: Trajectory | None
+
+
+class KnownMotion(NamedTuple):
+    """The motion along the samples of one window, and its turn at them (4, samples).
+
+    As of `MotionShape.turned_at`.
+    """
+
+    shape: MotionShape
+    turned: Array
+
+
+def taken_off(
+    samples: Waveform,
+    path: Trajectory,
+    imu: ImuSamples,
+    calibration: Calibration,
+    time_offset: float,
+    window: float,
+    wanted: Array | None = None,
+    known: KnownMotion | None = None,
+) -> TakenOff:
+    """Return what a prediction along a motion leaves of samples.
+
+    Parameters
+    ----------
+    path : Trajectory
+        States between which the motion is interpolated, with the shape of the IMU's.
+    time_offset : float
+        Of the IMU (s).
+    window : float
+        A beacon is predicted that is felt in windows so long (s).
+    wanted : ndarray, shape (m,), optional
+        Other times at which the motion is asked for (s).
+    known : KnownMotion, optional
+        The motion, where it is known.
+    """
+    site, measured_sensor = calibration.site, samples.measured_sensor
+    earth = np.zeros(3) if site.earth_field_world is None else site.earth_field_world
+    unexplained, change = np.empty_like(measured_sensor), np.empty_like(measured_sensor)
+    sending, others = Sending.of(calibration, window), []
+    along = (
+        stretches(samples.time, path, imu, time_offset, site.gravity)
+        if known is None
+        else only_stretch(samples.time, known.shape)
+    )
+    for stretch in along:
+        shape = stretch.shape
+        for rows in stretch.pieces(sending.at_once):
+            time = samples.time[rows]
+            turned = None if known is None else known.turned[:, rows]
+            motion, change_of = shape.changing_at(time, turned)
+            heard = sending.along(motion)
+            predicted, change[rows] = predicted_waveform(
+                motion,
+                heard,
+                earth,
+                carriers(heard.site.tone_frequencies_hz, time),
+                Motion(*change_of),
+                through_nodes=True,
+            )
+            unexplained[rows] = measured_sensor[rows] - predicted
+        if wanted is not None:
+            others.append(stretch.at_others(wanted))
+    return TakenOff(unexplained, change, sending, earth, joined(others) if others else None)
+
+
+def demodulate_about(
+    operator: WindowOperator,
+    measured_sensor: Array,
+    states: Trajectory,
+    imu: ImuSamples,
+    calibration: Calibration,
+    path: Trajectory | None = None,
+    *,
+    wanted: Array | None = None,
+    motion: KnownMotion | None = None,
+) -> MotionCompensated:
+    """Demodulate what a prediction of the waveform leaves, and add the phasors at the centres.
+
+    The raw samples of each window are predicted from the state and from the IMU's motion inside
+    the window; only what they differ by from the measured ones passes through the lock-in.
+
+    Parameters
+    ----------
+    measured_sensor : ndarray, shape (samples, 3)
+        (T)
+    states : Trajectory
+        At the centres of the windows.
+    path : Trajectory, optional
+        States between which the motion is interpolated, where they are not those of the windows.
+    wanted : ndarray, shape (m,), optional
+        Other times at which the motion is asked for (s), with what is left of the samples.
+    motion : KnownMotion, optional
+        Along the samples, where it is known.
+    """
+    site, known = calibration.site, states if path is None else path
+    samples = Waveform(operator.designs.time, measured_sensor)
+    window = operator.designs.settings.window
+    offset = calibration.time_offset
+    off = taken_off(samples, known, imu, calibration, offset, window, wanted, motion)
+    earth, sending, unexplained = off.earth_world, off.sending, off.unexplained_sensor
+    rest, left, by_time_offset = operator.demodulate_both(unexplained, off.change_sensor)
+    at_centre = predict_channels(
+        calibration, states.time, states.world_from_body, states.position_world
+    )
+    steady = predict_earth(site.platform.magnetometer, states.world_from_body, earth)
+    fields = replace(rest, phasor_sensor=rest.phasor_sensor + at_centre)
+    return MotionCompensated(
+        fields=fields if operator.tone_of_channel is None else _of_loudest(fields, sending, states),
+        by_time_offset=by_time_offset,
+        steady=replace(left, measured_sensor=left.measured_sensor + steady),
+        unexplained_sensor=None if wanted is None else unexplained,
+        wanted=off.wanted,
+    )
+
+
+def _of_loudest(fields: FieldSamples, sending: Sending, states: Trajectory) -> FieldSamples:
+    """Return phasors of the loudest on each frequency; what is foreseen of the others is off."""
+    site = sending.calibration.site
+    places = sensor_positions(site, states)
+    place = places[:, 0]  # samples are demodulated of one magnetometer alone
+    unknown = np.ones((len(place), len(site.channels)))
+    felt = sending.along(states)
+    far = np.stack([norm(place - b.position_world, axis=1) for b in felt.site.beacons], axis=1)
+    names = {beacon.name for beacon in felt.site.beacons}
+    own = np.array([name in names for name, _ in site.channels])
+    missed = calibration_error(felt.site, far)[:, felt.site.owner]
+    unknown[:, own] = np.hypot(missed, model_error(felt.site, places))
+    owned, count = owned_at(site, place, unknown=unknown), len(fields.channels)
+    return only_owned(fields, Owned(owned.channels[:, :count], owned.others[:, :count]))
+
+
+def _without_motion(
+    operator: WindowOperator, measured_sensor: Array, offset: Array
+) -> MotionCompensated:
+    """Demodulate windows of whose motion nothing is known."""
+    fields, steady = operator.demodulate(measured_sensor - offset)
+    steady = replace(steady, measured_sensor=steady.measured_sensor + offset)
+    return MotionCompensated(fields, np.zeros_like(fields.phasor_sensor), steady, unseen=True)
+
+
+def _by_strength(operator: WindowOperator, measured_sensor: Array, site: Site) -> MotionCompensated:
+    """Demodulate windows of beacons that share frequencies, wherever they were recorded."""
+    found = _without_motion(operator, measured_sensor, site.platform.magnetometer.offset)
+    try:
+        fields = owned_by(found.fields, site)
+    except InputError:
+        fields = only(found.fields, np.zeros(found.fields.valid.shape, dtype=bool))
+    return replace(found, fields=fields, unseen=False)
+
+
+def demodulate_predicted(
+    receiver: LockinReceiver,
+    number: int,
+    waveform: Waveform,
+    imu: ImuSamples,
+    before: State,
+    predicted: State,
+    offset: float,
+    *,
+    blind: bool = False,
+    lost: bool = False,
+) -> MotionCompensated:
+    """Demodulate one window about a prediction.
+
+    Parameters
+    ----------
+    number : int
+        Of the window.
+    waveform, imu : Waveform, ImuSamples
+        Covering the window and, of the IMU, the interval before it.
+    before, predicted : State
+        At the epoch before and at the centre.
+    offset : float
+        IMU time offset with which the states were propagated (s).
+    blind : bool
+        Whether samples stand in for inertial ones.
+    lost : bool
+        Whether the prediction may be anywhere, so that it tells not whose a phasor is.
+    """
+    assert receiver.grid is not None
+    window = receiver.grid.windows(np.array([number]), waveform.time)
+    inside = slice(int(window.first[0]), int(window.first[0] + window.count[0]))
+    samples = waveform.rows(inside)
+    alone = replace(window, first=np.zeros(1, dtype=np.int64))
+    calibration = replace(predicted.calibration, time_offset=offset)
+    known = on_clock(imu, offset, predicted.gyro_bias_body)
+    site = calibration.site
+    centre, path = as_trajectory([predicted]), as_trajectory([before, predicted])
+    assert receiver.admission is not None
+    shape = MotionShape.of(path, imu, offset, site.gravity, usual=receiver.admission.imu_step)
+    turned = shape.turned_at(np.concatenate([samples.time, window.centre]))
+    whole, turned = unit(turned), turned[:, :-1]
+    turn = BodyTurn(whole[:, :-1], whole[:, -1:])
+    operator = receiver.operator_of_one(samples, known, alone, site, turn)
+    if operator.unseen[0]:
+        return _without_motion(operator, samples.measured_sensor, site.platform.magnetometer.offset)
+    if lost and operator.tone_of_channel is not None:
+        return _by_strength(operator, samples.measured_sensor, receiver.site)
+    motion = KnownMotion(shape, turned)
+    found = demodulate_about(
+        operator, samples.measured_sensor, centre, imu, calibration, path, motion=motion
+    )
+    length = receiver.settings.window
+    if not blind:
+        return found
+    fields = noisier(found.fields, np.ones(1, dtype=bool), centre, calibration, length)
+    return replace(found, fields=fields)
+
+
+def noisier(
+    samples: FieldSamples,
+    blind: BoolArray,
+    states: Trajectory,
+    calibration: Calibration,
+    window: float,
+) -> FieldSamples:
+    """Return phasors with the noise of a shape of the motion that was missed.
+
+    It moves all channels alike: that they are taken for independent must not average it out.
+
+    Parameters
+    ----------
+    blind : bool ndarray, shape (n,)
+        Windows in which the motion was found without an IMU.
+    states : Trajectory
+        At their centres.
+    window : float
+        Length of the windows (s).
+    """
+    rows = np.flatnonzero(blind)
+    pose = states.world_from_body[rows], states.position_world[rows]
+    _, by_pose, _ = linearize_channels(calibration, (), states.time[rows], *pose)
+    # The mean over the window of half the square of time.
+    shape = window**2 / 24.0 * np.repeat([MISSED_SPIN, MISSED_PUSH], 3)
+    channels = len(samples.channels)
+    by = (by_pose * shape).reshape(len(rows), channels, 2, 3, 6)
+    cov = samples.phasor_cov.copy()
+    missed = 0.5 * channels * np.einsum("nckxi,nckyi->ncxy", by, by)
+    # What is found of the noise of a beacon is not of this.
+    site = calibration.site
+    factor = np.array([beacon.noise_factor for beacon in site.beacons])[site.owner]
+    cov[rows] += missed / factor[:, None, None] ** 2
+    return replace(samples, phasor_cov=cov)

@@ -1,0 +1,231 @@
+"""The motion while the IMU is silent, from the magnetometer's samples one by one.
+
+A window of the lock-in is long against a fast turn: without the gyro the Earth field leaks into
+every tone.  But each sample holds the Earth field, whose direction gives two angles at once, and
+the tones, which give the third and the place.  A filter over the samples, from the last state that
+is known, and back again (Rauch, Tung and Striebel), follows a turn of several radians a second.
+Where the gyro is heard, before a gap and behind it, the filter takes its rates: a short gap is as
+good as interpolated.  What it finds takes the place of inertial samples: as the shape of the motion
+only, with the noise of a stretch that has none.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from magfusion.estimation.graph.state import MOTION, State
+from magfusion.model.field import observe_earth
+from magfusion.model.parameters import Calibration, linearize_channels
+from magfusion.model.samples import ImuSamples, Waveform
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array
+
+TURN_NOISE = 20.0  # rad/s^2/sqrt(Hz); of a hand that turns as fast as it can
+PUSH_NOISE = 10.0  # m/s^2/sqrt(Hz); likewise
+FASTEST_TURN = 5.0  # rad/s; of which the rate at the beginning is one sigma
+STEADY_ERROR = 3e-4  # of the steady field: vibration, which no path follows
+FIELD_ERROR = 1e-2  # of the beacons' fields: iron, and the calibration
+FIRST_STEADY = 1e-6  # T; how far the steady field may be from what the first sample says
+GYRO_ERROR = 0.05  # rad/s; of a rate between two samples of a gyro: vibration
+WORST_MISFIT = 5.0  # mean squared innovation, in units of its expectation
+FEWEST = 8  # samples
+TURN, PLACE, SPEED, RATE, STEADY = (slice(3 * k, 3 * k + 3) for k in range(5))
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    world_from_body: Array
+    position_world: Array
+    velocity_world: Array
+    rate_body: Array
+    steady_world: Array
+    cov: Array  # (15, 15): turn and place in body axes, as of a pose
+
+    def moved(self, step: Array, cov: Array) -> "_Motion":
+        turn = Rotation.from_rotvec(step[TURN]).as_matrix()
+        return _Motion(
+            self.world_from_body @ turn,
+            self.position_world + self.world_from_body @ step[PLACE],
+            self.velocity_world + step[SPEED],
+            self.rate_body + step[RATE],
+            self.steady_world + step[STEADY],
+            cov,
+        )
+
+    def step_to(self, other: "_Motion") -> Array:
+        """Return the step that takes this to another: the inverse of `moved`."""
+        back = self.world_from_body.T
+        return np.concatenate(
+            [
+                Rotation.from_matrix(back @ other.world_from_body).as_rotvec(),
+                back @ (other.position_world - self.position_world),
+                other.velocity_world - self.velocity_world,
+                other.rate_body - self.rate_body,
+                other.steady_world - self.steady_world,
+            ]
+        )
+
+    def after(self, elapsed: float) -> tuple["_Motion", Array]:
+        """Return it a little later, and the transition."""
+        turn = Rotation.from_rotvec(elapsed * self.rate_body).as_matrix()
+        by = np.eye(MOTION)
+        by[TURN, TURN] = by[PLACE, PLACE] = turn.T
+        by[TURN, RATE] = elapsed * np.eye(3)
+        later = self.world_from_body @ turn
+        by[PLACE, SPEED] = elapsed * later.T
+        noise = np.zeros(MOTION)
+        noise[RATE], noise[SPEED] = TURN_NOISE**2 * elapsed, PUSH_NOISE**2 * elapsed
+        moved = replace(
+            self,
+            world_from_body=later,
+            position_world=self.position_world + elapsed * self.velocity_world,
+            cov=by @ self.cov @ by.T + np.diag(noise),
+        )
+        return moved, by
+
+
+@dataclass(frozen=True, eq=False)
+class FieldMotion:
+    """How the platform moved by the field.
+
+    Parameters
+    ----------
+    imu : ImuSamples
+        What an IMU would have measured, at the times of the magnetometer's samples on the log's
+        clock, with the biases of the state that it was followed from.
+    path : Trajectory
+        Poses and velocities at the same times.
+    """
+
+    imu: ImuSamples
+    path: Trajectory
+
+
+def motion_from_field(
+    state: State, waveform: Waveform, imu: ImuSamples | None = None, longest_step: float = 0.0
+) -> FieldMotion | None:
+    """Return how the platform moved while a magnetometer measured; None where that is not told.
+
+    Parameters
+    ----------
+    state : State
+        At or before the first sample.
+    waveform : Waveform
+        Samples that follow.
+    imu : ImuSamples, optional
+        Of the same stretch, on the log's clock: what there is.
+    longest_step : float
+        Between two inertial samples (s); a longer one is a gap.
+    """
+    time, calibration = waveform.time, state.calibration
+    if len(time) < FEWEST:
+        return None
+    motion, before, misfit = _begin(state, waveform), state.time, []
+    found: list[_Motion] = []
+    predictions: list[tuple[_Motion, Array]] = []
+    rates = _rates_at(time, imu, longest_step) - state.gyro_bias_body
+    for now, measured, rate in zip(time.tolist(), waveform.measured_sensor, rates, strict=True):
+        predictions.append(motion.after(now - before))
+        motion, square = _updated(predictions[-1][0], calibration, now, measured)
+        if np.isfinite(rate[0]):
+            motion = _turning(motion, rate)
+        found.append(motion)
+        misfit.append(square)
+        before = now
+    if not np.mean(misfit[len(misfit) // 2 :]) < WORST_MISFIT:
+        return None
+    for k in range(len(found) - 2, -1, -1):
+        ahead, by = predictions[k + 1]
+        gain = np.linalg.solve(ahead.cov, by @ found[k].cov).T
+        found[k] = found[k].moved(gain @ ahead.step_to(found[k + 1]), found[k].cov)
+    velocity = np.stack([one.velocity_world for one in found])
+    force = np.gradient(velocity, time, axis=0) + np.array([0.0, 0.0, calibration.site.gravity])
+    turned = np.stack([one.world_from_body for one in found])
+    rate = np.stack([one.rate_body for one in found])
+    accel = (np.swapaxes(turned, 1, 2) @ force[..., None])[..., 0]
+    place = np.stack([one.position_world for one in found])
+    return FieldMotion(
+        ImuSamples(time, rate + state.gyro_bias_body, accel + state.accel_bias_body),
+        Trajectory(time, turned, place, velocity),
+    )
+
+
+def _rates_at(time: Array, imu: ImuSamples | None, longest_step: float) -> Array:
+    """Return the gyro's rates at some times, shape (n, 3); NaN where it is silent (rad/s)."""
+    if imu is None or len(imu) == 0:
+        return np.full((len(time), 3), np.nan)
+    step = np.concatenate([[np.inf], np.diff(imu.time), [np.inf]])
+    span = step[np.searchsorted(imu.time, time)]
+    rates = np.stack([np.interp(time, imu.time, axis) for axis in imu.gyro_body.T], axis=1)
+    return np.asarray(np.where(span[:, None] <= longest_step, rates, np.nan))
+
+
+def _turning(motion: _Motion, rate: Array) -> _Motion:
+    """Return a motion whose rate was measured (rad/s)."""
+    spread = motion.cov[RATE, RATE] + GYRO_ERROR**2 * np.eye(3)
+    gain = np.linalg.solve(spread, motion.cov[RATE]).T
+    left = np.eye(MOTION)
+    left[:, RATE] -= gain
+    cov = left @ motion.cov @ left.T + GYRO_ERROR**2 * gain @ gain.T
+    return motion.moved(gain @ (rate - motion.rate_body), cov)
+
+
+def _begin(state: State, waveform: Waveform) -> _Motion:
+    sensor = state.calibration.site.platform.magnetometer
+    value, _, _ = _predicted(
+        state.calibration, state.time, state.world_from_body, state.position_world
+    )
+    tones = np.zeros(3) if waveform.time[0] - state.time > 0.0 else value
+    field = np.linalg.solve(sensor.matrix, waveform.measured_sensor[0] - tones - sensor.offset)
+    cov = np.zeros((MOTION, MOTION))
+    cov[:9, :9] = state.cov[:9, :9]
+    cov[RATE, RATE] = FASTEST_TURN**2 * np.eye(3)
+    cov[STEADY, STEADY] = FIRST_STEADY**2 * np.eye(3)
+    return _Motion(
+        state.world_from_body,
+        state.position_world,
+        state.velocity_world,
+        np.zeros(3),
+        state.world_from_body @ sensor.body_from_sensor @ field,
+        cov,
+    )
+
+
+def _predicted(
+    calibration: Calibration, time: float, world_from_body: Array, position_world: Array
+) -> tuple[Array, Array, float]:
+    """Return the beacons' field in a sample, its derivative by the pose, and its size (T)."""
+    at = np.array([time])
+    value, by_pose, _ = linearize_channels(
+        calibration, (), at, world_from_body[None], position_world[None]
+    )
+    frequencies = np.concatenate([b.tone_frequencies_hz for b in calibration.site.beacons])
+    angle = 2.0 * np.pi * frequencies * time
+    carrier = np.stack([np.cos(angle), -np.sin(angle)], axis=-1)
+    parts = value[0].reshape(-1, 2, 3), by_pose[0].reshape(-1, 2, 3, 6)
+    size = float(np.sqrt(np.sum(value**2)))
+    field, by_field = (np.einsum("ck,ck...->...", carrier, part) for part in parts)
+    return np.asarray(field), np.asarray(by_field), size
+
+
+def _updated(
+    motion: _Motion, calibration: Calibration, time: float, measured: Array
+) -> tuple[_Motion, float]:
+    sensor = calibration.site.platform.magnetometer
+    pose = motion.world_from_body, motion.position_world
+    tones, by_pose, size = _predicted(calibration, time, *pose)
+    steady = observe_earth(sensor, motion.world_from_body, motion.steady_world)
+    by = np.zeros((3, MOTION))
+    by[:, :6] = by_pose
+    by[:, TURN] += steady.platform_rotation
+    by[:, STEADY] = steady.earth_world
+    error = measured - tones - steady.measured_sensor
+    sigma = np.hypot(STEADY_ERROR * np.linalg.norm(motion.steady_world), FIELD_ERROR * size)
+    across = by @ motion.cov
+    spread = across @ by.T + sigma**2 * np.eye(3)
+    gain = np.linalg.solve(spread, across).T
+    square = float(error @ np.linalg.solve(spread, error)) / 3.0
+    left = np.eye(MOTION) - gain @ by
+    cov = left @ motion.cov @ left.T + sigma**2 * gain @ gain.T
+    return motion.moved(gain @ error, cov), square

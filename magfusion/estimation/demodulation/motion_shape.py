@@ -1,0 +1,354 @@
+"""The motion between states, of the IMU's shape; and how it changes with the IMU's time offset."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from magfusion.estimation.graph.preintegration import low_pass_reach
+from magfusion.model.hermite import hermite
+from magfusion.model.quaternion import (
+    cross,
+    inverse,
+    matrices,
+    of_matrices,
+    of_vectors,
+    product,
+    turned,
+    unit,
+    vectors,
+)
+from magfusion.model.samples import ImuSamples
+from magfusion.model.strapdown import turn_at, turn_from_gyro
+from magfusion.model.trajectory import Trajectory, interpolated
+from magfusion.units import Array
+
+MARGIN = 3  # inertial samples on either side of what is asked
+AT_ONCE = 1 << 14  # samples that are turned at once: what is made of them stays in the cache
+
+
+class _ByOffset(NamedTuple):
+    """What the IMU's time offset changes, at its samples (n, 3) and at the states.
+
+    Parameters
+    ----------
+    rate, rate_at_states : ndarray
+        (rad/s), world axes
+    position, velocity : ndarray
+        (m/s) and (m/s^2)
+    """
+
+    rate: Array
+    rate_at_states: Array
+    position: Array
+    velocity: Array
+
+
+@dataclass(frozen=True, eq=False)
+class MotionShape:
+    """The IMU integrated once over a log, and what it lacks at the states spread between them.
+
+    Parameters
+    ----------
+    states : Trajectory
+        With velocity and biases, at the field epochs.
+    time : ndarray, shape (n,)
+        Of the inertial samples, on the log's clock (s).
+    gyro_body : ndarray, shape (n, 3)
+        Freed of the bias (rad/s).
+    chain : ndarray, shape (4, n)
+        ``body(0)_from_body(k)``, quaternions, scalar first.
+    world_from_start : ndarray, shape (4, states)
+        At the states.
+    spread : ndarray, shape (3, states - 1)
+        The turn that is spread between each state and the next (rad).
+    world_from_body : ndarray, shape (4, n)
+        At the inertial samples.
+    accel_world, velocity_world, position_world : ndarray, shape (n, 3)
+        As integrated from rest at the origin (m/s^2, m/s, m).
+    reach : int
+        Inertial samples on either side over which `changing_at` averages.
+    usual : float
+        Usual time between two inertial samples (s).
+    """
+
+    states: Trajectory
+    time: Array
+    gyro_body: Array
+    chain: Array
+    world_from_start: Array
+    spread: Array
+    world_from_body: Array
+    accel_world: Array
+    velocity_world: Array
+    position_world: Array
+    gravity: float
+    reach: int
+    usual: float
+
+    @staticmethod
+    def of(
+        states: Trajectory,
+        imu: ImuSamples,
+        time_offset: float,
+        gravity: float,
+        reach: int | None = None,
+        usual: float | None = None,
+    ) -> "MotionShape":
+        """Integrate an inertial stream through states.
+
+        Parameters
+        ----------
+        time_offset : float
+            (s)
+        gravity : float
+            (m/s^2)
+        reach : int, optional
+            Where the samples are a part of a stream that has its own.
+        usual : float, optional
+            Usual time between two samples (s), where it is known.
+        """
+        if states.velocity_world is None or states.gyro_bias_body is None:
+            raise ValueError("states must have velocity and biases")
+        assert states.accel_bias_body is not None
+        time = imu.time + time_offset
+        usual = float(np.median(np.diff(imu.time))) if usual is None else usual
+        gyro = imu.gyro_body - interpolated(time, states.time, states.gyro_bias_body)
+        accel = imu.accel_body - interpolated(time, states.time, states.accel_bias_body)
+        chain = turn_from_gyro(time, gyro)
+        at_states = turn_at(chain, time, gyro, states.time)
+        known = of_matrices(states.world_from_body)
+        world_from_start = product(known, inverse(at_states))
+        spread = _between(world_from_start)
+        world_from_body, world_accel = np.empty_like(chain), np.empty_like(accel)
+        for rows in _pieces(len(time)):
+            start = _turn_at(states.time, world_from_start, spread, time[rows])
+            world_from_body[:, rows] = product(start, chain[:, rows])
+            world_accel[rows] = turned(world_from_body[:, rows], accel[rows].T).T
+        del accel  # of a long log each of these is a good part of the log
+        world_accel -= [0.0, 0.0, gravity]
+        velocity, position = _integrated(time, world_accel)
+        return MotionShape(
+            states=states,
+            time=time,
+            gyro_body=gyro,
+            chain=chain,
+            world_from_start=world_from_start,
+            spread=spread,
+            world_from_body=world_from_body,
+            accel_world=world_accel,
+            velocity_world=velocity,
+            position_world=position,
+            gravity=gravity,
+            reach=low_pass_reach(usual) if reach is None else reach,
+            usual=usual,
+        )
+
+    def turned_at(self, wanted: Array) -> Array:
+        """Return ``body(0)_from_body`` at times (m,) in any order, quaternions (4, m)."""
+        near = self._near(np.array([np.min(wanted), np.max(wanted)]))
+        return turn_at(self.chain[:, near], self.time[near], self.gyro_body[near], wanted)
+
+    def at(self, wanted: Array, turned: Array | None = None) -> Trajectory:
+        """Return the motion at any times.
+
+        Parameters
+        ----------
+        wanted : ndarray, shape (m,)
+            Strictly increasing (s).
+        turned : ndarray, shape (4, m), optional
+            As of `turned_at`, where it is known.
+
+        Returns
+        -------
+        Trajectory
+            Pose and velocity.
+        """
+        near, known = self._near(wanted), self.states.time
+        path = self.time[near], self.position_world[near], self.velocity_world[near]
+        position, velocity = hermite(*path, wanted)
+        inside = np.minimum(np.maximum(wanted, known[0]), known[-1])
+        lack, slope = hermite(known, *self._lack, inside)
+        return Trajectory(
+            time=wanted,
+            world_from_body=self._attitude(wanted, turned),
+            position_world=position + lack + slope * (wanted - inside)[:, None],
+            velocity_world=velocity + slope,
+        )
+
+    def changing_at(
+        self, wanted: Array, turned: Array | None = None
+    ) -> tuple[Trajectory, tuple[Array, Array]]:
+        """Return the motion at any times as `at`, and its derivative by the IMU's time offset.
+
+        The states stay where they are.  The stream's shape comes later by it: everywhere the body
+        has yet to turn and to move as much as it does in that time, less what it has at the states.
+        Rate and specific force are averaged (`low_passed`): white noise in a derivative would pass
+        for information.
+
+        Returns
+        -------
+        Trajectory
+            Pose and velocity.
+        tuple of ndarray, shape (m, 3)
+            Rotation (rad/s) and position (m/s), world axes.
+        """
+        near, known, late = self._near(wanted), self.states.time, self._by_offset
+        own, (place, speed) = self.time[near], self._with_change
+        position, velocity = hermite(own, place[near], speed[near], wanted)
+        inside = np.minimum(np.maximum(wanted, known[0]), known[-1])
+        lack, slope = hermite(known, *self._lack_with_change, inside)
+        position += lack + slope * (wanted - inside)[:, None]
+        motion = Trajectory(
+            time=wanted,
+            world_from_body=self._attitude(wanted, turned),
+            position_world=position[:, :3],
+            velocity_world=velocity[:, :3] + slope[:, :3],
+        )
+        by_rotation = interpolated(wanted, known, late.rate_at_states)
+        by_rotation -= interpolated(wanted, own, late.rate[near])
+        return motion, (by_rotation, position[:, 3:])
+
+    def _attitude(self, wanted: Array, turned: Array | None) -> Array:
+        turned = self.turned_at(wanted) if turned is None else turned
+        start = _turn_at(self.states.time, self.world_from_start, self.spread, wanted)
+        return matrices(unit(product(start, turned)))
+
+    def _near(self, wanted: Array) -> slice:
+        """Return the inertial samples that tell of some times, with a few about them."""
+        first, last = np.searchsorted(self.time, wanted[[0, -1]])
+        return slice(max(min(first, len(self.time)) - MARGIN, 0), last + MARGIN)
+
+    @cached_property
+    def _lack(self) -> tuple[Array, Array]:
+        """What the integrated position and velocity lack at the states, shape (states, 3)."""
+        states = self.states
+        assert states.velocity_world is not None
+        path = self.time, self.position_world, self.velocity_world
+        position, velocity = hermite(*path, states.time)
+        return states.position_world - position, states.velocity_world - velocity
+
+    @cached_property
+    def _with_change(self) -> tuple[Array, Array]:
+        """Position and velocity, and what the time offset changes of them, shape (n, 6)."""
+        late = self._by_offset
+        return (
+            np.concatenate([self.position_world, late.position], axis=1),
+            np.concatenate([self.velocity_world, late.velocity], axis=1),
+        )
+
+    @cached_property
+    def _lack_with_change(self) -> tuple[Array, Array]:
+        """As `_lack`, and the changes that the states hold back, shape (states, 6)."""
+        states = self.states
+        assert states.velocity_world is not None
+        place, speed = hermite(self.time, *self._with_change, states.time)
+        place, speed = -place, -speed
+        place[:, :3] += states.position_world
+        speed[:, :3] += states.velocity_world
+        return place, speed
+
+    @cached_property
+    def _by_offset(self) -> "_ByOffset":
+        known = self.states.time
+        rate, tilted = self._averaged(self.gyro_body), np.empty_like(self.accel_world)
+        for rows in _pieces(len(rate)):
+            rate[rows] = turned(self.world_from_body[:, rows], rate[rows].T).T
+        at_states = interpolated(known, self.time, rate)
+        # What the states hold back of the turn tilts the specific force.
+        for rows in _pieces(len(rate)):
+            force = self.accel_world[rows] + np.array([0.0, 0.0, self.gravity])
+            held = interpolated(self.time[rows], known, at_states)
+            tilted[rows] = cross(held.T, force.T).T
+        speed, moved = _integrated(self.time, tilted)
+        del tilted
+        moved -= self.velocity_world
+        speed -= self.accel_world
+        position = self._averaged(moved)
+        del moved
+        # Beside a gap, and at the ends, a mean is of another time: what has been gathered of speed
+        # since the beginning must not matter there.
+        since = self.time - self.time[0]
+        late = self._averaged(since) - since
+        uneven = np.flatnonzero(np.abs(late) > 0.5 * self.usual)
+        position[uneven] -= late[uneven, None] * speed[uneven]
+        velocity = self._averaged(speed)
+        del speed
+        return _ByOffset(rate, at_states, position, velocity)
+
+    def _averaged(self, values: Array) -> Array:
+        return uniform_filter1d(values, 2 * self.reach + 1, axis=0, mode="nearest")
+
+
+def motion_at(
+    states: Trajectory, imu: ImuSamples, time_offset: float, gravity: float, wanted: Array
+) -> Trajectory:
+    """Return the motion at any times: the IMU's shape between the states, through the states.
+
+    Parameters
+    ----------
+    states : Trajectory
+        With velocity and biases, at the field epochs.
+    time_offset : float
+        (s)
+    gravity : float
+        (m/s^2)
+    wanted : ndarray, shape (m,)
+        Strictly increasing (s).
+
+    Returns
+    -------
+    Trajectory
+        Pose and velocity at ``wanted``.
+    """
+    return MotionShape.of(states, imu, time_offset, gravity).at(wanted)
+
+
+def _integrated(time: Array, rate: Array) -> tuple[Array, Array]:
+    """Return the integral of samples (n, 3) that are linear in between, and its integral."""
+    once, twice = np.zeros((2, *rate.shape))
+    for rows in _pieces(len(time) - 1):
+        later = slice(rows.start + 1, rows.stop + 1)
+        before, after = rate[rows], rate[later]
+        step = (time[later] - time[rows])[:, None]
+        gained = 0.5 * (before + after) * step
+        gained[0] += once[rows.start]
+        np.cumsum(gained, axis=0, out=once[later])
+        gained = once[rows] * step + (2.0 * before + after) * step**2 / 6.0
+        gained[0] += twice[rows.start]
+        np.cumsum(gained, axis=0, out=twice[later])
+    return once, twice
+
+
+def _pieces(count: int) -> Iterator[slice]:
+    """Yield rows, as many at once as stay in the cache."""
+    for begin in range(0, count, AT_ONCE):
+        yield slice(begin, min(begin + AT_ONCE, count))
+
+
+def _between(turn: Array) -> Array:
+    """Return the vectors of the turns between neighbours, (4, states) to (3, states - 1) (rad)."""
+    between = product(inverse(turn[:, :-1]), turn[:, 1:])
+    if not between.shape[1]:
+        return np.zeros((3, 0))
+    return vectors(between)
+
+
+def _turn_at(known: Array, turn: Array, between: Array, wanted: Array) -> Array:
+    """Interpolate slowly varying rotations along great circles, holding the ends.
+
+    Of shape (4, states) to shape (4, m), scalar first; ``between`` as of `_between`.
+    """
+    if len(known) == 1:
+        return np.repeat(turn, len(wanted), axis=1)
+    inside = np.minimum(np.maximum(wanted, known[0]), known[-1])
+    if len(known) == 2:
+        share = (inside - known[0]) / (known[1] - known[0])
+        return product(turn[:, :1], of_vectors(share * between))
+    index = np.searchsorted(known, inside, side="right") - 1
+    index = np.minimum(np.maximum(index, 0), len(known) - 2)
+    share = (inside - known[index]) / (known[1:] - known[:-1])[index]
+    return product(turn[:, index], of_vectors(share * between[:, index]))

@@ -1,0 +1,123 @@
+"""The motion along a log, a stretch of samples at a time: of a long one the whole is several logs.
+
+A stretch has the states and inertial samples about it that the motion within hangs on: the shape
+between two states knows nothing of those farther away, but for the averages near them.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.estimation.demodulation.motion_shape import MARGIN, MotionShape
+from magfusion.estimation.graph.preintegration import low_pass_reach
+from magfusion.model.samples import ImuSamples
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array
+
+STRETCH = 1 << 17  # samples; a multiple of those that are predicted at once
+
+
+class Stretch(NamedTuple):
+    """Samples in a row.
+
+    Parameters
+    ----------
+    first, last : int
+        Of the samples, and the one that follows them.
+    since, until : float
+        Times that are nearest to them (s).
+    shape : MotionShape
+        The motion there.
+    """
+
+    first: int
+    last: int
+    since: float
+    until: float
+    shape: MotionShape
+
+    def pieces(self, at_once: int) -> Iterator[slice]:
+        """Yield the samples, so many at once."""
+        for begin in range(self.first, self.last, at_once):
+            yield slice(begin, min(begin + at_once, self.last))
+
+    def at_others(self, wanted: Array) -> Trajectory:
+        """Return the motion at those of some times (s) that belong to the stretch."""
+        own = wanted[(self.since <= wanted) & (wanted < self.until)]
+        if not len(own):
+            return Trajectory(own, np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros((0, 3)))
+        return self.shape.at(own)
+
+
+def only_stretch(time: Array, shape: MotionShape) -> Iterator[Stretch]:
+    """Yield samples (n,) (s) of which one shape tells the motion."""
+    yield Stretch(0, len(time), -np.inf, np.inf, shape)
+
+
+def stretches(
+    time: Array, path: Trajectory, imu: ImuSamples, time_offset: float, gravity: float
+) -> Iterator[Stretch]:
+    """Yield all samples, a stretch of them after the other.
+
+    Parameters
+    ----------
+    time : ndarray, shape (n,)
+        Of the samples, strictly increasing (s).
+    path : Trajectory
+        States between which the motion is interpolated.
+    time_offset : float
+        Of the IMU (s).
+    gravity : float
+        (m/s^2)
+    """
+    if len(time) <= STRETCH:
+        yield from only_stretch(time, MotionShape.of(path, imu, time_offset, gravity))
+        return
+    reach, stamps = low_pass_reach(_usual(imu)), imu.time + time_offset
+    margin = 2 * reach + 2 * MARGIN  # what is averaged is averaged again
+    for first in range(0, len(time), STRETCH):
+        last = min(first + STRETCH, len(time))
+        states, samples = _about(time[first:last], path.time, stamps, margin)
+        here = {k: v[states] for k, v in vars(path).items() if v is not None}
+        own = ImuSamples(imu.time[samples], imu.gyro_body[samples], imu.accel_body[samples])
+        shape = MotionShape.of(Trajectory(**here), own, time_offset, gravity, reach)
+        since = float(time[first]) if first > 0 else -np.inf
+        until = float(time[last]) if last < len(time) else np.inf
+        yield Stretch(first, last, since, until, shape)
+
+
+def joined(parts: list[Trajectory]) -> Trajectory:
+    """Return trajectories that follow each other as one."""
+    if len(parts) == 1:
+        return parts[0]
+    known = (name for name, value in vars(parts[0]).items() if value is not None)
+    return Trajectory(**{k: np.concatenate([getattr(p, k) for p in parts]) for k in known})
+
+
+def _usual(imu: ImuSamples) -> float:
+    return float(np.median(np.diff(imu.time)))
+
+
+def _about(time: Array, known: Array, stamps: Array, margin: int) -> tuple[slice, slice]:
+    """Return the states and the inertial samples that the motion in a stretch hangs on."""
+    first = int(np.searchsorted(known, time[0], side="right")) - 1
+    last = int(np.searchsorted(known, time[-1]))
+    begin = end = None  # all that there is, where the stretch is at an end of the log
+    if first > 0:
+        sample = int(np.searchsorted(stamps, known[first])) - margin
+        before = int(np.searchsorted(known, stamps[max(sample, 0)], side="right")) - 2
+        if sample > 0 and before > 0:
+            begin = before
+    if last < len(known) - 1:
+        sample = int(np.searchsorted(stamps, known[last])) + margin
+        after = int(np.searchsorted(known, stamps[min(sample, len(stamps) - 1)])) + 1
+        if sample < len(stamps) and after < len(known) - 1:
+            end = after
+    from_sample = None if begin is None else max(_at(stamps, known[begin]) - MARGIN, 0)
+    to_sample = None if end is None else _at(stamps, known[end]) + MARGIN
+    return slice(begin, None if end is None else end + 1), slice(from_sample, to_sample)
+
+
+def _at(stamps: Array, time: float) -> int:
+    return int(np.searchsorted(stamps, time))

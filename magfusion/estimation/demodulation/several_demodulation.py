@@ -1,0 +1,127 @@
+"""The phasors of several magnetometers' samples, each of which can be demodulated anew."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.demodulation.demodulated_apart import each_alone
+from magfusion.estimation.demodulation.demodulation import Demodulation, demodulated
+from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
+from magfusion.files.fields import SAME_TIME, side_by_side
+from magfusion.model.parameters import Calibration, seen_by
+from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.receiver.receivers import usual_lockin
+from magfusion.receiver.slots import has_schedule
+from magfusion.receiver.windows import LockinSettings
+from magfusion.units import BoolArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What one of several magnetometers recorded.
+
+    Parameters
+    ----------
+    sensor : int
+        Which of the platform's.
+    rows : int ndarray, shape (n,)
+        The epochs at which its phasors are.
+    demodulation : Demodulation
+        As if it were alone, by the log's clock.
+    """
+
+    sensor: int
+    rows: IntArray
+    demodulation: Demodulation
+
+
+@dataclass(frozen=True, eq=False)
+class SeveralDemodulation(Demodulation):
+    """The phasors of several magnetometers, by windows at the same times.
+
+    Parameters
+    ----------
+    parts : tuple of Part
+        Of those that have samples.
+    """
+
+    parts: tuple[Part, ...] = ()
+
+    @property
+    def anew(self) -> bool:
+        """Whether there are samples to demodulate again, once the motion is known."""
+        return True
+
+    def compensated(
+        self,
+        calibration: Calibration,
+        states: Trajectory,
+        path: Trajectory | None = None,  # noqa: ARG002
+    ) -> MotionCompensated:
+        """Return the phasors with the motion inside the windows taken off, of each by its own."""
+        fields = self.fields
+        phasor = np.full_like(fields.phasor_sensor, np.nan)
+        cov = np.full_like(fields.phasor_cov, np.nan)
+        by_offset = np.zeros_like(phasor)
+        for part in self.parts:
+            log = replace(part.demodulation.log, imu=self.log.imu)
+            here = {k: v[part.rows] for k, v in vars(states).items() if v is not None}
+            known = replace(part.demodulation, log=log)
+            found = known.compensated(seen_by(calibration, part.sensor), Trajectory(**here))
+            own = part.rows, calibration.site.of_sensor(part.sensor)
+            phasor[own], cov[own] = found.fields.phasor_sensor, found.fields.phasor_cov
+            by_offset[own] = found.by_time_offset
+        wave = MotionCompensated.of_slots(replace(fields, phasor_sensor=phasor, phasor_cov=cov))
+        return replace(wave, by_time_offset=by_offset)
+
+
+def same_windows(site: Site, settings: LockinSettings | None) -> LockinSettings | None:
+    """Return how each of several magnetometers is demodulated: at the same times of the log's."""
+    if has_schedule(site):
+        return settings
+    return replace(usual_lockin(site) if settings is None else settings, origin=0.0)
+
+
+def demodulated_several(
+    log: Log, site: Site, settings: LockinSettings | None = None
+) -> SeveralDemodulation:
+    """Return the phasors of a log with samples of several magnetometers.
+
+    Raises
+    ------
+    InputError
+        As `magfusion.estimation.demodulation.demodulation.demodulated`, of one that it names.
+    """
+    lockin = same_windows(site, settings)
+    sensors = [sensor.name for sensor in site.platform.magnetometers]
+    found = {sensors.index(name): one for name, one in _each(log, site, lockin)}
+    none = FieldSamples.empty(site.channels[: len(site.channels) // len(sensors)])
+    every = [found[k].fields if k in found else none for k in range(len(sensors))]
+    fields = side_by_side(every, site)
+    hidden: BoolArray = np.zeros(fields.valid.shape, dtype=bool)
+    parts = []
+    for sensor, one in found.items():
+        rows = np.searchsorted(fields.time, one.fields.time - SAME_TIME)
+        parts.append(Part(sensor, rows, one))
+        if one.drowned is not None:
+            hidden[rows, site.of_sensor(sensor)] = one.drowned
+    dropped = {
+        f"{sensors[sensor]}: {reason}": count
+        for sensor, one in found.items()
+        for reason, count in one.dropped.items()
+    }
+    return SeveralDemodulation(log, fields, dropped, drowned=hidden, parts=tuple(parts))
+
+
+def _each(
+    log: Log, site: Site, lockin: LockinSettings | None
+) -> Iterator[tuple[str, Demodulation]]:
+    for name, own, alone in each_alone(log, site):
+        try:
+            yield name, demodulated(own, alone, lockin)
+        except InputError as error:
+            raise InputError(f"magnetometer {name}: {error}") from error

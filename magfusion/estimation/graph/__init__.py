@@ -1,0 +1,1 @@
+"""The factor graph: states, factors, and the inertial data between epochs."""

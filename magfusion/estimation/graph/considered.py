@@ -1,0 +1,69 @@
+"""What parameters that are held do to everything that a graph estimates."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from magfusion.estimation.graph.factors import CONSIDERED_KEY
+from magfusion.estimation.graph.graph import Estimate, Graph
+from magfusion.estimation.graph.prior_factor import prior_factor
+from magfusion.estimation.solve.bordered import eliminate_partial
+from magfusion.model.parameters import Block
+from magfusion.model.prior import prior_sqrt_covariance
+from magfusion.units import Array
+
+AT_ONCE = 2e8  # bytes; parameters that are held are taken in groups of so much
+PER_COLUMN = 400.0  # bytes that one of them takes of each state, in the graph and eliminated
+
+
+def responses(
+    graph: Graph, estimate: Estimate, considered: tuple[Block, ...]
+) -> Iterator[gtsam.VectorValues]:
+    """Yield the step of every variable that considered parameters cause.
+
+    One for each column of their prior's spread: one sigma of each where they are independent.
+    They are left over when all else is eliminated, so that one elimination serves them all, or of
+    a long log as many as fit in memory.
+    """
+    assert graph.declared is not None
+    spread, shift = prior_sqrt_covariance(graph.declared.site, considered), None
+    if graph.shift is not None:
+        spread, shift = graph.shift.beside(spread)
+    group = max(1, int(AT_ONCE / (PER_COLUMN * graph.epochs)))
+    for first in range(0, spread.shape[1], group):
+        columns = slice(first, first + group)
+        moved = None if shift is None else shift[:, columns]
+        conditional = _conditional(graph, estimate, considered, spread[:, columns], moved)
+        yield from steps_of_others(conditional, spread[:, columns].shape[1])
+
+
+def _conditional(
+    graph: Graph,
+    estimate: Estimate,
+    considered: tuple[Block, ...],
+    spread: Array,
+    shift: Array | None,
+) -> gtsam.GaussianBayesNet:
+    """Return everything that is estimated, given columns of what is considered."""
+    assert graph.declared is not None
+    linear = replace(graph, declared=None).beside(
+        estimate, considered, spread, graph.by_considered(spread)
+    )
+    if graph.blocks:
+        linear.push_back(prior_factor(graph.declared, graph.declared, graph.blocks, shift))
+    return eliminate_partial(linear, graph.ordering)[0]
+
+
+def steps_of_others(
+    conditional: gtsam.GaussianBayesNet, count: int
+) -> Iterator[gtsam.VectorValues]:
+    """Yield the step of every variable that a unit of each parameter that is held causes.
+
+    One at a time: of a long log all of them are as much as the log.
+    """
+    for one in np.eye(count):
+        given = gtsam.VectorValues()
+        given.insert(CONSIDERED_KEY, one)
+        yield conditional.optimize(given)

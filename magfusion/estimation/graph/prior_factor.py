@@ -1,0 +1,63 @@
+"""The prior of a calibration as a linear factor, and what moves its mean."""
+
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from magfusion.estimation.graph.factors import CALIBRATION_KEY, CONSIDERED_KEY
+from magfusion.model.parameters import Block, Calibration, difference
+from magfusion.model.prior import prior_sqrt_information
+from magfusion.units import Array
+
+
+class PriorShift(NamedTuple):
+    """What is uncertain beside a calibration does to the mean of a prior that other logs made.
+
+    Parameters
+    ----------
+    by_considered : ndarray, shape (dimension, considered)
+        What one sigma of each considered parameter does to it.
+    apart : ndarray, shape (dimension, k)
+        What a unit of each of ``k`` errors does to it that this log has no part in.
+    """
+
+    by_considered: Array
+    apart: Array
+
+    def beside(self, spread: Array) -> tuple[Array, Array]:
+        """Return a spread with columns for the errors apart, and the shift in the same columns.
+
+        Parameters
+        ----------
+        spread : ndarray, shape (uncertain, n)
+            Of the considered parameters first.
+        """
+        between = spread.shape[1] - self.by_considered.shape[1]
+        wider = np.pad(spread, ((0, 0), (0, self.apart.shape[1])))
+        nothing = np.zeros((len(self.apart), between))
+        return wider, np.concatenate([self.by_considered, nothing, self.apart], axis=1)
+
+
+def prior_factor(
+    declared: Calibration,
+    calibration: Calibration,
+    blocks: tuple[Block, ...],
+    shift: Array | None = None,
+) -> gtsam.JacobianFactor:
+    """Return the prior at a calibration.
+
+    Parameters
+    ----------
+    shift : ndarray, shape (dimension, n), optional
+        What a unit of each held parameter does to its mean.
+    """
+    sqrt_information = prior_sqrt_information(declared.site, blocks)
+    error = -sqrt_information @ difference(declared, calibration, blocks)
+    unit = gtsam.noiseModel.Unit.Create(len(sqrt_information))
+    if shift is None:
+        return gtsam.JacobianFactor(CALIBRATION_KEY, sqrt_information, error, unit)
+    by_others = -sqrt_information @ shift
+    return gtsam.JacobianFactor(
+        CALIBRATION_KEY, sqrt_information, CONSIDERED_KEY, by_others, error, unit
+    )

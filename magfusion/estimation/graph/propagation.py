@@ -1,0 +1,144 @@
+"""From one field epoch to the next by the inertial stream: mean, transition and noise."""
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from magfusion.estimation.graph.imu_decimation import thinned
+from magfusion.estimation.graph.inertial import (
+    Link,
+    Preintegrated,
+    Steps,
+    inertial_factor,
+    links_between,
+)
+from magfusion.estimation.graph.preintegration import cut_at_epochs
+from magfusion.estimation.graph.process_noise import ProcessNoise
+from magfusion.estimation.graph.state import MOTION, State, values_from
+from magfusion.model.altered import altered
+from magfusion.model.parameters import Block, Calibration, corrected_imu
+from magfusion.model.samples import ImuSamples
+from magfusion.model.site import Site
+from magfusion.units import Array
+
+# Columns of GTSAM's factor, by key: x0 v0 x1 v1 b0 b1.
+_BEFORE = np.r_[0:6, 6:9, 18:24]
+_AFTER = np.r_[9:15, 15:18, 24:30]
+
+
+@dataclass(frozen=True, eq=False)
+class Propagated:
+    """Where the inertial stream leads.
+
+    Parameters
+    ----------
+    state : State
+        At the later time, its covariance carried on.
+    bridged : bool
+        Whether the stream had a gap.
+    transition, noise : ndarray, shape (15 + calibration, 15 + calibration)
+        Of the state's tangent.
+    """
+
+    state: State
+    link: Link
+    bridged: bool
+    transition: Array
+    noise: Array
+
+
+def propagate(
+    state: State,
+    imu: ImuSamples,
+    time: float,
+    site: Site,
+    time_offset: float,
+    process_noise: ProcessNoise | None = None,
+    usual: float | None = None,
+    blocks: tuple[Block, ...] = (),
+    *,
+    blind: bool = False,
+) -> Propagated:
+    """Carry a state on to a later time.
+
+    Transition and noise are those of the graph's own inertial factor, so that a filter built on
+    this and the graph agree to round-off.
+
+    Parameters
+    ----------
+    imu : ImuSamples
+        Covering the interval; where it does not, its end values are extended.
+    time : float
+        (s)
+    site : Site
+        Its IMU's noise and its gravity.
+    time_offset : float
+        Added to the IMU's stamps (s).
+    process_noise : ProcessNoise, optional
+        Of the calibration.
+    usual : float, optional
+        Sampling interval of the IMU (s), as in `cut_at_epochs`.
+    blocks : tuple of Block
+        Calibration parameters in the state's tangent.
+    blind : bool
+        Whether samples stand in for inertial ones: they have the noise of a gap.
+    """
+    epochs = np.array([state.time, time])
+    accel, gyro = state.accel_bias_body, state.gyro_bias_body
+    bias = gtsam.imuBias.ConstantBias(accel, gyro)
+    before = gtsam.NavState(state.pose, state.velocity_world)
+
+    def steps(calibration: Calibration) -> Steps:
+        stream = corrected_imu(calibration, blocks, imu)
+        increments = cut_at_epochs(stream, time_offset, epochs, usual)
+        if blind:
+            increments = replace(increments, bridged=np.ones_like(increments.bridged))
+        return Steps(thinned(increments, accel[None], gyro[None]), accel, gyro)
+
+    def predicted(measurement: Preintegrated) -> gtsam.NavState:
+        return measurement.predict(before, bias)
+
+    def values(after: gtsam.NavState) -> gtsam.Values:
+        both = before, after
+        velocities = [at.velocity() for at in both]
+        return values_from([at.pose() for at in both], velocities, [bias.vector()] * 2)
+
+    own = steps(state.calibration)
+    (link,) = links_between(
+        lambda calibration: [
+            (own if calibration is state.calibration else steps(calibration)).preintegrated(site)
+        ],
+        state.calibration,
+        blocks,
+        lambda found: values(predicted(found[0])),
+    )
+    after = predicted(link.measurement)
+    factor = inertial_factor(0, link.measurement)
+    rows, _ = factor.linearize(values(after)).jacobian()
+    root = np.linalg.inv(rows[:, _AFTER])
+    transition = np.eye(len(state.cov))
+    transition[:MOTION, :MOTION] = -root @ rows[:, _BEFORE]
+    if link.by_calibration is not None:
+        transition[:MOTION, MOTION:] = -root @ link.by_calibration
+    noise = np.zeros_like(state.cov)
+    noise[:MOTION, :MOTION] = root @ root.T
+    if process_noise is not None:
+        noise[MOTION:, MOTION:] = process_noise.cov(state.calibration, time, time - state.time)
+    cov, motion = state.cov.copy(), transition[:MOTION]
+    across = motion @ state.cov
+    cov[:MOTION, :MOTION] = across @ motion.T
+    cov[:MOTION, MOTION:], cov[MOTION:, :MOTION] = across[:, MOTION:], across[:, MOTION:].T
+    cov += noise
+    pose = after.pose()
+    later = altered(
+        state,
+        time=time,
+        pose=pose,
+        world_from_body=pose.rotation().matrix(),
+        position_world=np.asarray(pose.translation()),
+        velocity_world=np.asarray(after.velocity()),
+        cov=cov,
+    )
+    bridged = bool(own.increments.bridged[0])
+    return Propagated(later, altered(link, steps=own), bridged, transition, noise)

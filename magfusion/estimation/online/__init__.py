@@ -1,0 +1,1 @@
+"""Estimation as data arrive: navigator, Kalman filter, fixed-lag smoother."""

@@ -1,0 +1,80 @@
+"""Corrections that enter smoothly: what the output is still away from the corrected estimate."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.estimation.graph.state import POSITION, ROTATION, VELOCITY, State
+from magfusion.model.rotation import rotations_of, vectors_of
+from magfusion.units import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Offset:
+    """A correction that has not entered altogether.
+
+    Parameters
+    ----------
+    time : float
+        When it came (s).
+    step : ndarray, shape (9,)
+        From the corrected state to what was told before, world axes: rotation (on the left),
+        position, velocity.
+    """
+
+    time: float
+    step: Array
+
+
+class Blend:
+    """Corrections, each of which enters within so long (s), at first and at last slowly."""
+
+    _offsets: list[Offset]
+
+    def __init__(self, length: float) -> None:
+        self.length, self._offsets = length, []
+
+    def forget(self) -> None:
+        """Let all that was told before be of no more account."""
+        self._offsets = []
+
+    def take(self, told: State, corrected: State) -> None:
+        """Go on from what was told to a corrected state of the same time."""
+        turn = told.world_from_body @ corrected.world_from_body.T
+        step = np.concatenate(
+            [
+                vectors_of(turn),
+                told.position_world - corrected.position_world,
+                told.velocity_world - corrected.velocity_world,
+            ]
+        )
+        kept = [one for one in self._offsets if told.time - one.time < self.length]
+        left = sum((self._left(one, told.time) for one in kept), np.zeros(9))
+        self._offsets = [*kept, Offset(told.time, step - left)]
+
+    def _left(self, one: Offset, time: float) -> Array:
+        share = min(max((time - one.time) / self.length, 0.0), 1.0)
+        return one.step * (1.0 - share**2 * (3.0 - 2.0 * share))
+
+    def remaining(self, time: float) -> Array:
+        """Return what is left at a time (s) of all corrections, shape (9,)."""
+        return sum((self._left(one, time) for one in self._offsets), np.zeros(9))
+
+    def told(self, state: State) -> tuple[State, Array]:
+        """Return a corrected state as it is told, with a covariance for what is left; and that."""
+        step = self.remaining(state.time)
+        if not np.any(step):
+            return state, step
+        world_from_body = rotations_of(step[:3]) @ state.world_from_body
+        body = step.copy()
+        body[ROTATION], body[POSITION] = world_from_body.T @ step[:3], world_from_body.T @ step[3:6]
+        cov = state.cov.copy()
+        cov[:9, :9] += np.outer(body, body)
+        moved = replace(
+            state,
+            world_from_body=world_from_body,
+            position_world=state.position_world + step[POSITION],
+            velocity_world=state.velocity_world + step[VELOCITY],
+            cov=cov,
+        )
+        return moved, step

@@ -1,0 +1,382 @@
+"""What one epoch does to a running estimate: gate, update, being lost, and what is said of it."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.errors import EstimationError
+from magfusion.estimation.graph.measurement import Measurement
+from magfusion.estimation.graph.propagation import Propagated
+from magfusion.estimation.graph.state import POSITION, ROTATION, State
+from magfusion.estimation.initialization.online import OnlineStart
+from magfusion.estimation.integrity.place_witness import of_place
+from magfusion.estimation.measurements.earth import EarthField, EarthWeight, speed_sigma
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
+from magfusion.estimation.measurements.linearization import is_curved, relinearized
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.measurements.zero_velocity import zero_velocity
+from magfusion.estimation.online.ekf import ErrorStateFilter
+from magfusion.estimation.online.fixed_lag import SlidingWindow
+from magfusion.estimation.online.input_queue import Arrivals
+from magfusion.estimation.online.measured import Measured
+from magfusion.estimation.online_integrity.bank import SubsetBank
+from magfusion.estimation.online_integrity.gate import Gate
+from magfusion.estimation.online_integrity.judgement import Judgement
+from magfusion.estimation.online_integrity.magnetometer_watch import MagnetometerWatch
+from magfusion.estimation.online_integrity.near_metal import NearMetal
+from magfusion.estimation.online_integrity.online import Heard, OnlineWitness
+from magfusion.estimation.online_integrity.open_roll import roll_findings
+from magfusion.estimation.online_integrity.reckoned import Reckoned
+from magfusion.estimation.online_integrity.recovery import (
+    AgreedFix,
+    Attempts,
+    agreed_fix,
+    at_fix,
+    corroborated,
+    explains,
+    prior_of,
+    restarted,
+)
+from magfusion.estimation.online_integrity.score_online import OnlineScore
+from magfusion.model.parameters import Block
+from magfusion.model.rotation import vectors_of
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding
+from magfusion.units import Array, BoolArray
+
+WIDE_POSITION, WIDE_ROTATION = 0.3, 0.2  # m, rad; beyond, the prediction is no place to linearise
+LOST_POSITION = 10.0  # m; a prediction wider than this is worth nothing
+NOW = np.zeros(1, dtype=np.int64)  # the one epoch of a measurement
+AS_LIKELY = 20.0  # difference of chi square to the best hypothesis
+COMPARED_EVERY, COMPARED_EPOCHS = 30.0, 150  # s, epochs; between fixes that nothing asked for
+
+Estimator = SlidingWindow | ErrorStateFilter
+
+
+class EpochUpdate:
+    """Takes in epochs, one after the other.
+
+    Parameters
+    ----------
+    estimated, blocks : tuple of Block
+        Calibration parameters that are estimated, and all in the states' tangent.
+    earth : bool
+        Whether the steady field is a measurement.
+    bank : SubsetBank, optional
+        Filters without each beacon; without it there are no protection levels.
+    """
+
+    gate: Gate
+    witness: OnlineWitness
+    score: OnlineScore
+    metal: NearMetal
+    _reckoned: Reckoned
+    _attempts: Attempts
+    _pointing: Attempts
+    _earth: EarthWeight | None
+    bank: SubsetBank | None
+    _compared_at: float
+    _since_compared: int
+
+    def __init__(
+        self,
+        site: Site,
+        estimated: tuple[Block, ...],
+        blocks: tuple[Block, ...],
+        earth: bool,
+        bank: SubsetBank | None = None,
+    ) -> None:
+        self.site, self.blocks, self.bank = site, blocks, bank
+        self.gate = Gate(site.channels, blocks, MagnetometerWatch(site))
+        self.of_currents: tuple[Finding, ...] = ()
+        self._roll = roll_findings(site)
+        self.metal, self._reckoned = NearMetal(site, blocks), Reckoned(blocks)
+        self.witness = OnlineWitness(site, estimated)
+        self.score = OnlineScore(site, estimated, blocks[len(estimated) :], steady=earth)
+        self._attempts, self._pointing = Attempts(), Attempts()
+        self._earth = EarthWeight(blocks) if earth else None
+        self._compared_at, self._since_compared = -np.inf, COMPARED_EPOCHS
+
+    def begin(self, start: OnlineStart) -> Judgement:
+        """Judge a first state."""
+        said = Judgement(start.trust.reasons, turn=start.turn, shift=start.shift)
+        self.gate.watch.begin(start.excluded, start.said)
+        self.witness.begin(start.state.time, said, start.borrowed)
+        self.score.begin(start.score, start.state.time)
+        fitted = [f for f in start.trust.remarks if f.code == "fitted_line" and start.beside]
+        return self._judged(start.state, None).beside(*fitted)
+
+    def take_in(
+        self,
+        estimator: Estimator,
+        arrived: Arrivals,
+        predicted: Propagated,
+        samples: FieldSamples | None,
+    ) -> Judgement:
+        """Go on to a prediction, take in what was measured there, and judge the state.
+
+        Parameters
+        ----------
+        samples : FieldSamples, optional
+            Of this epoch; None where there may be a window of it.
+        """
+        before, state = estimator.state, predicted.state
+        if predicted.bridged:
+            self.gate.counts["inertial gap bridged"] += 1
+        step = max(state.time - arrived.last_epoch, 1e-6)
+        earth, standing = self._earth is not None, arrived.rests(state)
+        lost = self._lost(state)
+        found = arrived.measured(
+            before, state, samples, step, earth=earth, standing=standing, lost=lost
+        )
+        measurements: list[Measurement] = arrived.others_at(state.time)
+        if standing:
+            measurements.append(zero_velocity(NOW, self.site.platform.motion.rest_speed_sigma))
+        point = None
+        if found is None or not np.any(found.samples.valid):
+            self.gate.nothing_measured()
+        else:
+            if lost and found.apart and self._found_again(estimator, found, predicted):
+                return self._judged(estimator.state, None)
+            found, point, refused = self._linearization_point(found, state)
+            explained, valid = state if point is None else point, found.samples.valid[0]
+            phasors = self._weighed_phasors(found, explained, asked=point is None)
+            if self.metal.comes:
+                return self._without_the_last(estimator, predicted)
+            phasors = self.gate.passed(phasors, explained, valid, refused)
+            found = replace(found, phasors=phasors)
+            if self.gate.lost and found.apart and self._found_again(estimator, found, predicted):
+                return self._judged(estimator.state, None)
+        if found is not None:
+            known = state if point is None else replace(point, cov=state.cov)
+            measurements += self._of_fields(found, known, step)
+        self._ask(arrived, before, predicted, measurements, point)
+        linear = predicted if point is None else None
+        try:
+            estimator.absorb(predicted, measurements, point)
+        except EstimationError:
+            self.gate.counts["update failed"] += 1
+            self.gate.refused_in_a_row += 1
+            self.witness.uncertain("update_failed", state.time)
+            self.score.end()
+            estimator.replace_state(state)
+            linear = None
+        self._separate(linear, measurements, estimator.state)
+        self._hear(before, predicted, estimator.state, found)
+        if found is not None and found.apart:
+            self._compare(found.samples, estimator.state)
+        judged = self._judged(estimator.state, self._lost_since(estimator.state))
+        return judged if found is None else replace(judged, heard=found.heard)
+
+    def _without_the_last(self, estimator: Estimator, predicted: Propagated) -> Judgement:
+        """Go on with a prediction that holds nothing of what came while it was not noticed."""
+        estimator.replace_state(self._reckoned.taken_back(predicted))
+        self._reckoned.forget()
+        self.score.end()
+        return self._judged(estimator.state, self._lost_since(estimator.state))
+
+    # What was measured
+
+    def _weighed_phasors(
+        self, found: Measured, explained: State, *, asked: bool
+    ) -> FieldPhasors | JointPhasors:
+        """Weigh phasors by what is near; of those that the score asks of, all is predicted once."""
+        if isinstance(found.phasors, JointPhasors):  # of two beacons or more
+            return found.phasors
+        if asked:
+            self.score.foresee(found.phasors, explained)
+        return self.metal.weighed(found.phasors, explained, found.samples.valid[0])
+
+    def _of_fields(self, found: Measured, known: State, step: float) -> list[Measurement]:
+        measurements: list[Measurement] = [found.phasors]
+        if found.earth is not None:
+            measurements.append(self._weighed(found.earth, known))
+            if isinstance(found.phasors, FieldPhasors) and not np.any(
+                found.phasors.sqrt_information
+            ):
+                sigma = speed_sigma(step, self.site.platform.motion)
+                measurements.append(zero_velocity(NOW, sigma))
+        return measurements
+
+    def _weighed(self, field: EarthField, known: State) -> EarthField:
+        assert self._earth is not None
+        weighed, disturbed = self._earth.weighed(field, known)
+        self.gate.counts["Earth field disturbed"] += disturbed
+        return weighed
+
+    # What is said of it
+
+    def _ask(
+        self,
+        arrived: Arrivals,
+        before: State,
+        predicted: Propagated,
+        measurements: list[Measurement],
+        point: State | None,
+    ) -> None:
+        """Let the score hear an epoch; a state that is linearised elsewhere ends it."""
+        if point is not None:
+            self.score.end()
+            return
+        state, offset = predicted.state, arrived.applied_offset
+        imu = arrived.inertial_samples(before.time - offset, state.time - offset)
+        self.score.predict(before, state, predicted.transition, imu)
+        self.score.measured(measurements, state)
+
+    def _hear(
+        self, before: State, predicted: Propagated, state: State, found: Measured | None
+    ) -> None:
+        if self.metal.lone and not self.metal.near:
+            self._reckoned.hear(before, predicted, state)
+        elapsed, accel = predicted.state.time - before.time, None
+        if elapsed > 0.0 and not predicted.bridged:
+            gained = predicted.state.velocity_world - before.velocity_world
+            accel = gained / elapsed + before.world_from_body @ before.accel_bias_body
+        steady = None if found is None else found.steady
+        repeats = 1.0 if found is None else found.repeats
+        self.witness.hear(state, self.gate, Heard(accel, elapsed, steady, repeats))
+
+    def _separate(
+        self, predicted: Propagated | None, measurements: list[Measurement], state: State
+    ) -> None:
+        """Carry the filters without each beacon on; from None they begin anew."""
+        if self.bank is None:
+            return
+        if predicted is None:
+            self.bank.forget()
+        else:
+            self.bank.absorb(predicted, measurements, state)
+
+    def _judged(self, state: State, since: float | None) -> Judgement:
+        held = self.score.said_of(state)
+        said = self.witness.judgement(state, self.gate, since, held)
+        said = said.beside(
+            *self.metal.said().findings,
+            *self.of_currents,
+            *self.gate.watch.findings(),
+            *_of_place(self.site, state),
+            *self._roll,
+        )
+        return said if self.bank is None else self.bank.heard(said, state)
+
+    def _compare(self, samples: FieldSamples, state: State) -> None:
+        """See from time to time whether a fix finds the platform where the state says."""
+        if self.metal.near:
+            return
+        self._since_compared += 1
+        due = state.time >= self._compared_at + COMPARED_EVERY
+        due = due and self._since_compared >= COMPARED_EPOCHS
+        if not (due or self.witness.asks_for_a_fix):
+            return
+        self._compared_at, self._since_compared = state.time, 0
+        fix = agreed_fix(samples, state.calibration)
+        lacking = self.site.platform.magnetometer.lacking
+        if fix is not None and lacking and not fix.fixes.determined[0, 0]:
+            return  # a roll that is open is as far from any state
+        if fix is not None and explains(fix, samples, state.calibration):
+            self.witness.compared(*_apart(state, fix))
+
+    # Being lost, and found again
+
+    def asks_for_each(self, state: State) -> bool:
+        """Return whether beacons that are told together do not do: each must be told alone."""
+        return self._lost(state) or _wide(state)
+
+    def _lost(self, state: State) -> bool:
+        return self.gate.lost or not _no_wider(state.cov[POSITION, POSITION], LOST_POSITION)
+
+    def _linearization_point(
+        self, found: Measured, state: State
+    ) -> tuple[Measured, State | None, BoolArray]:
+        """Return fields as they are linearised, the fix where if one is needed, what disagrees."""
+        samples = found.samples
+        nothing = np.zeros(len(samples.channels), dtype=bool)
+        # Of a state that is near enough, or its windows were not asked for.
+        if not isinstance(found.phasors, FieldPhasors):
+            return found, None, nothing
+        if not _wide(state):
+            self._pointing.over()
+            if not is_curved(state):
+                return found, None, nothing
+            at = relinearized(found.phasors, state, self.blocks)
+            return found if at is None else replace(found, phasors=at), None, nothing
+        if not self._pointing.due(state.time):
+            return found, None, samples.valid[0]
+        fix = agreed_fix(samples, state.calibration, prior_of(state))
+        if fix is None:
+            return found, None, nothing
+        if not explains(fix, samples, state.calibration):
+            return found, None, samples.valid[0]
+        self.gate.counts["found by a fix"] += 1
+        self._pointing.over()
+        return found, at_fix(state, fix), fix.refused
+
+    def _found_again(self, estimator: Estimator, found: Measured, predicted: Propagated) -> bool:
+        """Give the pose up that explains nothing any more, and start from a fix."""
+        state = predicted.state
+        if not self._attempts.due(state.time):
+            return False
+        if not corroborated(found.samples):
+            return False
+        fix = agreed_fix(found.samples, state.calibration)
+        if fix is None or not fix.fixes.determined[0, 0]:
+            return False
+        if not explains(fix, found.samples, state.calibration):
+            return False
+        estimator.replace_state(restarted(state, fix))
+        self._reckoned.forget()
+        self.witness.forget_motion()
+        self.score.end()
+        self._separate(None, [], estimator.state)
+        self._end_loss(state.time)
+        return True
+
+    def _lost_since(self, state: State) -> float | None:
+        if self._lost(state):
+            return self._attempts.lost_at(state.time)
+        if self._attempts.since is not None:
+            self._end_loss(state.time)
+        return None
+
+    def _end_loss(self, time: float) -> None:
+        self.gate.counts["lost and found again"] += 1
+        self.gate.refused_in_a_row = 0
+        self._attempts.over()
+        self.witness.uncertain("found_again", time)
+
+
+def _wide(state: State) -> bool:
+    """Return whether a state is no place to linearise."""
+    wide = (POSITION, WIDE_POSITION), (ROTATION, WIDE_ROTATION)
+    return not all(_no_wider(state.cov[part, part], sigma) for part, sigma in wide)
+
+
+def _no_wider(cov: Array, sigma: float) -> bool:
+    """Tell whether no axis of a covariance (3, 3) has a larger sigma."""
+    # The trace is not below the variance of any axis, and costs less.
+    return bool(cov.trace() <= sigma**2 or np.linalg.eigvalsh(cov)[-1] <= sigma**2)
+
+
+def _of_place(site: Site, state: State) -> tuple[Finding, ...]:
+    if site.bounds is None:
+        return ()
+    at = np.array([state.time]), state.world_from_body[None], state.position_world[None]
+    return of_place(site, *at, state.cov[None, :6, :6])
+
+
+def _apart(state: State, fix: AgreedFix) -> tuple[float, float]:
+    """Return squared distance and offset (m) of a state from the likely hypothesis nearest to it.
+
+    A mirrored pose that explains the epoch as well is no contradiction.
+    """
+    fixes, body_from_world = fix.fixes, state.world_from_body.T
+    best = (np.inf, np.inf)
+    for k in np.flatnonzero(fixes.cost[0] < fixes.cost[0, 0] + AS_LIKELY):
+        turn = vectors_of(body_from_world @ fixes.world_from_body[0, k])
+        shift = body_from_world @ (fixes.position_world[0, k] - state.position_world)
+        offset = np.concatenate([turn, shift])
+        cov = fix.excess * fixes.pose_cov[0, k] + state.cov[:6, :6]
+        distance = float(offset @ np.linalg.solve(cov, offset))
+        best = min(best, (distance, float(np.linalg.norm(shift))))
+    return best

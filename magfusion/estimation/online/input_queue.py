@@ -1,0 +1,570 @@
+"""What has arrived for a navigator and is not used up yet.
+
+How far all of it goes, and what of it was measured at an epoch.
+"""
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.batch.settings import EstimatorSettings
+from magfusion.estimation.data_checks.detection import DetectionFilter
+from magfusion.estimation.data_checks.freeze import Freeze
+from magfusion.estimation.data_checks.stream_buffer import Buffer, check_clock
+from magfusion.estimation.demodulation.motion_compensation import (
+    MotionCompensated,
+    demodulate_predicted,
+)
+from magfusion.estimation.graph.measurement import Measurement
+from magfusion.estimation.graph.preintegration import RATE_SPAN
+from magfusion.estimation.graph.state import MOTION, VELOCITY, State, as_trajectory
+from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
+from magfusion.estimation.measurements.earth import earth_measurement
+from magfusion.estimation.measurements.model_error import alike_at
+from magfusion.estimation.measurements.phasors import field_phasors
+from magfusion.estimation.measurements.signs import OPEN_SIGN, count_open, with_signs
+from magfusion.estimation.measurements.zero_velocity import (
+    REACH,
+    may_stand,
+    quiet_before,
+)
+from magfusion.estimation.online.measured import Measured
+from magfusion.estimation.online.short_windows import ShortWindows
+from magfusion.estimation.online.stand_in import StandIn
+from magfusion.files.named_records import magnetometer_number
+from magfusion.model.marks import Marks
+from magfusion.model.parameters import CLOCK_RATE, TIME_OFFSET, Block
+from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
+from magfusion.model.trust import Finding
+from magfusion.receiver.lockin_receiver import LockinReceiver
+from magfusion.receiver.receiver import Receiver
+from magfusion.units import Array, IntArray
+
+LONGEST_WAIT = 5.0  # s; the fields go on without an IMU that is silent for longer
+OFFSET_STALE = 1e-4  # s; at a radian a second, six thousandths of a degree
+SHORTEST_STEP = 1e-6  # s; of epochs of one magnetometer
+MARGIN = 0.1  # s; of inertial samples about a window
+
+
+class Arrivals:
+    """Streams in order of time, each on its own clock.
+
+    Parameters
+    ----------
+    receiver : Receiver
+        Of the waveform; it begins with the first state, and not at all where phasors come.
+    applied_offset : float
+        Added to the IMU's stamps (s).
+
+    Attributes
+    ----------
+    imu, waveform : Buffer
+        Rates and specific forces of the body; raw fields.
+    fields : list of FieldSamples
+        One epoch each, the oldest first.
+    steady : dict
+        By the time of the epoch (s), the steady fields with it.
+    others : list of (float, Measurement)
+        Anything else that was measured, and when (s).
+    windows : deque of int
+        Numbers of windows that were admitted and not demodulated yet.
+    usual : float, optional
+        Sampling interval of the IMU (s), once there is a state.
+    last_epoch : float
+        When fields were last measured (s).
+    unseen : int
+        Windows in which the inertial stream is silent.
+    open_signs : int
+        Amplitudes that were left out because nothing tells their sign.
+    frozen : int
+        Inertial samples that were left out because the IMU hung.
+    stand_in : StandIn
+        What takes its place there.
+    short : ShortWindows, optional
+        Of tones that are close.
+    """
+
+    receiver: Receiver
+    short: ShortWindows | None
+    applied_offset: float
+    imu: Buffer
+    waveform: Buffer
+    fields: list[FieldSamples]
+    steady: dict[float, SteadyFields]
+    others: list[tuple[float, Measurement]]
+    windows: deque[int]
+    usual: float | None
+    _heard_by: dict[str, float]  # when each of several magnetometers was last heard (s)
+    last_epoch: float
+    unseen: int
+    open_signs: int
+    frozen: int
+    stand_in: StandIn
+    _gyro: Freeze
+    _accel: Freeze
+    _detection: DetectionFilter
+    _window: int | None  # at the state that is to be predicted
+    _noise: list[Array]
+    _noise_unseen: bool
+
+    def __init__(self, receiver: Receiver, applied_offset: float) -> None:
+        self.receiver, self.short = receiver, None
+        # What stands in for them needs a state, which a whole log has only when it is smoothed.
+        receiver.needs_turn = not isinstance(receiver, LockinReceiver)
+        receiver.joined = True
+        self.applied_offset = applied_offset
+        self.imu = Buffer("imu", 6)
+        self.waveform = Buffer("magnetometer", 3)
+        self.fields, self.steady, self.others = [], {}, []
+        self.windows = deque()
+        self.usual = self._window = None
+        self.last_epoch = -np.inf
+        self._detection = DetectionFilter()
+        self.unseen, self.stand_in, self.open_signs = 0, StandIn(), 0
+        self.frozen, self._gyro, self._accel = 0, Freeze(), Freeze()
+        self._noise, self._noise_unseen = [], False
+        self._heard_by = {}
+
+    # What goes in
+
+    def add_imu(self, time: Array, gyro_body: Array, accel_body: Array) -> None:
+        """Take inertial samples, as `Navigator.add_imu`."""
+        stamps = np.atleast_1d(time)
+        check_clock("imu", stamps, self._newest)
+        rows = np.hstack([np.atleast_2d(gyro_body), np.atleast_2d(accel_body)])
+        self.imu.add(stamps, rows)
+        if not self.receiver.site.platform.inertial:
+            return
+        for instrument, own in ((self._gyro, rows[:, :3]), (self._accel, rows[:, 3:])):
+            for after, until in instrument.stretches(stamps, own):
+                self.frozen += self.imu.leave_out(after, until)
+
+    def add_magnetometer(
+        self, time: Array, measured_sensor: Array, magnetometer: str | None = None
+    ) -> None:
+        """Take raw samples of the magnetometer, as `Navigator.add_magnetometer`."""
+        magnetometer_number(self.receiver.site, magnetometer, "samples")
+        stamps = np.atleast_1d(time)
+        check_clock("magnetometer", stamps, self._newest)
+        self.waveform.add(stamps, np.atleast_2d(measured_sensor))
+
+    def add_marks(self, marks: Marks) -> None:
+        """Take bursts of coils, as `Navigator.add_marks`."""
+        check_clock("marks", marks.end, self._newest)
+        self.receiver.hear_marks(marks)
+
+    def add_slots(self, time: Array, slot: IntArray) -> None:
+        """Take slots beside samples, as `Navigator.add_slots`."""
+        check_clock("magnetometer", time, self._newest)
+        self.receiver.hear_slots(time, slot)
+
+    def add_fields(self, samples: FieldSamples, steady: SteadyFields | None, after: float) -> int:
+        """Take phasors, as `Navigator.add_fields`; return how many are not after a time (s)."""
+        check_clock("fields", samples.time, self._newest)
+        if self.fields and self.fields[-1].signed != samples.signed:
+            raise InputError(
+                "fields: amplitudes without sign come among phasors; give one or other"
+            )
+        late = 0
+        for i in range(len(samples)):
+            one = samples.rows(slice(i, i + 1))
+            if one.time[0] <= after:
+                late += 1
+                continue
+            self.fields.append(one)
+            if steady is not None:
+                self.steady[float(one.time[0])] = steady.rows(slice(i, i + 1))
+        self.fields.sort(key=lambda s: float(s.time[0]))
+        return late
+
+    def add_measurement(self, time: float, measurement: Measurement, after: float) -> bool:
+        """Take any other measurement; return whether it is after a time (s)."""
+        check_clock("measurement", np.array([time]), self._newest)
+        if time > after:
+            self.others.append((time, measurement.at(0)))
+            self.others.sort(key=lambda other: other[0])
+        return time > after
+
+    # How far it goes
+
+    @property
+    def next_field(self) -> float:
+        """When the next fields are measured (s), as far as is known."""
+        if self.fields:
+            return float(self.fields[0].time[0])
+        if self.receiver.grid is None:
+            return np.inf
+        number = self.windows[0] if self.windows else self.receiver.next_number
+        return self.receiver.centre_of(number)
+
+    @property
+    def next_other(self) -> float:
+        """When anything else was measured next (s)."""
+        return self.others[0][0] if self.others else np.inf
+
+    @property
+    def _newest(self) -> float:
+        """Newest stamp of all streams (s)."""
+        return max(self.imu.newest, self.waveform.newest, self._newest_field)
+
+    @property
+    def _newest_field(self) -> float:
+        """Newest stamp of the fields (s)."""
+        last = float(self.fields[-1].time[0]) if self.fields else -np.inf
+        return max(last, self.waveform.newest)
+
+    @property
+    def first(self) -> float:
+        """Oldest stamp of the fields (s)."""
+        if self.fields:
+            return float(self.fields[0].time[0])
+        time, _ = self.waveform.rows()
+        return float(time[0]) if len(time) else np.inf
+
+    @property
+    def inertial(self) -> float:
+        """Time of the newest inertial sample (s)."""
+        return self.imu.newest + self.applied_offset
+
+    @property
+    def hung_since(self) -> float | None:
+        """Stamp since which the IMU hangs (s), on the log's clock; None where it does not."""
+        since = [one.since for one in (self._gyro, self._accel) if one.found]
+        return min(since) + self.applied_offset if since else None
+
+    @property
+    def reached(self) -> float:
+        """Until when everything has come (s)."""
+        return min(self.inertial, self._newest_field)
+
+    @property
+    def awaited(self) -> float:
+        """Until when the inertial samples have come, or are not waited for any more (s)."""
+        return max(self.inertial, self._newest_field - LONGEST_WAIT)
+
+    def due(self, inertial: float) -> bool:
+        """Return whether fields may be taken in that came, up to a time of the IMU (s)."""
+        return bool(self.fields) and bool(self.fields[0].time[0] <= inertial)
+
+    @property
+    def remarks(self) -> tuple[Finding, ...]:
+        """What is to be said of the streams; nothing of those of one magnetometer."""
+        return ()
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """What was of no use, with the reason: windows, samples."""
+        frozen = {"imu sample of a sensor that hung": self.frozen} if self.frozen else {}
+        late = {f"{b.name} sample too late": b.late for b in (self.imu, self.waveform) if b.late}
+        unseen = {"window without inertial samples": self.unseen} if self.unseen else {}
+        unseen |= {OPEN_SIGN: self.open_signs} if self.open_signs else {}
+        return {
+            **{f"window: {k}": v for k, v in self.receiver.dropped.items()},
+            **unseen,
+            **frozen,
+            **late,
+        }
+
+    # How it goes on
+
+    def settle(self) -> None:
+        """Put what came last into its order, as a checkpoint holds it."""
+        self.imu.rows()
+        self.waveform.rows()
+
+    def gathered(self, delay: float, span: float) -> float | None:
+        """Return until when a first state is looked for (s); None as long as that is too early.
+
+        Parameters
+        ----------
+        delay : float
+            As of `receive` (s).
+        span : float
+            Of the data that it takes (s).
+        """
+        reached = self.reached - delay
+        return reached if reached - self.first >= span else None
+
+    def first_state(self, until: float, settings: EstimatorSettings) -> OnlineStart | NoStart:
+        """Return the first state that what has come leads to, or why there is none."""
+        steady = list(self.steady.values())
+        return find_online_start(
+            self.receiver.site,
+            self.inertial_samples(),
+            self.waveform,
+            self.fields,
+            steady,
+            until,
+            settings,
+            self.receiver.marks,
+        )
+
+    def forget_before_start(self, kept: float) -> None:
+        """Keep no more than so long (s), whatever it is."""
+        oldest = self.reached - kept
+        for buffer in (self.imu, self.waveform):
+            buffer.forget(oldest, oldest)
+        self.fields = [s for s in self.fields if s.time[0] >= oldest]
+        self.receiver.forget_marks(oldest)
+
+    def start(self, start: OnlineStart, delay: float) -> None:
+        """Go on from a first state, and drop what it has used; the delay as of `receive`."""
+        time = start.state.time
+        self.applied_offset = float(start.state.calibration.imu_offset(np.array(time)))
+        self.usual = float(np.median(np.diff(self.imu.rows()[0])))
+        self.fields = [s for s in self.fields if s.time[0] > time]
+        self.steady = {t: s for t, s in self.steady.items() if t > time}
+        self.others = [other for other in self.others if other[0] > time]
+        self.last_epoch = time
+        if start.waveform is not None:
+            if isinstance(self.receiver, LockinReceiver):
+                self.receiver.beside = start.beside
+            self.receiver.begin(start.waveform, self.inertial_samples())
+            if self.short is not None:
+                self.short.receiver.beside_lines(start.beside)
+                self.short.receiver.begin(start.waveform, self.inertial_samples())
+            self.receive(start.state, delay)
+        self.forget(time)
+
+    def receive(self, state: State, delay: float) -> None:
+        """Judge the windows that are complete and not too late for a delay (s); demodulate slots.
+
+        Windows wait for a prediction of the motion in them.
+        """
+        until, receiver = min(self.awaited, self.waveform.newest) - delay, self.receiver
+        if self.short is not None and self.short.receiver.complete(until):
+            samples = self._waveform_samples(), self.inertial_samples()
+            self.short.receive(*samples, until, self.last_epoch)
+        if not receiver.complete(until):
+            return
+        assert receiver.grid is not None
+        waveform, imu = self._waveform_samples(), self.inertial_samples()
+        # The first state has used windows, too.
+        after = self.last_epoch + 0.25 * receiver.grid.step
+        if isinstance(receiver, LockinReceiver):
+            windows = receiver.admit(waveform, imu, until)
+            self.windows.extend(windows.number[windows.centre > after].tolist())
+        else:
+            offset = self.applied_offset
+            found = receiver.push(waveform, imu, until, state.gyro_bias_body, offset)
+            self.fields += found.rows(found.time > after).epochs()
+
+    def next_window(self, state: State, *, lost: bool = False) -> float | None:
+        """Go on to the next window that was admitted: return its centre (s); None for none.
+
+        Of close tones to the next short one, as long as the state is near enough for it.
+
+        Parameters
+        ----------
+        lost : bool
+            Whether the tones must be told apart before anything else.
+        """
+        if self.short is not None:
+            while self.windows and self.receiver.centre_of(self.windows[0]) <= state.time:
+                self.windows.popleft()
+            centre = None if lost else self.short.next_after(state.time)
+            if centre is not None:
+                return centre
+        if not self.windows:
+            return None
+        self._window = self.windows.popleft()
+        return self.receiver.centre_of(self._window)
+
+    @property
+    def window_to_come(self) -> bool:
+        """Whether the samples of a window are there that awaits its inertial ones."""
+        newest = self.waveform.newest
+        short = self.short is not None and self.short.receiver.complete(newest)
+        return short or self.receiver.complete(newest)
+
+    def apply_offset_anew(self, state: State, blocks: tuple[Block, ...]) -> float:
+        """Cut the inertial stream by the time offset that has been learnt since; return the change.
+
+        A state is the platform's where the IMU's stamp says; under another offset it is the same
+        state, a little earlier or later (s) on the log's clock.
+        """
+        lag = float(state.calibration.imu_offset(np.array(state.time))) - self.applied_offset
+        if abs(lag) < OFFSET_STALE:
+            return 0.0
+        by_state, run = np.zeros(len(state.cov)), state.time - state.calibration.imu_begin
+        for parameter, _, columns, _ in blocks:
+            if parameter == TIME_OFFSET:
+                by_state[MOTION + columns.start] = 1.0
+            elif parameter == CLOCK_RATE:
+                by_state[MOTION + columns.start] = run
+        if not np.any(by_state):
+            return 0.0
+        sigma = float(np.sqrt(by_state @ state.cov @ by_state))
+        if abs(lag) < 2.0 * sigma:
+            return 0.0
+        self.applied_offset += lag
+        return lag
+
+    def forget(self, time: float) -> None:
+        """Keep the samples that are needed after a state (s)."""
+        reach = 2.0 + self.receiver.history
+        self.imu.forget(time - reach, time - self.applied_offset - 1.0)
+        self.stand_in.forget(time - reach)
+        self.waveform.forget(time - reach, time - reach)
+
+    # What comes out
+
+    def inertial_samples(self, begin: float = -np.inf, end: float = np.inf) -> ImuSamples:
+        """Return the inertial samples between two stamps of their own, and the next outside."""
+        time, rows = self.imu.between(begin, end)
+        return ImuSamples(time, rows[:, :3], rows[:, 3:])
+
+    def motion_samples(self, begin: float, end: float) -> ImuSamples:
+        """Return them with what stands in for those that did not come."""
+        return self.stand_in.among(self.inertial_samples(begin, end), begin, end)
+
+    def fill_silence(self, state: State, time: float) -> None:
+        """Learn of the fields how the platform moves from a state to a time (s), if need be."""
+        receiver = self.receiver
+        if self.fields or not isinstance(receiver, LockinReceiver) or receiver.admission is None:
+            return
+        until, streams = time + receiver.settings.window / 2.0, (self.imu, self.waveform)
+        self.stand_in.fill(state, until, *streams, self.applied_offset, receiver.admission)
+
+    def others_at(self, time: float) -> list[Measurement]:
+        """Return anything else that was measured at a time (s), once."""
+        found = [measurement for when, measurement in self.others if when == time]
+        self.others = [other for other in self.others if other[0] > time]
+        return found
+
+    def rests(self, state: State) -> bool:
+        """Return whether the platform is at rest, as far as is known."""
+        stamp = state.time - self.applied_offset
+        motion = state.calibration.site.platform.motion
+        if not may_stand(state.velocity_world, state.cov[VELOCITY, VELOCITY], motion):
+            return False
+        imu = self.inertial_samples(stamp - motion.rest_span - REACH, stamp + REACH)
+        return bool(quiet_before(imu, np.array([stamp]), motion)[0])
+
+    def measured(
+        self,
+        before: State,
+        predicted: State,
+        samples: FieldSamples | None,
+        step: float,
+        *,
+        earth: bool,
+        standing: bool,
+        lost: bool = False,
+    ) -> Measured | None:
+        """Return what was detected and measured at a prediction; None where nothing was.
+
+        Parameters
+        ----------
+        before, predicted : State
+            At the epoch before and at this.
+        samples : FieldSamples, optional
+            Of this epoch; None where there may be a window of it.
+        step : float
+            Since fields were last measured (s).
+        earth : bool
+            Whether a steady field is a measurement.
+        standing : bool
+            Whether the platform is known to stand.
+        """
+        time = predicted.time
+        by_offset, steady = None, self.steady.pop(time, None)
+        if samples is None and self.short is not None and self.short.at(time):
+            return self._measured_together(self.short, before, predicted, standing=standing)
+        if samples is None:
+            wave = self._demodulated(before, predicted, lost=lost)
+            if wave is None:
+                return None  # only the clock went on
+            samples, steady, by_offset = wave.fields, wave.steady, wave.by_time_offset
+        own = step if not samples.magnetometers else self._own_step(samples)
+        samples = self._detection.of(samples, own)
+        if not samples.signed:
+            here, found = as_trajectory([predicted]), samples
+            samples = with_signs(samples, here, predicted.calibration)
+            self.open_signs += count_open(found, samples)
+        if not np.any(samples.valid) and not (earth and steady is not None):
+            return None
+        self.last_epoch = time
+        now, offset = np.zeros(1, dtype=np.int64), np.full(1, self.applied_offset)
+        rate_body = (self._rate_body(time) - predicted.gyro_bias_body)[None]
+        repeats = max(1.0, float(samples.window[0]) / own)
+        phasors = field_phasors(
+            predicted.calibration.site,
+            samples,
+            now,
+            as_trajectory([predicted]),
+            rate_body,
+            offset,
+            repeats,
+            by_offset,
+            alike_at(predicted, step),
+            np.array([standing]),
+        )
+        field = None
+        if earth and steady is not None:
+            site = predicted.calibration.site
+            field = earth_measurement(site, steady, now, rate_body, offset, step)
+        return Measured(samples, phasors, field, steady, repeats)
+
+    def _measured_together(
+        self, short: ShortWindows, before: State, predicted: State, *, standing: bool
+    ) -> Measured:
+        """Return what a short window tells of tones together."""
+        half, time = 0.5 * short.length, predicted.time
+        begin, end = min(before.time, time - half), time + half
+        imu = self.motion_samples(begin - MARGIN, end + MARGIN)
+        rate_body = self._rate_body(time) - predicted.gyro_bias_body
+        self.last_epoch = time
+        return short.measured(
+            before,
+            predicted,
+            self._waveform_samples(),
+            imu,
+            self.applied_offset,
+            rate_body,
+            standing=standing,
+        )
+
+    def _own_step(self, samples: FieldSamples) -> float:
+        """Return since when the magnetometers of an epoch did not measure, the shortest (s)."""
+        time, valid = float(samples.time[0]), samples.valid[0]
+        named = zip(samples.magnetometers, valid.tolist(), strict=True)
+        names = dict.fromkeys(name for name, there in named if there)
+        steps = [time - self._heard_by.get(name, -np.inf) for name in names]
+        self._heard_by |= dict.fromkeys(names, time)
+        return max(min(steps, default=np.inf), SHORTEST_STEP)
+
+    def _demodulated(
+        self, before: State, predicted: State, *, lost: bool
+    ) -> MotionCompensated | None:
+        """Return the window at a prediction; None where there is none."""
+        number, receiver = self._window, self.receiver
+        if number is None or receiver.centre_of(number) != predicted.time:
+            return None
+        assert isinstance(receiver, LockinReceiver)
+        half = receiver.settings.window / 2.0
+        begin, end = min(before.time, predicted.time - half), predicted.time + half
+        imu = self.motion_samples(begin - MARGIN, end + MARGIN)
+        wave, offset = self._waveform_samples(), self.applied_offset
+        blind = self.stand_in.covers(begin - offset, end - offset)
+        found = demodulate_predicted(
+            receiver, number, wave, imu, before, predicted, offset, blind=blind, lost=lost
+        )
+        unseen = found.unseen or blind
+        self.unseen += unseen
+        if unseen != self._noise_unseen:
+            self._noise, self._noise_unseen = [], unseen
+        # The mean over neighbouring windows, as far as they are known.
+        self._noise = [*self._noise, found.fields.phasor_cov][-receiver.settings.noise_windows :]
+        return replace(found, fields=replace(found.fields, phasor_cov=np.mean(self._noise, axis=0)))
+
+    def _waveform_samples(self) -> Waveform:
+        axes = self.receiver.site.platform.magnetometer.axes
+        return Waveform(*self.waveform.rows(), axes=axes)
+
+    def _rate_body(self, time: float) -> Array:
+        stamp = time - self.applied_offset
+        imu = self.motion_samples(stamp - RATE_SPAN / 2, stamp + RATE_SPAN / 2)
+        return np.asarray(np.mean(imu.gyro_body, axis=0)) if len(imu) else np.zeros(3)

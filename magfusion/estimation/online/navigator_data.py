@@ -1,0 +1,238 @@
+"""A running navigator's parts as plain data, and back: what a checkpoint holds.
+
+A part's state is what its class annotates; the rest is made again of the site and the settings.
+Calibrations are kept as what differs from the declared one, GTSAM's preintegrated measurements as
+the inertial steps they were made of.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from magfusion.estimation.batch.calibration_data import calibration_rules
+from magfusion.estimation.data_checks.running import Running
+from magfusion.estimation.data_checks.stream_buffer import Buffer
+from magfusion.estimation.graph.inertial import ROWS, Link, Steps
+from magfusion.estimation.graph.measurement import Measurement
+from magfusion.estimation.graph.state import MOTION, State, states_of
+from magfusion.estimation.measurements.earth import EarthField
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
+from magfusion.estimation.measurements.phasors import FieldPhasors, Predictions
+from magfusion.estimation.measurements.pose_fix import PoseFix
+from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
+from magfusion.estimation.online.fixed_lag import Node, Prior, SlidingWindow
+from magfusion.estimation.online_integrity.bank import SubsetBank
+from magfusion.estimation.online_integrity.judgement import JudgedState, Judgement
+from magfusion.estimation.online_integrity.levels import Levels
+from magfusion.estimation.online_integrity.score_epochs import Sums
+from magfusion.files.plain_data import Rules, from_plain, to_plain
+from magfusion.model.parameters import Block, Calibration, dimension, initial_calibration
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.model.trust import Verdict
+from magfusion.receiver.marked_bursts import OVERLAP, Bursts
+from magfusion.units import Array
+
+MEASUREMENTS: tuple[type[Measurement], ...] = (
+    FieldPhasors,
+    JointPhasors,
+    EarthField,
+    ZeroVelocity,
+    PoseFix,
+)
+ROUNDING = 1e-6  # of a rotation, and of a correlation's least eigenvalue
+
+
+def _made_again(data: Any) -> Predictions:
+    _check(data is None, "holds predictions, which are not kept")
+    return Predictions()
+
+
+# What is only kept to be shared is made again.
+_FORGOTTEN = Rules({Predictions: lambda _: None}, {Predictions: _made_again})
+
+
+def navigator_rules(
+    site: Site, blocks: tuple[Block, ...], measurements: tuple[type[Measurement], ...] = ()
+) -> Rules:
+    """Return how the parts of a navigator become plain data, and what holds for them.
+
+    Parameters
+    ----------
+    blocks : tuple of Block
+        Calibration parameters in the states' tangent.
+    measurements : tuple of type
+        Kinds of measurements from outside the package.
+    """
+    declared = initial_calibration(site, 0.0)
+    kinds = {kind.__name__: kind for kind in (*MEASUREMENTS, *measurements)}
+    size = MOTION + dimension(blocks)
+    of_calibration = replace(calibration_rules(declared, blocks), checks={Steps: _check_steps})
+    return Rules(
+        writers={
+            **of_calibration.writers,
+            Link: lambda link: _link_data(link, of_calibration),
+            Measurement: _measurement_data,
+            Verdict: str,
+            Levels: lambda levels: list(levels.found),
+        },
+        readers={
+            **of_calibration.readers,
+            Link: lambda data: _link(data, site, size - MOTION, of_calibration),
+            Measurement: lambda data: _measurement(data, kinds),
+            Verdict: Verdict,
+            Levels: _levels,
+        },
+        checks={
+            State: lambda state: _check_state(state, size),
+            JudgedState: lambda state: _check_state(state, size),
+            Judgement: _check_judgement,
+            Running: _check_running,
+            Sums: _check_sums,
+            SubsetBank: lambda bank: bank.check(size),
+            Node: lambda node: _check_node(node, blocks),
+            Prior: lambda prior: _check_prior(prior, size),
+            Buffer: _check_buffer,
+            Bursts: _check_bursts,
+            FieldSamples: lambda f: _check(f.channels == site.channels, "has other channels"),
+            SlidingWindow: lambda window: _check_window(window),
+        },
+    )
+
+
+def _levels(data: Any) -> Levels:
+    right = isinstance(data, list) and len(data) == 2
+    _check(right and all(x is None or type(x) is float for x in data), "are no levels")
+    return Levels((data[0], data[1]))
+
+
+def _check(right: bool | np.bool_, wrong: str) -> None:
+    if not right:
+        raise ValueError(wrong)
+
+
+def _check_bursts(bursts: Bursts) -> None:
+    marks = bursts.marks
+    lengths = {
+        len(marks.begin),
+        len(marks.end),
+        len(marks.slot),
+        len(bursts.epochs(bursts.numbers)),
+    }
+    _check(len(lengths) == 1, "has columns of different length")
+    edges = np.stack([marks.begin, marks.end], axis=1).ravel()
+    _check(np.all(np.diff(edges) > -OVERLAP), "has bursts that overlap")
+
+
+def _check_state(state: State, size: int) -> None:
+    shapes = {"world_from_body": (3, 3), "cov": (size, size)}
+    for name, value in vars(state).items():
+        if isinstance(value, np.ndarray):
+            _check(value.shape == shapes.get(name, (3,)), f"has a {name} of another shape")
+            _check(np.all(np.isfinite(value)), f"has a {name} that is not finite")
+    _check(np.isfinite(state.time), "is of no time")
+    turned = state.world_from_body @ state.world_from_body.T
+    _check(np.max(np.abs(turned - np.eye(3))) < ROUNDING, "has a rotation that is none")
+    _check_cov(state.cov)
+
+
+def _check_judgement(judgement: Judgement) -> None:
+    levels = (judgement.protection_level_m, judgement.protection_level_deg)
+    known = [level for level in levels if level is not None]
+    values = (judgement.inflation, judgement.turn, judgement.shift, *known)
+    _check(np.all(np.isfinite(values)) and judgement.inflation >= 1.0, "is no judgement")
+
+
+def _check_running(running: Running) -> None:
+    sums = (*running.total, running.weight, running.squares)
+    _check(running.total.ndim == 1 and np.all(np.isfinite(sums)), "is not finite")
+
+
+def _check_sums(sums: Sums) -> None:
+    size, states = len(sums.gradient), sums.response.shape[:1]
+    shapes = (sums.information.shape, sums.gradient.shape, sums.response.shape)
+    _check(shapes == ((size, size), (size,), (*states, size)), "has sums of another shape")
+    values = np.concatenate([v.ravel() for v in (sums.information, sums.gradient, sums.response)])
+    _check(np.all(np.isfinite([*values, sums.time])), "has sums that are not finite")
+
+
+def _check_cov(cov: Array) -> None:
+    sigma = np.sqrt(np.maximum(np.diagonal(cov), np.finfo(float).tiny))
+    correlation = cov / sigma / sigma[:, None]
+    _check(np.all(np.isfinite(correlation)), "has a covariance that is not finite")
+    _check(np.max(np.abs(correlation - correlation.T)) < ROUNDING, "has a skew covariance")
+    least = np.linalg.eigvalsh(correlation)[0]
+    _check(least > -ROUNDING, "has a covariance that is not positive definite")
+
+
+def _check_node(node: Node, blocks: tuple[Block, ...]) -> None:
+    state = states_of([node.state])
+    for measurement in node.measurements:
+        rows = measurement.linearize(state, node.state.calibration, blocks)
+        _check(len(measurement.epoch) == 1, "holds a measurement of several epochs")
+        _check(np.all(np.isfinite(rows.error)), "holds a measurement that is not finite")
+
+
+def _check_prior(prior: Prior, size: int) -> None:
+    matrix, right = prior.sqrt_information, prior.right
+    _check(matrix.ndim == 2 and matrix.shape[1] == size, "has a matrix of another shape")
+    _check(right.shape == matrix.shape[:1], "has a right side of another shape")
+    _check(np.all(np.isfinite(matrix)) and np.all(np.isfinite(right)), "is not finite")
+
+
+def _check_buffer(buffer: Buffer) -> None:
+    time, rows = buffer.rows()
+    _check(time.ndim == 1 and rows.shape == (len(time), buffer.width), "has another shape")
+    _check(np.all(np.isfinite(time)) and np.all(np.isfinite(rows)), "is not finite")
+    _check(np.all(np.diff(time) > 0.0), "is not in order of time")
+
+
+def _check_window(window: SlidingWindow) -> None:
+    _check(np.all(np.diff([n.state.time for n in window.nodes]) > 0.0), "is not in order of time")
+    _check(all(node.link for node in window.nodes[1:]), "has nodes that are not linked")
+
+
+def _measurement_data(measurement: Measurement) -> dict[str, Any]:
+    return {
+        "kind": type(measurement).__name__,
+        **{k: to_plain(v, _FORGOTTEN) for k, v in vars(measurement).items()},
+    }
+
+
+def _measurement(data: Any, kinds: Mapping[str, type[Measurement]]) -> Measurement:
+    _check(isinstance(data, dict) and str(data.get("kind")) in kinds, "is of no known kind")
+    own = {name: value for name, value in data.items() if name != "kind"}
+    return from_plain(kinds[str(data["kind"])], own, str(data["kind"]), _FORGOTTEN)
+
+
+@dataclass(frozen=True, eq=False)
+class _LinkData:
+    by_calibration: Array | None
+    calibration: Calibration
+    steps: Steps
+
+
+def _link_data(link: Link, rules: Rules) -> Any:
+    assert link.steps is not None
+    return to_plain(_LinkData(link.by_calibration, link.calibration, link.steps), rules)
+
+
+def _link(data: Any, site: Site, columns: int, rules: Rules) -> Link:
+    found = from_plain(_LinkData, data, "link", rules)
+    if (by := found.by_calibration) is not None:
+        _check(by.shape == (ROWS, columns) and np.all(np.isfinite(by)), "has a wrong derivative")
+    measurement = found.steps.preintegrated(site)
+    return Link(measurement, found.by_calibration, found.calibration, found.steps)
+
+
+def _check_steps(steps: Steps) -> None:
+    own, biases = steps.increments, (steps.accel_bias_body, steps.gyro_bias_body)
+    count = len(own.dt)
+    shapes = (own.gyro_body.shape, own.accel_body.shape, own.dt.shape)
+    _check(shapes == ((count, 3), (count, 3), (count,)), "has steps of another shape")
+    _check(biases[0].shape == biases[1].shape == (3,), "has biases of another shape")
+    _check(own.first.tolist() == [0, count] and len(own.bridged) == 1, "is not of one interval")
+    values = np.concatenate([v.ravel() for v in (*vars(own).values(), *biases)])
+    _check(np.all(np.isfinite(values)) and np.all(own.dt > 0.0), "has steps that are not finite")

@@ -1,0 +1,43 @@
+"""A navigator that goes on from a checkpoint."""
+
+from typing import Any
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.graph.measurement import Measurement
+from magfusion.estimation.online.navigator import Navigator
+from magfusion.estimation.online.navigator_data import navigator_rules
+from magfusion.estimation.online.navigator_settings import NavigatorSettings
+from magfusion.model.site import Site
+
+
+def restored(
+    site: Site,
+    settings: NavigatorSettings,
+    checkpoint: Any,
+    measurements: tuple[type[Measurement], ...] = (),
+) -> Navigator:
+    """Return the navigator of a checkpoint.
+
+    Parameters
+    ----------
+    site, settings
+        Of the navigator that made it.
+    checkpoint : dict
+        What `Navigator.checkpoint` returned.
+    measurements : tuple of type
+        Kinds of measurements from outside the package that were given to it.
+
+    Raises
+    ------
+    InputError
+        Where it is none, or does not fit the site.
+    """
+    navigator = Navigator(site, settings)
+    rules = navigator_rules(navigator.site, navigator.blocks, measurements)
+    try:
+        navigator.go_on_from(checkpoint, rules)
+    except np.linalg.LinAlgError as error:
+        raise InputError(f"its covariance is none ({error}); run without --resume") from error
+    return navigator

@@ -1,0 +1,384 @@
+"""What has arrived of several magnetometers: windows and fields of one time are one epoch.
+
+Each has a receiver and a clock of its own, and may be later than another.  An epoch waits for all
+of them, but for one that is silent; of that it is said, and the others go on.
+"""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.batch.settings import EstimatorSettings
+from magfusion.estimation.data_checks.stream_buffer import check_clock
+from magfusion.estimation.demodulation.motion_compensation import MotionCompensated
+from magfusion.estimation.demodulation.several_demodulation import same_windows
+from magfusion.estimation.demodulation.warming import refuse_warm
+from magfusion.estimation.graph.state import State
+from magfusion.estimation.initialization.online import NoStart, OnlineStart, find_online_start
+from magfusion.estimation.online.input_queue import LONGEST_WAIT, MARGIN, Arrivals
+from magfusion.estimation.online.measured import Measured
+from magfusion.estimation.online.sensor_stream import SensorStream
+from magfusion.files.fields import SAME_TIME, side_by_side
+from magfusion.files.named_records import magnetometer_number
+from magfusion.model.marks import Marks
+from magfusion.model.parameters import seen_by
+from magfusion.model.samples import FieldSamples, ImuSamples, SteadyFields, Waveform
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Verdict
+from magfusion.receiver.lockin_receiver import LockinReceiver
+from magfusion.receiver.marked_bursts import LATE
+from magfusion.receiver.receivers import receiver_of
+from magfusion.receiver.slots import is_marked
+from magfusion.receiver.windows import LockinSettings
+from magfusion.units import Array, IntArray
+
+SILENCE = 1.0  # s; and a window: the others go on without one that is silent for longer
+
+
+class SeveralArrivals(Arrivals):
+    """Streams of a platform with several magnetometers, as `Arrivals`.
+
+    Attributes
+    ----------
+    streams : list of SensorStream
+        Of each magnetometer; without a sample where fields come.
+    begun_at : float
+        Stamp of whatever came first of any (s).
+    without : Counter
+        Magnetometer to number of epochs while it was silent.
+    """
+
+    streams: list[SensorStream]
+    begun_at: float
+    without: Counter[str]
+    _fields_to: dict[str, float]  # stamp of the newest fields of each (s)
+    _longest: float  # of their windows (s)
+    _centre: float  # of the windows at the state that is to be predicted (s)
+    _looked: float  # until when a first state was looked for last (s)
+
+    def __init__(self, site: Site, lockin: LockinSettings | None, applied_offset: float) -> None:
+        refuse_warm(site)
+        super().__init__(receiver_of(site, lockin), applied_offset)
+        self.site, sensors = site, site.platform.magnetometers
+        self._lockin = same_windows(site, lockin) if site.beacons else lockin
+        self.streams = []
+        for sensor in sensors:
+            alone = site.platform.carrying((replace(sensor, clock_offset=0.0),))
+            self.streams.append(SensorStream(replace(site, platform=alone), self._lockin))
+        self.begun_at, self.without = np.inf, Counter()
+        self._fields_to, self._longest = {}, 0.0
+        self._centre = self._looked = -np.inf
+        self._delay = 0.0
+
+    # What goes in
+
+    def add_magnetometer(
+        self, time: Array, measured_sensor: Array, magnetometer: str | None = None
+    ) -> None:
+        """Take raw samples of a magnetometer by its own stamps."""
+        which = magnetometer_number(self.site, magnetometer, "samples")
+        if self._fields_to:
+            raise InputError(
+                f"magnetometer: samples of {magnetometer} come beside fields; give the one or the"
+                " other of all magnetometers"
+            )
+        stream, late = self.streams[which], self.site.platform.magnetometers[which].clock_offset
+        stamps = np.atleast_1d(time) + late
+        check_clock(stream.samples.name, stamps, self._newest)
+        stream.samples.add(stamps, np.atleast_2d(measured_sensor))
+        self.begun_at = min(self.begun_at, float(np.min(stamps, initial=np.inf)))
+
+    def add_marks(self, marks: Marks) -> None:
+        """Take bursts of coils, which every magnetometer hears."""
+        check_clock("marks", marks.end, self._newest)
+        for stream in self.streams:
+            stream.receiver.hear_marks(marks)
+
+    def add_slots(self, time: Array, slot: IntArray) -> None:  # noqa: ARG002
+        """Refuse slots beside samples: each magnetometer would tell its own."""
+        raise InputError(
+            "magnetometer: slot beside the samples of several is not taken; give records of marks"
+        )
+
+    def add_fields(
+        self,
+        samples: FieldSamples,
+        steady: SteadyFields | None,  # noqa: ARG002
+        after: float,
+    ) -> int:
+        """Take phasors by the log's clock; those of one time are put together."""
+        if any(np.isfinite(stream.samples.newest) for stream in self.streams):
+            raise InputError(
+                "fields: they come beside samples of the magnetometers; give the one or the other"
+                " of all magnetometers"
+            )
+        check_clock("fields", samples.time, self._newest)
+        late = 0
+        for one in samples.epochs():
+            self._hear(one)
+            if one.time[0] <= after:
+                late += 1
+            else:
+                self._put(one)
+        self.fields.sort(key=lambda s: float(s.time[0]))
+        return late
+
+    def _hear(self, one: FieldSamples) -> None:
+        time = float(one.time[0])
+        named = zip(one.magnetometers, one.valid[0].tolist(), strict=True)
+        for name in dict.fromkeys(name for name, there in named if there):
+            self._fields_to[name] = max(self._fields_to.get(name, -np.inf), time)
+        self.begun_at = min(self.begun_at, time)
+        self._longest = max(self._longest, float(one.window[0]))
+
+    def _put(self, one: FieldSamples) -> None:
+        """Put an epoch to the others, or into the one of the same time."""
+        for k, known in enumerate(self.fields):
+            apart = not np.any(known.valid & one.valid)
+            if apart and abs(known.time[0] - one.time[0]) < SAME_TIME:
+                there = one.valid[..., None]
+                self.fields[k] = replace(
+                    known,
+                    window=np.maximum(known.window, one.window),
+                    phasor_sensor=np.where(there, one.phasor_sensor, known.phasor_sensor),
+                    phasor_cov=np.where(there[..., None], one.phasor_cov, known.phasor_cov),
+                )
+                return
+        self.fields.append(one)
+
+    # How far it goes
+
+    def _heard_to(self) -> dict[str, float]:
+        """Return until when each magnetometer was heard (s)."""
+        return {
+            stream.name: max(stream.samples.newest, self._fields_to.get(stream.name, self.begun_at))
+            for stream in self.streams
+        }
+
+    @property
+    def complete(self) -> float:
+        """Until when all were heard, or are not waited for any more (s)."""
+        if not np.isfinite(self.begun_at):
+            return -np.inf
+        heard, silent = self._heard_to(), self._silent()
+        waited = min(to for name, to in heard.items() if name not in silent)
+        return max(waited, self.inertial - LONGEST_WAIT)
+
+    def _silent(self) -> list[str]:
+        """Return which magnetometers are not waited for."""
+        heard = self._heard_to()
+        newest = max(heard.values())
+        return [n for n, to in heard.items() if newest - to > SILENCE + self._longest]
+
+    @property
+    def _newest(self) -> float:
+        heard = max(self._heard_to().values()) if np.isfinite(self.begun_at) else -np.inf
+        return max(self.imu.newest, heard)
+
+    @property
+    def _newest_field(self) -> float:
+        return self.complete
+
+    @property
+    def first(self) -> float:
+        """Oldest stamp of what is kept of the fields (s)."""
+        known = [stream.waveform.time[:1] for stream in self.streams]
+        known += [samples.time for samples in self.fields[:1]]
+        return float(np.min(np.concatenate(known), initial=np.inf))
+
+    @property
+    def next_field(self) -> float:
+        """When the next fields are measured (s), as far as is known."""
+        silent = self._silent()
+        live = [stream for stream in self.streams if stream.windows or stream.name not in silent]
+        known = [float(samples.time[0]) for samples in self.fields[:1]]
+        return min([*known, *(stream.next_centre for stream in live)], default=np.inf)
+
+    @property
+    def window_to_come(self) -> bool:
+        """Whether what is there of the fields waits for more."""
+        return bool(self.fields) or any(stream.to_come for stream in self.streams)
+
+    def due(self, inertial: float) -> bool:
+        """Return whether the oldest fields have all that there will be of their epoch."""
+        until = min(inertial, self.complete - self._delay) - self._slots_late
+        return bool(self.fields) and bool(self.fields[0].time[0] <= until)
+
+    @property
+    def _slots_late(self) -> float:
+        """How much later than a slot its phasor comes, at most (s)."""
+        grids = [
+            s.receiver.grid for s in self.streams if not isinstance(s.receiver, LockinReceiver)
+        ]
+        known = [grid.step * (grid.together + 1) + grid.wait for grid in grids if grid is not None]
+        marked = LATE if known and is_marked(self.site) else 0.0
+        return max(known, default=0.0) + marked
+
+    @property
+    def remarks(self) -> tuple[Finding, ...]:
+        """What is to be said of magnetometers that fell silent."""
+        heard = self._heard_to()
+        return tuple(
+            Finding(
+                "magnetometer_silent",
+                f"Magnetometer {name} has sent nothing since {heard[name]:.3f} s: the others go on"
+                " without it. Check its supply, its cable and its channel.",
+                Verdict.TRUSTWORTHY,
+            )
+            for name in self._silent()
+        )
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """What was of no use, with the magnetometer and the reason."""
+        found = super().losses
+        for stream in self.streams:
+            name = stream.name
+            counts = {f"window: {k}": v for k, v in stream.receiver.dropped.items()}
+            counts["window too late"] = stream.late
+            counts["sample too late"] = stream.samples.late
+            counts["epoch while it was silent"] = self.without[name]
+            found |= {f"magnetometer {name}: {k}": v for k, v in counts.items() if v}
+        return found
+
+    # How it goes on
+
+    def settle(self) -> None:
+        """Put what came last into its order."""
+        super().settle()
+        for stream in self.streams:
+            stream.samples.rows()
+
+    def gathered(self, delay: float, span: float) -> float | None:
+        """Return until when a first state is looked for (s), however large the pieces are."""
+        until = self.first + span
+        if not self.reached - delay >= until:
+            return None
+        self._looked = until
+        return until
+
+    def first_state(self, until: float, settings: EstimatorSettings) -> OnlineStart | NoStart:
+        """Return the first state by what was measured up to a time (s)."""
+        late = {sensor.name: sensor.clock_offset for sensor in self.site.platform.magnetometers}
+        waves = {}
+        for stream in self.streams:
+            wave = stream.waveform
+            wave = wave.rows(wave.time <= until)
+            if len(wave):
+                marks = stream.receiver.marks
+                waves[stream.name] = Waveform(
+                    wave.time - late[stream.name], wave.measured_sensor, marks
+                )
+        imu, known = self.inertial_samples(), until - self.applied_offset
+        kept = imu.time <= known
+        imu = ImuSamples(imu.time[kept], imu.gyro_body[kept], imu.accel_body[kept])
+        return find_online_start(
+            self.site, imu, self.waveform, self.fields, [], until, settings, None, waves
+        )
+
+    def forget_before_start(self, kept: float) -> None:
+        """Keep no more than so long before what was looked at last (s)."""
+        oldest = self._looked - kept
+        self.imu.forget(oldest, oldest)
+        self.fields = [s for s in self.fields if s.time[0] >= oldest]
+        for stream in self.streams:
+            stream.samples.forget(oldest, oldest)
+            stream.receiver.forget_marks(oldest)
+
+    def start(self, start: OnlineStart, delay: float) -> None:
+        """Go on from a first state, each receiver by its own samples."""
+        for stream in self.streams:
+            if isinstance(stream.receiver, LockinReceiver):
+                stream.receiver.beside = start.lines.get(stream.name)
+        super().start(start, delay)
+        self.receive(start.state, delay)
+
+    def receive(self, state: State, delay: float) -> None:
+        """Judge the windows of each that are complete and not too late for a delay (s)."""
+        self._delay = delay
+        imu = self.inertial_samples()
+        for k, stream in enumerate(self.streams):
+            until = min(self.awaited, stream.samples.newest) - delay
+            found = stream.receive(imu, until, self.last_epoch, state, self.applied_offset)
+            if found is None:
+                continue
+            for one in self._beside({k: found}).epochs():
+                self._put(one)
+        self.fields.sort(key=lambda s: float(s.time[0]))
+
+    def _beside(self, found: dict[int, FieldSamples]) -> FieldSamples:
+        """Return what some magnetometers measured as channels of all."""
+        none = FieldSamples.empty(self.streams[0].receiver.site.channels)
+        return side_by_side([found.get(k, none) for k in range(len(self.streams))], self.site)
+
+    def next_window(self, state: State, *, lost: bool = False) -> float | None:  # noqa: ARG002
+        """Go on to the next windows of all: return their centre (s); None where one may come."""
+        centre = min(stream.next_admitted for stream in self.streams)
+        grids = [s.receiver for s in self.streams if s.receiver.grid is not None]
+        if not np.isfinite(centre):
+            return None
+        steps = [r.admission.magnetometer_step for r in grids if r.admission is not None]
+        length = max(r.grid.length for r in grids if r.grid is not None)
+        whole = min(self.awaited, self.complete) - self._delay
+        if centre + 0.5 * length + 2.0 * max(steps) > whole:
+            return None
+        self._centre = centre
+        for stream in self.streams:
+            mine = stream.next_admitted - centre < SAME_TIME
+            stream.now = stream.windows.popleft() if mine else None
+        return centre
+
+    def forget(self, time: float) -> None:
+        """Keep the samples that are needed after a state (s)."""
+        reach = 2.0 + max(stream.receiver.history for stream in self.streams)
+        self.imu.forget(time - reach, time - self.applied_offset - 1.0)
+        for stream in self.streams:
+            stream.samples.forget(time - reach, time - reach)
+
+    def fill_silence(self, state: State, time: float) -> None:
+        """Do without the IMU where it is silent: no one magnetometer's samples stand in for it."""
+
+    # What comes out
+
+    def measured(
+        self,
+        before: State,
+        predicted: State,
+        samples: FieldSamples | None,
+        step: float,
+        *,
+        earth: bool,
+        standing: bool,
+        lost: bool = False,
+    ) -> Measured | None:
+        """Return what was measured at a prediction, as `Arrivals.measured`."""
+        self.without.update(self._silent())
+        return super().measured(
+            before, predicted, samples, step, earth=earth, standing=standing, lost=lost
+        )
+
+    def _demodulated(
+        self, before: State, predicted: State, *, lost: bool
+    ) -> MotionCompensated | None:
+        """Return the windows at a prediction, each by its own magnetometer; None for none."""
+        if self._centre != predicted.time:
+            return None
+        half = 0.5 * max(s.receiver.grid.length for s in self.streams if s.receiver.grid)
+        begin, end = min(before.time, predicted.time - half), predicted.time + half
+        imu, offset = self.motion_samples(begin - MARGIN, end + MARGIN), self.applied_offset
+        found: dict[int, MotionCompensated] = {}
+        for k, stream in enumerate(self.streams):
+            if stream.now is None:
+                continue
+            mine = replace(predicted, calibration=seen_by(predicted.calibration, k))
+            found[k] = stream.demodulated(before, mine, imu, offset, lost=lost)
+            stream.now = None
+        fields = self._beside({k: one.fields for k, one in found.items()})
+        fields = replace(fields, time=np.array([predicted.time]))
+        wave = MotionCompensated.of_slots(fields)
+        by_offset = wave.by_time_offset.copy()
+        for k, one in found.items():
+            by_offset[:, self.site.of_sensor(k)] = one.by_time_offset
+        return replace(wave, by_time_offset=by_offset)

@@ -1,0 +1,102 @@
+"""Inertial samples that take the place of those that never came, while the fields are heard."""
+
+import numpy as np
+
+from magfusion.estimation.data_checks.stream_buffer import Buffer
+from magfusion.estimation.graph.state import State
+from magfusion.model.samples import ImuSamples, Waveform
+from magfusion.receiver.admission import Admission, longest_step, silences
+from magfusion.units import Array
+
+LONGEST = 2.0  # s; that is followed from a known state
+REACH = 0.5  # s; of inertial samples about a stretch, to know whether one is missing
+
+
+class StandIn:
+    """What the magnetometer tells of the motion in the gaps of the inertial stream.
+
+    Attributes
+    ----------
+    time : ndarray, shape (n,)
+        On the IMU's clock (s).
+    rows : ndarray, shape (n, 6)
+        Rates and specific forces of the body (rad/s, m/s^2).
+    """
+
+    time: Array
+    rows: Array
+
+    def __init__(self) -> None:
+        self.time, self.rows = np.zeros(0), np.zeros((0, 6))
+
+    def fill(
+        self,
+        state: State,
+        until: float,
+        imu: Buffer,
+        waveform: Buffer,
+        offset: float,
+        admission: Admission,
+    ) -> None:
+        """Follow the motion from a state on, where the inertial stream has a gap.
+
+        Parameters
+        ----------
+        state : State
+            The last that is known.
+        until : float
+            (s)
+        offset : float
+            Added to the IMU's stamps (s).
+        """
+        stamps, heard = imu.between(state.time - offset - REACH, until - offset + REACH)
+        begin, end = silences(stamps + offset, admission.imu_step, admission.imu_margin)
+        # What is behind the newest sample is silent from it on.
+        begin[-1] -= admission.imu_margin
+        meets = (begin < until - admission.imu_margin) & (end > state.time)
+        if not np.any(meets) or state.calibration.site.platform.magnetometer.lacking:
+            return
+        time, rows = waveform.rows()
+        within = (time > state.time) & (time < until)
+        kept = self.time <= state.time - offset
+        self.time, self.rows = self.time[kept], self.rows[kept]
+        if until - state.time > LONGEST:
+            return
+        from magfusion.estimation.demodulation.motion_from_field import motion_from_field
+
+        inertial = ImuSamples(stamps + offset, heard[:, :3], heard[:, 3:])
+        part, step = Waveform(time[within], rows[within]), admission.imu_step
+        followed = motion_from_field(state, part, inertial, longest_step(step))
+        if followed is None:
+            return
+        found = followed.imu
+        silent = np.zeros(len(found), dtype=bool)
+        for first, last in zip(begin[meets], end[meets], strict=True):
+            silent |= (found.time > first + 0.5 * step) & (found.time < last - 0.5 * step)
+        own = np.hstack([found.gyro_body, found.accel_body])[silent]
+        self.time = np.append(self.time, found.time[silent] - offset)
+        self.rows = np.vstack([self.rows, own])
+        if silent[-1]:  # the last one's interval reaches to the end
+            self.time = np.append(self.time, until - offset)
+            self.rows = np.vstack([self.rows, own[-1:]])
+
+    def among(self, imu: ImuSamples, begin: float, end: float) -> ImuSamples:
+        """Return inertial samples with those that stand in between two stamps."""
+        if not self.covers(begin, end):
+            return imu
+        inside = (self.time >= begin) & (self.time <= end)
+        time, first = np.unique(np.append(imu.time, self.time[inside]), return_index=True)
+        gyro = np.vstack([imu.gyro_body, self.rows[inside, :3]])[first]
+        accel = np.vstack([imu.accel_body, self.rows[inside, 3:]])[first]
+        return ImuSamples(time, gyro, accel)
+
+    def covers(self, begin: float, end: float) -> bool:
+        """Tell whether anything stands in between two stamps."""
+        return len(self.time) > 0 and bool(np.any((self.time > begin) & (self.time < end)))
+
+    def forget(self, before: float) -> None:
+        """Drop what is older."""
+        if not len(self.time):
+            return
+        kept = self.time >= before
+        self.time, self.rows = self.time[kept], self.rows[kept]

@@ -1,0 +1,1 @@
+"""Integrity of a running estimate: gate, recovery, separation, levels."""

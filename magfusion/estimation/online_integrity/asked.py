@@ -1,0 +1,132 @@
+"""Whom the online score asks: everything that is held, or of many beacons those that are heard."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+
+from magfusion.estimation.graph.measurement import Measurement
+from magfusion.estimation.graph.state import MOTION
+from magfusion.estimation.integrity.held import gains
+from magfusion.estimation.integrity.suspects import Suspect, held_blocks, suspects
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.model.parameters import BeaconParameter, Block, dimension, prior_sigma
+from magfusion.model.prior import prior_sqrt_covariance
+from magfusion.model.site import Site
+from magfusion.units import Array, IntArray
+
+
+class Asked:
+    """What is held, and where it stands beside a state.
+
+    Parameters
+    ----------
+    site : Site
+        With those beacons that are asked.
+    estimated, considered : tuple of Block
+        Calibration parameters in the state's tangent, of all beacons.
+    steady : bool
+        Whether the steady field is measured.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        estimated: tuple[Block, ...],
+        considered: tuple[Block, ...],
+        *,
+        steady: bool,
+    ) -> None:
+        self.site, self.held = site, held_blocks(site, estimated, steady=steady)
+        self.names = tuple(beacon.name for beacon in site.beacons)
+        self.unit, self.size = prior_sigma(self.held), MOTION + dimension(estimated)
+        at = MOTION + dimension((*estimated, *considered))
+        self.blocks = tuple(
+            b._replace(columns=slice(at - MOTION + b.columns.start, at - MOTION + b.columns.stop))
+            for b in self.held
+        )
+        self.asked, self.whole = (*estimated, *considered, *self.blocks), at
+        among = [b for b in considered if _is_of(b, self.names)]
+        self.spread = self._declared(tuple(among))
+        # Of a state's tangent, what is considered of them.
+        self.rest = _columns(among)
+
+    @cached_property
+    def suspects(self) -> tuple[Suspect, ...]:
+        """What one mistake would have wrong; only what is asked for is made."""
+        return tuple(suspects(self.site, self.held))
+
+    @cached_property
+    def _alike(self) -> list[tuple[list[int], IntArray, Array]]:
+        """Suspects of one shape each: their numbers, rows of what is held, and how they combine."""
+        shapes: dict[tuple[int, ...], list[tuple[int, IntArray, Array]]] = {}
+        for k, one in enumerate(self.suspects):
+            rows = np.concatenate([np.arange(b.columns.start, b.columns.stop) for b in one.blocks])
+            combine = one.combine[rows]
+            shapes.setdefault(combine.shape, []).append((k, rows, combine))
+        found = []
+        for own in shapes.values():
+            numbers, rows_of, combines = zip(*own, strict=True)
+            found.append((list(numbers), np.stack(rows_of), np.stack(combines)))
+        return found
+
+    def gains(self, information: Array, gradient: Array) -> Array:
+        """Return what freeing each suspect would gain, shape (suspects,)."""
+        found = np.zeros(len(self.suspects))
+        for numbers, rows, combine in self._alike:
+            own = information[rows[:, :, None], rows[:, None, :]]
+            found[numbers] = gains(combine, own, gradient[rows])
+        return found
+
+    def among(self, other: "Asked") -> tuple[IntArray, IntArray]:
+        """Return the columns of what both hold, here and there."""
+        there = {block.key: block.columns for block in other.held}
+        both = [(b.columns, there[b.key]) for b in self.held if b.key in there]
+        here, far = (
+            np.concatenate([np.arange(s.start, s.stop) for s in one] or [np.zeros(0, dtype=int)])
+            for one in ([pair[k] for pair in both] for k in (0, 1))
+        )
+        return here, far
+
+    def _declared(self, considered: tuple[Block, ...]) -> Array:
+        """Return a root of the covariance that the site declares of what is held."""
+        if not considered:
+            return np.zeros((len(self.unit), 0))
+        start, own = 0, []
+        for block in considered:
+            own.append(block._replace(columns=slice(start, start + len(block.sigma))))
+            start += len(block.sigma)
+        spread = prior_sqrt_covariance(self.site, tuple(own))
+        at, out = {b.key: b.columns for b in self.held}, np.zeros((len(self.unit), len(spread)))
+        for block in own:
+            if block.key in at:
+                out[at[block.key]] = spread[block.columns]
+        return out / self.unit[:, None]
+
+
+def heard_in(measurements: Iterable[Measurement], site: Site) -> list[str]:
+    """Return the names of the beacons that some measurements tell of."""
+    told = np.zeros(len(site.channels), dtype=bool)
+    for one in measurements:
+        if isinstance(one, FieldPhasors):
+            told |= np.any(one.sqrt_information != 0.0, axis=(0, 2, 3))
+        elif isinstance(one, JointPhasors):
+            told |= np.any(one.felt, axis=0)
+    return [site.beacons[k].name for k in np.unique(site.owner[told]).tolist()]
+
+
+def of_beacons_named(site: Site, names: Iterable[str]) -> Site:
+    """Return a site with some of its beacons, in their order."""
+    wanted = set(names)
+    return replace(site, beacons=tuple(b for b in site.beacons if b.name in wanted))
+
+
+def _is_of(block: Block, names: tuple[str, ...]) -> bool:
+    return not isinstance(block.parameter, BeaconParameter) or block.owner in names
+
+
+def _columns(blocks: Iterable[Block]) -> IntArray:
+    own = [np.arange(MOTION + b.columns.start, MOTION + b.columns.stop) for b in blocks]
+    return np.concatenate([np.zeros(0, dtype=np.int64), *own])

@@ -1,0 +1,275 @@
+"""Filters without each beacon beside the running estimate: separation online, at constant cost.
+
+Each is kept as its deviation from the estimate, linearised where that is, with the covariance of
+both: what a false beacon did is in the estimate's prior for long, but never was in the filter
+without it, so that a slow fault is seen too.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.graph.measurement import Measurement, measured_rows
+from magfusion.estimation.graph.propagation import Propagated
+from magfusion.estimation.graph.state import MOTION, State, between
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
+from magfusion.estimation.measurements.phasors import FieldPhasors, leaves_out
+from magfusion.estimation.online_integrity.judgement import Judgement
+from magfusion.estimation.online_integrity.levels import Asked, Levels
+from magfusion.estimation.posterior.separation import LEAST, Separation, radii
+from magfusion.model.parameters import Block, dimension
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Risk, Verdict
+from magfusion.units import DEGREE, Array, IntArray
+
+MOST = 6  # filters; of more beacons some share one
+SLACK = 3.0  # sigma; a deviation below it is covered
+# Of what a filter without a beacon does not take over from a start that was made with all.
+WIDE = np.repeat([0.2, 0.3, 0.5], 3)  # rad, m, m/s
+NOBODY, TOGETHER = -1, -2  # groups of rows that are of no beacon, or of all
+OPEN_ROTATION, OPEN_POSITION = 0.3, 10.0  # rad, m; beyond, nothing else determines the pose
+
+
+class SubsetBank:
+    """Filters without each beacon, or without each of a few groups of them.
+
+    Parameters
+    ----------
+    blocks : tuple of Block
+        Calibration parameters in the states' tangent.
+    considered : int
+        Parameters at the tangent's end that are considered, not estimated.
+    """
+
+    _step: Array | None  # (groups, n); of each filter from the estimate
+    _cov: Array | None  # (1 + groups, n, n); of the filter with all, then of those without
+    _joint: Array | None  # (groups, n, n); of the errors of each with those of the one with all
+
+    def __init__(
+        self, site: Site, blocks: tuple[Block, ...], considered: int, risk: Risk | None = None
+    ) -> None:
+        self.blocks, self.considered = blocks, considered
+        last = dimension(blocks) - considered
+        self._estimated = tuple(block for block in blocks if block.columns.stop <= last)
+        self.risk = Risk() if risk is None else risk
+        self.names = [beacon.name for beacon in site.beacons]
+        self.groups = min(len(self.names), MOST)
+        members = np.bincount(np.arange(len(self.names)) % self.groups)
+        self._prior = np.array(self.risk.fault * members[None], dtype=np.float64)
+        self._step = self._cov = self._joint = None
+        names = [name for name, _ in site.channels]
+        self._owner = np.array([self.names.index(name) % self.groups for name in names])
+
+    def check(self, size: int) -> None:
+        """See that the filters are of states of a size, as a checkpoint gave them.
+
+        Raises
+        ------
+        ValueError
+            Where they are not.
+        """
+        parts = (self._step, self._cov, self._joint)
+        if all(part is None for part in parts):
+            return
+        shapes = ((self.groups, size), (1 + self.groups, size, size), (self.groups, size, size))
+        for part, shape in zip(parts, shapes, strict=True):
+            if part is None or part.shape != shape or not np.all(np.isfinite(part)):
+                raise ValueError("has filters of another shape, or not finite")
+
+    def forget(self) -> None:
+        """Begin anew: the estimate has."""
+        self._step = self._cov = self._joint = None
+
+    def absorb(
+        self, predicted: Propagated, measurements: Sequence[Measurement], after: State
+    ) -> None:
+        """Go on to where the estimate is now.
+
+        Parameters
+        ----------
+        predicted : Propagated
+            From the estimate before.
+        measurements : sequence of Measurement
+            Of this epoch, as the estimate took them in.
+        after : State
+            The estimate.
+        """
+        if self._step is None or self._step.shape[1] != len(after.cov):
+            self._begin(after)
+            return
+        assert self._cov is not None
+        assert self._joint is not None
+        motion, noise = predicted.transition[:MOTION], predicted.noise
+        step, cov, joint = (part.copy() for part in (self._step, self._cov, self._joint))
+        step[:, :MOTION] = step @ motion.T
+        for part in (cov, joint):
+            part[:, :MOTION] = motion @ part
+            part[:, :, :MOTION] = part @ motion.T
+            part += noise
+        error, jacobian, owner = self._rows(measurements, predicted.state)
+        taken = self._taken(jacobian, owner)
+        self._leave_out_together(measurements, owner, jacobian, taken)
+        if leaves_out(measurements):
+            kept = np.any(jacobian, axis=1)
+            error, jacobian, taken = error[kept], jacobian[kept], taken[:, kept]
+        # What is considered has no gain: only rows and columns of all else are updated.
+        count = cov.shape[1] - self.considered
+        own, considered = slice(0, count), slice(count, None)
+        crossed, back = taken @ cov, np.swapaxes(taken, 1, 2)
+        gain = self._gains(crossed[:, :, own], crossed @ back)
+        turned = np.swapaxes(gain, 1, 2)
+        innovation = error + step @ jacobian.T
+        step[:, own] -= (gain[1:] @ innovation[..., None])[..., 0]
+        step[:, own] -= between(predicted.state, after, self._estimated)
+        # Joseph's form: what is considered is not updated as would be best.
+        half = cov[:, own] - gain @ crossed
+        whole = half[:, :, own] + (gain - half @ back) @ turned
+        cov[:, own, own] = 0.5 * (whole + np.swapaxes(whole, 1, 2))
+        cov[:, own, considered] = half[:, :, considered]
+        cov[:, considered, own] = np.swapaxes(half[:, :, considered], 1, 2)
+        joint[:, own] -= gain[1:] @ (taken[1:] @ joint)
+        across = joint @ back[0]
+        joint[:, own, own] += gain[1:] @ turned[0]
+        joint[:, :, own] -= across @ turned[0]
+        self._step, self._cov, self._joint = step, cov, joint
+
+    def _begin(self, state: State) -> None:
+        size = len(state.cov)
+        self._step = np.zeros((self.groups, size))
+        self._joint = np.repeat(state.cov[None], self.groups, axis=0)
+        self._cov = np.repeat(state.cov[None], 1 + self.groups, axis=0)
+        own = np.arange(len(WIDE))
+        self._cov[1:, own, own] += WIDE**2
+
+    def _rows(
+        self, measurements: Sequence[Measurement], state: State
+    ) -> tuple[Array, Array, IntArray]:
+        """Return error, Jacobian and group of each row; negative of what is no beacon's."""
+        parts = [(measured_rows([], state, self.blocks), np.zeros(0, dtype=np.int64))]
+        for measurement in measurements:
+            rows = measured_rows([measurement], state, self.blocks)
+            if isinstance(measurement, FieldPhasors):
+                owner = np.repeat(self._owner, 6)
+            else:
+                together = isinstance(measurement, JointPhasors)
+                owner = np.full(len(rows[0]), TOGETHER if together else NOBODY)
+            parts.append((rows, owner))
+        error = np.concatenate([rows[0] for rows, _ in parts])
+        jacobian = np.concatenate([rows[1] for rows, _ in parts])
+        return error, jacobian, np.concatenate([owner for _, owner in parts])
+
+    def _taken(self, jacobian: Array, owner: IntArray) -> Array:
+        """Return the rows that every filter takes in, zero of what it leaves out."""
+        # The first filter leaves nobody out.
+        kept = np.arange(-1, self.groups)[:, None] != np.where(owner < 0, self.groups, owner)
+        return np.where(kept[:, :, None], jacobian, 0.0)
+
+    def _leave_out_together(
+        self, measurements: Sequence[Measurement], owner: IntArray, jacobian: Array, taken: Array
+    ) -> None:
+        """Leave out of rows of tones that are told together what each group can explain."""
+        rows = np.flatnonzero(owner == TOGETHER)
+        for measurement in measurements:
+            if isinstance(measurement, JointPhasors):
+                for group in range(self.groups):
+                    basis = measurement.spanned((self._owner == group)[None])[0]
+                    taken[1 + group, rows] -= basis @ (basis.T @ jacobian[rows])
+
+    def _gains(self, crossed: Array, spread: Array) -> Array:
+        """Return the gain of every filter, shape (1 + groups, estimated, rows)."""
+        innovation = spread + np.eye(spread.shape[1])
+        return np.asarray(np.swapaxes(np.linalg.solve(innovation, crossed), 1, 2))
+
+    def heard(self, judgement: Judgement, state: State) -> Judgement:
+        """Return what is said of a state with what the bank says of it, and its levels."""
+        found = self.separation(state)
+        if found is None or judgement.verdict is Verdict.FAILED:
+            return judgement
+        excess = self._excess(found)
+        if np.max(excess) <= 1.0:
+            # What the witnesses allow for is beyond what separation knows of.
+            wide, more = float(np.sqrt(judgement.inflation)), SLACK * float(np.sqrt(3.0))
+            beyond = (more * judgement.shift, more * judgement.turn / DEGREE)
+            asked = Asked(found, SLACK, self.risk, self._prior, wide, beyond)
+            return replace(judgement, levels=Levels(asked=asked))
+        worst = int(np.argmax(excess))
+        turn, shift = np.max(np.where(found.determined[0, :, None], found.shift[0], 0.0), axis=0)
+        text = (
+            f"The state with and without {self._called(worst)} differs by {1e3 * shift:.3g} mm,"
+            f" {excess[worst]:.3g} times what noise and survey explain: the beacons contradict each"
+            " other. Check their drive, and iron or a screen near one."
+        )
+        return replace(
+            judgement,
+            findings=(
+                *judgement.findings,
+                Finding("separation", text, weight=float(excess[worst])),
+            ),
+            turn=max(judgement.turn, float(turn)),
+            shift=max(judgement.shift, float(shift)),
+        )
+
+    def _excess(self, found: Separation) -> Array:
+        """Return the step of each filter, of its threshold; zeros where all are clearly below."""
+        step = np.add.reduceat(found.step[0] ** 2, (0, 3), axis=1)
+        own = np.add.reduceat(found.cov[0].diagonal(), (0, 3))
+        if (step <= SLACK**2 * own).all():
+            return np.zeros(self.groups)
+        return found.excess(self.risk, SLACK)[0]
+
+    def _called(self, group: int) -> str:
+        names = self.names[group :: self.groups]
+        return f"beacon {names[0]}" if len(names) == 1 else f"beacons {', '.join(names)}"
+
+    def separation(self, state: State) -> Separation | None:
+        """Return how the filters deviate from an estimate; None where there are none yet."""
+        if self._step is None or self._cov is None or self._joint is None:
+            return None
+        pose = np.s_[:, :6, :6]
+        # A copy: a state whose levels nobody has asked for yet must not keep the whole filters.
+        subset, joint = self._cov[1:][pose].copy(), self._joint[pose]
+        apart = subset + self._cov[:1][pose] - joint - np.swapaxes(joint, 1, 2)
+        variance = np.einsum("gii->gi", subset)
+        determined = (np.sum(variance[:, :3], axis=1) < OPEN_ROTATION**2) & (
+            np.sum(variance[:, 3:], axis=1) < OPEN_POSITION**2
+        )
+        count = (1, self.groups)
+        return Separation(
+            self._step[None, :, :6].copy(),
+            state.cov[None, :6, :6].copy(),
+            subset[None],
+            apart[None],
+            determined[None],
+            np.zeros(count),
+            np.full(count, 6),
+        )
+
+    def grown(self, transition: Array, noise: Array) -> Array:
+        """Return factors by which levels are larger where the inertial stream has led to, (n, 2).
+
+        Attitude, then position.  No norm that a level is made of grows by more than that, neither
+        of the estimate nor of a filter without a beacon nor of their distance.
+
+        Parameters
+        ----------
+        transition : ndarray, shape (n, 15, 15 or 15 + calibration)
+            From the state of the last epoch.
+        noise : ndarray, shape (n, 15, 15)
+            Since then.
+        """
+        if self._cov is None or self._joint is None:
+            return np.ones((len(transition), 2))
+        size = transition.shape[2]
+        cov, joint = self._cov[:, :size, :size], self._joint[:, :size, :size]
+        apart = cov[1:] + cov[:1] - joint - np.swapaxes(joint, 1, 2)
+        pose = transition[:, None, :6]
+        back = np.swapaxes(pose, 2, 3)
+        later = pose @ np.concatenate([cov, apart]) @ back
+        later[:, : len(cov)] += noise[:, None, :6, :6]
+        before, after = radii(np.concatenate([cov, apart])[:, :6, :6]), radii(later)
+        # What is known exactly, or separates nothing, has no share in a level.
+        shares = [
+            after[i] / np.where(before[i] > LEAST, before[i], np.inf) for i in range(len(before))
+        ]
+        return np.asarray(np.maximum(np.max(shares, axis=(0, 2)), 1.0))

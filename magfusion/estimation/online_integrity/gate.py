@@ -1,0 +1,101 @@
+"""Which channels of an epoch the prediction explains, and how well each beacon's field is."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from magfusion.estimation.graph.state import State
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.online_integrity.magnetometer_watch import MagnetometerWatch
+from magfusion.model.parameters import Block
+from magfusion.units import Array, BoolArray
+
+GATE = 38.3  # chi square of six components, one in a million
+LOST_EPOCHS = 5  # in a row, most of whose channels were refused: the state is wrong, not they
+Phasors = FieldPhasors | JointPhasors
+MEMORY = 0.95  # of the running mean of the distortion, an epoch
+
+
+class Gate:
+    """Refuses outliers, and notices when it is the state that is wrong.
+
+    Attributes
+    ----------
+    counts : Counter
+        Outliers by beacon.
+    distortion : dict of str to float
+        By beacon, running mean of the squared innovation in units of its expectation.
+    refused_in_a_row : int
+        Epochs most of whose channels were refused, up to now.
+    taken, refused : dict of str to float
+        Of the last epoch, by beacon, the mean squared innovation of the channels that were taken
+        and of those that were refused, in the same units.
+    """
+
+    counts: Counter[str]
+    distortion: dict[str, float]
+    refused_in_a_row: int
+    taken: dict[str, float]
+    refused: dict[str, float]
+
+    def __init__(
+        self,
+        channels: tuple[tuple[str, int], ...],
+        blocks: Sequence[Block],
+        watch: MagnetometerWatch,
+    ) -> None:
+        self.blocks, self.watch = tuple(blocks), watch
+        self.owner = np.array([name for name, _ in channels], dtype=object)
+        self._names = tuple(dict.fromkeys(name for name, _ in channels))
+        self._number = np.array([self._names.index(name) for name, _ in channels], dtype=np.int64)
+        self.counts = Counter()
+        self.distortion = {}
+        self.refused_in_a_row = 0
+        self.taken, self.refused = {}, {}
+
+    @property
+    def lost(self) -> bool:
+        """Whether the state is to be doubted rather than the measurements."""
+        return self.refused_in_a_row >= LOST_EPOCHS
+
+    def passed(
+        self, measurements: Phasors, state: State, valid: BoolArray, refused: BoolArray
+    ) -> Phasors:
+        """Return the measurements without the channels that a state does not explain.
+
+        Parameters
+        ----------
+        measurements : FieldPhasors or JointPhasors
+            Of one epoch.
+        valid, refused : bool ndarray, shape (channels,)
+            What the epoch holds, and what was refused before.
+        """
+        distance = measurements.alone().distances(state, self.blocks, GATE)
+        false = self.watch.heard(distance > GATE, valid)
+        rejected: BoolArray = np.asarray((distance > GATE) | refused | false) & valid
+        self._note(distance, valid)
+        self.taken = self._by_beacon(distance, valid & ~rejected)
+        self.refused = self._by_beacon(distance, rejected)
+        for name in self.owner[rejected]:
+            self.counts[f"outlier of {name}"] += 1
+        most = np.sum(rejected & ~false) > 0.5 * np.sum(valid & ~false)
+        self.refused_in_a_row = self.refused_in_a_row + 1 if most else 0
+        return measurements.without(rejected) if np.any(rejected) else measurements
+
+    def nothing_measured(self) -> None:
+        """Say that an epoch held no field."""
+        self.taken, self.refused = {}, {}
+
+    def _by_beacon(self, distance: Array, chosen: BoolArray) -> dict[str, float]:
+        own = self._number[chosen]
+        count = np.bincount(own, minlength=len(self._names)).tolist()
+        total = np.bincount(own, distance[chosen], len(self._names)).tolist()
+        each = zip(self._names, total, count, strict=True)
+        return {name: whole / number / 6.0 for name, whole, number in each if number}
+
+    def _note(self, distance: Array, valid: BoolArray) -> None:
+        for name, level in self._by_beacon(distance, valid).items():
+            before = self.distortion.get(name, level)
+            self.distortion[name] = MEMORY * before + (1.0 - MEMORY) * level

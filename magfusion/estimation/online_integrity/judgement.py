@@ -1,0 +1,148 @@
+"""What is said of one state online, and the state with a covariance that it allows."""
+
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from magfusion.estimation.graph.state import POSITION, ROTATION, State
+from magfusion.estimation.online_integrity.levels import Levels
+from magfusion.model.one_axis import opened_state, roll_is_open
+from magfusion.model.trust import Finding, Trust, Verdict, worst
+from magfusion.units import Array
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What the witnesses say of a state.
+
+    Parameters
+    ----------
+    findings : tuple of Finding
+        A failed one means that the platform is lost.
+    excluded : tuple of str
+        Beacons that the gate refused there.
+    inflation : float
+        Of the whole covariance, at least one.
+    turn, shift : float
+        What the attitude (rad) and the position (m) may be off by beyond that, one sigma an axis.
+    levels : Levels, optional
+        None where there are none.
+    heard : tuple of str
+        Beacons that were told from noise there, the motion inside the window taken off.
+    """
+
+    findings: tuple[Finding, ...] = ()
+    excluded: tuple[str, ...] = ()
+    inflation: float = 1.0
+    turn: float = 0.0
+    shift: float = 0.0
+    levels: Levels | None = None
+    heard: tuple[str, ...] = ()
+
+    @property
+    def protection_level_m(self) -> float | None:
+        """Radius that the position stays within (m), if there is one."""
+        return None if self.levels is None else self.levels.found[0]
+
+    @property
+    def protection_level_deg(self) -> float | None:
+        """Angle that the attitude stays within (deg), if there is one."""
+        return None if self.levels is None else self.levels.found[1]
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of the findings'."""
+        return worst(finding.verdict for finding in self.findings)
+
+    @property
+    def reasons(self) -> tuple[Finding, ...]:
+        """The findings that cast doubt, the most important first."""
+        return Trust(self.findings).reasons
+
+    @property
+    def remarks(self) -> tuple[Finding, ...]:
+        """What is said without doubt: the estimator copes with it."""
+        return Trust(self.findings).remarks
+
+    def beside(self, *findings: Finding) -> "Judgement":
+        """Return it with more to be said."""
+        return replace(self, findings=(*self.findings, *findings)) if findings else self
+
+    def honest(self, cov: Array) -> Array:
+        """Return the covariance of a state as its witnesses allow it; the same where they agree."""
+        if self.inflation == 1.0 and self.turn == 0.0 and self.shift == 0.0:
+            return cov
+        wide = self.inflation * cov
+        wide[ROTATION, ROTATION] += self.turn**2 * np.eye(3)
+        wide[POSITION, POSITION] += self.shift**2 * np.eye(3)
+        return wide
+
+    def estimators(self, cov: Array) -> Array:
+        """Return the covariance that the estimator itself claims: the inverse of `honest`."""
+        if self.inflation == 1.0 and self.turn == 0.0 and self.shift == 0.0:
+            return cov
+        narrow = cov.copy()
+        narrow[ROTATION, ROTATION] -= self.turn**2 * np.eye(3)
+        narrow[POSITION, POSITION] -= self.shift**2 * np.eye(3)
+        return narrow / self.inflation
+
+
+@dataclass(frozen=True)
+class Told:
+    """What was said of the state at a time (s)."""
+
+    time: float
+    judgement: Judgement
+    reset_counter: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedState(State):
+    """A state and what is said of it; its covariance is as wide as that demands.
+
+    Parameters
+    ----------
+    judgement : Judgement
+    reset_counter : int
+        How often the pose has jumped up to here, as `magfusion.estimation.online_integrity.resets`
+        has it: who follows a pose by its changes begins anew where it rises.
+    """
+
+    judgement: Judgement = Judgement()
+    reset_counter: int = 0
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the state is to be believed."""
+        return self.judgement.verdict
+
+    @property
+    def lost(self) -> bool:
+        """Whether the pose is a guess that nobody should use."""
+        return self.verdict is Verdict.FAILED
+
+
+def told_cov(state: State, judgement: Judgement) -> Array:
+    """Return the covariance of a state as it is told: with any roll that nothing tells."""
+    cov, site = judgement.honest(state.cov), state.calibration.site
+    if not roll_is_open(site):
+        return cov
+    turned = state.world_from_body, state.gyro_bias_body, site.platform.imu.gyro_bias_sigma
+    return opened_state(site, cov, *turned)
+
+
+def judged_state(state: State, judgement: Judgement, reset_counter: int = 0) -> JudgedState:
+    """Return a state of an estimator as it is told."""
+    told = {"cov": told_cov(state, judgement), "judgement": judgement}
+    own = {name: getattr(state, name) for name in _OF_STATE}
+    return JudgedState(**own | told | {"reset_counter": reset_counter})
+
+
+def parts_of(state: JudgedState) -> dict[str, Any]:
+    """Return the fields of a state by their names, to make one of another kind with them."""
+    return {name: getattr(state, name) for name in _OF_JUDGED}
+
+
+_OF_STATE = tuple(field.name for field in fields(State))
+_OF_JUDGED = tuple(field.name for field in fields(JudgedState))

@@ -1,0 +1,155 @@
+"""Metal that comes near a lone beacon: how much of its field it makes, and what that leaves.
+
+Of several beacons the one that is disturbed contradicts the others and is refused.  Of one there is
+nothing to compare with but the motion: its channels are refused one after the other, the rest moves
+the state, and a fix is as wrong as they are.  So the share of the field that the motion does not
+explain is estimated as it changes, and weighs as an error that epochs close by have in common:
+what passes is bridged by the inertial data, and the covariance says so.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magfusion.estimation.data_checks.running import Running, nothing
+from magfusion.estimation.graph.state import MOTION, State, states_of
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.online_integrity.judgement import Judgement
+from magfusion.estimation.online_integrity.recovery import EXPLAINED
+from magfusion.model.noise import model_error, paired_whitening
+from magfusion.model.parameters import Block
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding
+from magfusion.units import Array, BoolArray
+
+MEMORY = 0.15  # s; over which the share is averaged
+RELEASE = 1.0  # s; in which it is forgotten, as what passes comes back
+COMMON = 2.0  # s; for which epochs have the error of a hand-held thing in common
+QUIET = 1.0  # s; without it, before anything can have come
+BEYOND = 2.0  # times the declared model error
+SURE = 5.0  # sigma
+
+
+class NearMetal:
+    """The share of a lone beacon's field that came with something near it."""
+
+    _heard: Running  # squared share, and its variance were there nothing
+    _kept: float  # squared share that is believed
+    _time: float
+    _quiet: float  # s
+    _since: float | None
+
+    def __init__(self, site: Site, blocks: tuple[Block, ...]) -> None:
+        self.site, self.blocks = site, blocks
+        self.lone = len(site.beacons) == 1
+        self._heard, self._kept = nothing(2), 0.0
+        self._time, self._quiet, self._since = -np.inf, 0.0, None
+
+    @property
+    def comes(self) -> bool:
+        """Whether it was noticed at the last epoch: those before have some of it."""
+        return self._since == self._time
+
+    @property
+    def near(self) -> bool:
+        """Whether there is something."""
+        return self._since is not None
+
+    def weighed(self, phasors: FieldPhasors, state: State, valid: BoolArray) -> FieldPhasors:
+        """Return the phasors of an epoch, weighed by what is near.
+
+        Parameters
+        ----------
+        state : State
+            Predicted, as the prediction claims to know it.
+        valid : bool ndarray, shape (channels,)
+        """
+        if not self.lone or not np.any(valid):
+            return phasors
+        step = state.time - self._time if np.isfinite(self._time) else 0.0
+        self._time = state.time
+        power = np.sum(phasors.measured[0] ** 2, axis=1) / 3.0
+        self._hear(phasors, state, valid, power)
+        self._believe(min(step, COMMON))
+        if not self.near:
+            return phasors
+        alike = max(1.0, 2.0 * COMMON / max(step, 1e-6))
+        return _with_share(phasors, valid, self._kept * power, alike)
+
+    def _hear(self, phasors: FieldPhasors, state: State, valid: BoolArray, power: Array) -> None:
+        """Estimate the squared share of one epoch, by the score of its likelihood."""
+        own = phasors.alone()
+        rows = own.linearize(states_of([state]), state.calibration, self.blocks)
+        size = rows.error.shape[2]
+        error = rows.error[0, valid].reshape(-1)
+        jacobian = rows.jacobian(len(state.cov) - MOTION)[0, valid].reshape(len(error), -1)
+        spread = jacobian @ state.cov @ jacobian.T + np.eye(len(error))
+        shape = own.sqrt_information[0, valid] @ _in_phase(phasors.measured[0, valid])
+        alone = power[valid, None, None] * shape @ np.swapaxes(shape, 1, 2)
+        blocks = np.zeros((len(alone), size, len(alone), size))
+        channel = np.arange(len(alone))
+        blocks[channel, :, channel] = alone
+        along = blocks.reshape(len(error), -1)
+        weight = np.linalg.solve(spread, np.column_stack([along, error]))
+        shared, seen = weight[:, :-1], weight[:, -1]
+        information = float(np.sum(shared * shared.T))
+        share = (float(seen @ along @ seen) - float(np.trace(shared))) / information
+        found = np.array([share, 2.0 / information])
+        self._heard = self._heard.with_sample(found, state.time, MEMORY)
+
+    def _believe(self, step: float) -> None:
+        share, variance = self._heard.mean
+        sigma = np.sqrt(variance / max(self._heard.count, 1.0))
+        usual = BEYOND * float(np.max(model_error(self.site)))
+        self._kept *= float(np.exp(-2.0 * step / RELEASE))
+        if share > max(usual**2, SURE * sigma) and self._heard.count > 3.0:
+            if self._since is None and self._quiet >= QUIET:
+                self._since = self._time
+            self._kept = max(self._kept, min(share, EXPLAINED**2))
+            self._quiet = 0.0
+        elif self._kept < usual**2:
+            self._quiet, self._since = self._quiet + step, None
+
+    def said(self) -> Judgement:
+        """Return what is to be said of a state."""
+        if self._since is None:
+            return Judgement()
+        name, share = self.site.beacons[0].name, 100.0 * np.sqrt(self._kept)
+        text = (
+            f"The field of beacon {name} departs by {share:.2g} % from what site and motion say,"
+            f" since {self._since:.1f} s: metal or iron has come near it or the sensor. Take it"
+            " away, or wait until it has gone; the sigmas hold for it."
+        )
+        return Judgement((Finding("metal_near", text, weight=share),))
+
+
+def _in_phase(measured: Array) -> Array:
+    """Return the directions (n, 6, 3) of phasors (n, 6), real part first, at their phase."""
+    phasor = measured[:, :3] + 1j * measured[:, 3:]
+    turn = np.exp(0.5j * np.angle(np.sum(phasor**2, axis=1)))
+    both = np.stack([turn.real, turn.imag], axis=1)
+    return (both[:, :, None, None] * np.eye(3)).reshape(len(measured), 6, 3)
+
+
+def _with_share(
+    phasors: FieldPhasors, valid: BoolArray, variance: Array, alike: float
+) -> FieldPhasors:
+    """Return phasors whose components have an error more that so many epochs have in common.
+
+    Parameters
+    ----------
+    variance : ndarray, shape (channels,)
+        (T^2)
+    """
+    given = phasors.sqrt_information[0, :, :3, :3]
+    some = np.any(given, axis=2) & valid[:, None]  # components that the receiver lacks are zero
+    root = given * some[:, :, None] + np.eye(3) * ~some[:, None]
+    inverse = np.linalg.inv(root)
+    cov = inverse @ np.swapaxes(inverse, 1, 2) * (some[:, :, None] & some[:, None])
+    more = variance[:, None, None] * np.eye(3) * some[:, None]
+    before = np.ones(len(valid)) if phasors.excess is None else phasors.excess[0]
+    own, wide = cov / before[:, None, None] + more, cov + alike * more
+    less, more_wide = (np.trace(part, axis1=1, axis2=2) for part in (own, wide))
+    excess = np.divide(more_wide, less, out=np.ones_like(less), where=less > 0.0)
+    whitening = paired_whitening(wide[None], some[None])
+    return replace(phasors, sqrt_information=whitening, excess=excess[None])

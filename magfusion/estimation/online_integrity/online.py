@@ -1,0 +1,406 @@
+"""Witnesses of an online estimate: what is said of each state, at constant cost.
+
+Fields that the prediction explains worse than it claims; biases and calibration beyond what was
+declared; gravity and the Earth's field, two compasses that know nothing of beacons; fixes that
+find the platform elsewhere.  None of them knows the truth.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.special import chdtri
+
+from magfusion.estimation.data_checks.running import Running, nothing
+from magfusion.estimation.data_checks.steady_field import DOUBT, off_earth
+from magfusion.estimation.graph.state import MOTION, ROTATION, State
+from magfusion.estimation.online_integrity.gate import Gate
+from magfusion.estimation.online_integrity.judgement import Judgement
+from magfusion.model.parameters import (
+    Block,
+    Calibration,
+    difference,
+    initial_calibration,
+    prior_sigma,
+)
+from magfusion.model.samples import SteadyFields
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Verdict
+from magfusion.units import Array, BoolArray
+
+MEMORY = 10.0  # s; of the innovations and of the compasses
+LEAST_SPAN = 1.0  # s; of inertial data, before gravity is judged
+FADES = 20.0  # s; what was said of the beginning and may have passed since
+PASSING = {"not_converged", "diverged", "field_residuals", "geometry", "gap", "separation"}
+RESTARTS_MEMORY = 60.0  # s
+LEAST_EXCESS = 2.5  # mean square; the noise was tuned on the few seconds of the start
+SURE = 6.0
+BEYOND_HELP = 0.2  # rad; a bias that turns the vertical farther leaves no state to inflate
+TURNED = 1.0  # s; of a gyro bias, before the fields correct it
+LEAST_GAIN = 0.05  # of a prior variance; what is hardly determined does not move by itself
+OFTEN_REFUSED = 0.5  # of a beacon's epochs
+MANY_RESTARTS = 3.0
+PRIOR_EVERY = 1.0  # s
+LARGEST_INFLATION = 1e8
+PROBATION = 2.0  # s, after the platform was found again or an update failed
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """What an epoch brought beside the state.
+
+    Parameters
+    ----------
+    accel_world : ndarray, shape (3,), optional
+        Mean acceleration since the epoch before by the raw accelerometer, in world axes, as far as
+        gravity leaves one (m/s^2).
+    elapsed : float
+        Since that epoch (s).
+    steady : SteadyFields, optional
+        The steady field of the window.
+    repeats : float
+        How many epochs hold each sample of overlapping windows.
+    """
+
+    accel_world: Array | None = None
+    elapsed: float = 0.0
+    steady: SteadyFields | None = None
+    repeats: float = 1.0
+
+
+class OnlineWitness:
+    """What is known of the trust in a running estimate.
+
+    Parameters
+    ----------
+    estimated : tuple of Block
+        Calibration parameters that are estimated, first in the state's tangent.
+    """
+
+    _level: dict[str, Running]
+    _refused: dict[str, Running]
+    _repeats: float
+    _gravity: Running
+    _earth: Running
+    _restarts: Running
+    _uncertain_until: dict[str, float]
+    _elsewhere: float | None
+    _elsewhere_times: int
+    _began: float
+    _beginning: Judgement
+    _borrowed: dict[str, Array]
+    _prior_at: float
+    _prior: Judgement
+
+    def __init__(self, site: Site, estimated: tuple[Block, ...]) -> None:
+        self.site, self.estimated = site, estimated
+        self.channels = {b.name: len(b.tones) for b in site.beacons}
+        self._level, self._refused, self._repeats = {}, {}, 1.0
+        self._gravity, self._earth, self._restarts = nothing(3), nothing(3), nothing()
+        self._uncertain_until = {}
+        self._elsewhere, self._elsewhere_times = None, 0
+        self._began, self._prior_at, self._prior = 0.0, -np.inf, Judgement()
+        self._beginning = Judgement()
+        self._declared: Calibration | None = None
+        self._borrowed = {}
+        self._borrowed_variance: Array | None = None
+
+    # What is heard
+
+    def begin(self, time: float, said: Judgement, borrowed: Mapping[str, Array]) -> None:
+        """Begin with a first state (s), and what is said of the smoothed beginning.
+
+        Parameters
+        ----------
+        borrowed : mapping of str to ndarray
+            Variance that estimated parameters have of what was only considered.
+        """
+        self._began, self._beginning, self._borrowed = time, said, dict(borrowed)
+        self._borrowed_variance = None
+
+    def hear(self, state: State, gate: Gate, heard: Heard) -> None:
+        """Take in an epoch: the state after it, and what its gate said."""
+        time = state.time
+        for name, level in gate.taken.items():
+            before = self._level.get(name, nothing())
+            self._level[name] = before.with_sample(np.array([level]), time, MEMORY)
+        for name in {**gate.taken, **gate.refused}:
+            share = np.array([float(name in gate.refused and name not in gate.taken)])
+            before = self._refused.get(name, nothing())
+            self._refused[name] = before.with_sample(share, time, MEMORY)
+        self._repeats = heard.repeats
+        if heard.accel_world is not None:
+            accel, weight = heard.accel_world, heard.elapsed
+            self._gravity = self._gravity.with_sample(accel, time, MEMORY, weight)
+        if heard.steady is not None:
+            self._hear_steady(state, heard.steady)
+
+    def _hear_steady(self, state: State, steady: SteadyFields) -> None:
+        measured, earth = steady.measured_sensor[0], self.site.earth_field_world
+        if earth is None or not np.all(np.isfinite(measured)):
+            return
+        sensor = self.site.platform.magnetometer
+        field = np.linalg.solve(sensor.matrix, measured - sensor.offset)
+        field_world = state.world_from_body @ (sensor.body_from_sensor @ field)
+        self._earth = self._earth.with_sample(field_world - earth, state.time, MEMORY)
+
+    def uncertain(self, code: str, time: float) -> None:
+        """Doubt the states for a while, for a reason that has passed."""
+        self._uncertain_until[code] = time + PROBATION
+        if code == "found_again":
+            self._restarts = self._restarts.with_sample(np.ones(1), time, RESTARTS_MEMORY)
+
+    def forget_motion(self) -> None:
+        """Forget what was heard of a pose that was given up."""
+        self._level, self._refused = {}, {}
+        self._gravity, self._earth = nothing(3), nothing(3)
+        self._elsewhere, self._elsewhere_times = None, 0
+
+    def compared(self, distance: float, off: float) -> None:
+        """Take in how a fix compares: its squared distance and how far off it is (m).
+
+        Parameters
+        ----------
+        distance : float
+            Chi square of six components.
+        """
+        if distance < chdtri(6, 1e-6):
+            self._elsewhere, self._elsewhere_times = None, 0
+        else:
+            self._elsewhere, self._elsewhere_times = off, self._elsewhere_times + 1
+
+    @property
+    def asks_for_a_fix(self) -> bool:
+        """Whether a fix that disagreed should be followed by another at once."""
+        return self._elsewhere is not None
+
+    # What is said
+
+    def judgement(
+        self, state: State, gate: Gate, lost_since: float | None, held: Judgement
+    ) -> Judgement:
+        """Return what is to be said of a state, with what is said of all that it holds."""
+        parts = [
+            held,
+            self._of_the_beginning(state.time),
+            self._of_being_lost(gate, lost_since),
+            self._of_fields(),
+            self._of_biases(state),
+            self._of_calibration(state),
+            self._of_gravity(),
+            self._of_earth(state),
+            self._of_what_happened(state.time),
+            self._of_fixes(),
+        ]
+        return Judgement(
+            findings=tuple(finding for part in parts for finding in part.findings),
+            excluded=tuple(sorted(set(gate.refused))),
+            inflation=min(LARGEST_INFLATION, max(part.inflation for part in parts)),
+            turn=max(part.turn for part in parts),
+            shift=max(part.shift for part in parts),
+        )
+
+    def _of_the_beginning(self, time: float) -> Judgement:
+        """Return what was said of the beginning: what is of the site stays, what passes fades."""
+        said, findings = self._beginning, self._beginning.findings
+        if time >= self._began + FADES:
+            findings = tuple(f for f in findings if f.code not in PASSING)
+        return replace(said, findings=findings) if findings else Judgement()
+
+    def _of_being_lost(self, gate: Gate, since: float | None) -> Judgement:
+        if since is not None:
+            text = (
+                f"Lost since {since:.1f} s: no fix explains the fields, nor does the state. Look at"
+                " the frequencies, phases and positions of the beacons in the site."
+            )
+            return Judgement((Finding("lost", text, Verdict.FAILED, 10.0),))
+        if gate.refused_in_a_row == 0 or not gate.refused:
+            return Judgement()
+        levels = [*gate.refused.values(), *gate.taken.values()]
+        excess = max(1.0, float(np.mean(levels)) if levels else 1.0)
+        text = (
+            f"The fields of {_listed(gate.refused)} were refused together for"
+            f" {gate.refused_in_a_row} epochs: a disturbance, or the state is wrong."
+        )
+        return Judgement((Finding("field_innovations", text, weight=excess),), inflation=excess)
+
+    def _of_fields(self) -> Judgement:
+        found, inflation = [], 1.0
+        for name, level in self._level.items():
+            mean, worth = float(level.mean[0]), level.count / self._repeats
+            limit = 1.0 + DOUBT * np.sqrt(2.0 / (6.0 * self.channels[name] * max(worth, 0.2)))
+            limit = max(limit, LEAST_EXCESS)
+            if mean > limit:
+                inflation = max(inflation, self._repeats * mean)
+                text = (
+                    f"The field of beacon {name} deviates from its prediction by"
+                    f" {np.sqrt(mean):.2g} times what is claimed over the last {MEMORY:g} s: iron"
+                    " nearby, a wrong survey of it, or motion that the IMU did not measure."
+                )
+                found.append(Finding("field_innovations", text, weight=mean / limit))
+        for name, share in self._refused.items():
+            often = float(share.mean[0])
+            if often > OFTEN_REFUSED and share.count > 4.0:
+                text = (
+                    f"The field of beacon {name} was refused in {100 * often:.0f} % of the last"
+                    f" {MEMORY:g} s: it is moved, disturbed or not as the site says."
+                )
+                found.append(Finding("beacon_excluded", text, weight=often / OFTEN_REFUSED))
+        return Judgement(tuple(found), inflation=inflation)
+
+    def _of_biases(self, state: State) -> Judgement:
+        if not self.site.platform.inertial:
+            return Judgement()
+        imu, elapsed = self.site.platform.imu, state.time - self._began
+        found, inflation, turn, variance = [], 1.0, 0.0, state.cov.diagonal()
+        for code, name, bias, sigma, walk, first, unit in (
+            ("accel_bias", "accelerometer", state.accel_bias_body, imu.accel_bias_sigma,
+             imu.accel_bias_walk, 9, "m/s^2"),
+            ("gyro_bias", "gyro", state.gyro_bias_body, imu.gyro_bias_sigma, imu.gyro_bias_walk,
+             12, "rad/s"),
+        ):  # fmt: skip
+            prior = sigma**2 + walk**2 * elapsed
+            own = variance[first : first + 3]
+            score = np.abs(bias) / np.sqrt(np.maximum(prior - own, LEAST_GAIN * prior))
+            axis = int(score.argmax())
+            worst = float(score[axis])
+            if worst < DOUBT:
+                continue
+            size = float(np.linalg.norm(bias))
+            off = size / self.site.gravity if code == "accel_bias" else size * TURNED
+            verdict = Verdict.FAILED if worst > SURE and off > BEYOND_HELP else Verdict.DOUBTFUL
+            text = (
+                f"The bias of the {name}'s {'xyz'[axis]} axis is {bias[axis]:.3g} {unit},"
+                f" {worst:.0f} times what is declared: axes, signs or units of the IMU, its"
+                " mounting to the magnetometer, or a declared sigma that is too small."
+            )
+            found.append(Finding("imu_bias", text, verdict, worst / DOUBT))
+            inflation, turn = max(inflation, worst**2), max(turn, off)
+        return Judgement(tuple(found), inflation=inflation, turn=turn)
+
+    def _of_calibration(self, state: State) -> Judgement:
+        if not self.estimated:
+            return self._prior
+        if state.time < self._prior_at + PRIOR_EVERY:
+            return self._prior
+        self._prior_at = state.time
+        declared = self._declared
+        if declared is None or declared.reference_time != state.calibration.reference_time:
+            declared = initial_calibration(self.site, state.calibration.reference_time)
+            self._declared = declared
+        change = difference(declared, state.calibration, self.estimated)
+        left = np.diagonal(state.cov)[MOTION : MOTION + len(change)]
+        walk = self._walk * (state.time - self._began) / 3600.0
+        prior = self._declared_variance + walk
+        if self._borrowed_variance is None:  # also where a checkpoint brought it
+            own = (self._borrowed.get(b.name, np.zeros(len(b.sigma))) for b in self.estimated)
+            self._borrowed_variance = np.concatenate(list(own))
+        # What was only considered moves the estimate, and its error with it: it is in both.
+        both = 2.0 * np.minimum(self._borrowed_variance, left)
+        gained = np.maximum(prior - left + both, LEAST_GAIN * prior)
+        scores, usual = np.abs(change) / np.sqrt(gained), np.maximum(prior, gained)
+        of_site, found, inflation = self._of_site, [], 1.0
+        total = float((change**2 / usual)[of_site].sum())
+        number = int(np.count_nonzero(of_site))
+        for block in self.estimated if scores[of_site].max(initial=0.0) > DOUBT else ():
+            score = float(np.max(scores[block.columns]))
+            if not block.parameter.of_log and score > DOUBT:
+                text = (
+                    f"{block.name} came out {score:.1f} times what its declared sigma allows: a"
+                    " wrong value in the site, or a sigma that is too small."
+                )
+                found.append(Finding("prior", text, weight=score / DOUBT))
+                inflation = max(inflation, score**2)
+        if number and total > (limit := float(chdtri(number, 1e-5))):
+            text = (
+                f"Together the {number} calibration parameters are {np.sqrt(total / number):.2g}"
+                " times as far from their declared values as their sigmas say."
+            )
+            found.append(Finding("prior", text, weight=total / limit))
+            inflation = max(inflation, total / number)
+        self._prior = Judgement(tuple(found), inflation=inflation)
+        return self._prior
+
+    @cached_property
+    def _of_site(self) -> BoolArray:
+        """Which of the estimated parameters are no log's own."""
+        own = [np.full(len(b.sigma), not b.parameter.of_log) for b in self.estimated]
+        return np.concatenate(own)
+
+    @cached_property
+    def _walk(self) -> Array:
+        """Variance that each estimated parameter gains in an hour."""
+        own = (b.parameter.walk_per_sqrt_hour(self.site) ** 2 for b in self.estimated)
+        return np.repeat(list(own), [len(b.sigma) for b in self.estimated])
+
+    @cached_property
+    def _declared_variance(self) -> Array:
+        return np.asarray(prior_sigma(self.estimated) ** 2)
+
+    def _of_gravity(self) -> Judgement:
+        """Judge what is left of the mean specific force: no platform falls for seconds."""
+        span = self._gravity.weight  # s that are heard, without the gaps of the IMU
+        if span < LEAST_SPAN or not self.site.platform.inertial:
+            return Judgement()
+        left = float(np.linalg.norm(self._gravity.mean))
+        motion, imu = self.site.platform.motion, self.site.platform.imu
+        sigma = np.hypot(np.sqrt(2.0) * motion.speed_sigma / span, imu.accel_bias_sigma)
+        score = left / sigma
+        if score < DOUBT:
+            return Judgement()
+        angle = left / self.site.gravity
+        verdict = Verdict.FAILED if angle > 2.0 * BEYOND_HELP else Verdict.DOUBTFUL
+        text = (
+            f"The mean specific force of the last {MEMORY:g} s leaves {left:.2g} m/s^2 beside"
+            " gravity at the estimated attitude: axes or signs of the IMU, its mounting to the"
+            " magnetometer, or gravity removed from its data."
+        )
+        return Judgement((Finding("gravity_direction", text, verdict, score / DOUBT),), turn=angle)
+
+    def _of_earth(self, state: State) -> Judgement:
+        if self._earth.weight < 5.0:
+            return Judgement()
+        attitude, cov = state.world_from_body, state.cov[ROTATION, ROTATION]
+        off = off_earth(self.site, self._earth.mean, attitude @ cov @ attitude.T)
+        if off is None:
+            return Judgement()
+        return Judgement((off.finding,), turn=off.turn, shift=off.shift(state.position_world))
+
+    def _of_what_happened(self, time: float) -> Judgement:
+        found = []
+        for code, until in self._uncertain_until.items():
+            if time < until:
+                found.append(Finding(code, _PASSED[code], weight=0.5))
+        restarts = self._restarts
+        kept = np.exp(-max(0.0, time - restarts.time) / RESTARTS_MEMORY) * restarts.weight
+        if kept > MANY_RESTARTS - 1.0:
+            text = (
+                f"The platform was lost about {kept:.0f} times in the last minute: fields and"
+                " inertial data lead apart. Look at the axes, signs, units and stamps of the IMU."
+            )
+            verdict = Verdict.FAILED if kept > 2.0 * MANY_RESTARTS else Verdict.DOUBTFUL
+            found.append(Finding("restarts", text, verdict, weight=kept / MANY_RESTARTS))
+        return Judgement(tuple(found))
+
+    def _of_fixes(self) -> Judgement:
+        if self._elsewhere is None:
+            return Judgement()
+        text = (
+            f"A fix of one epoch alone finds the platform {self._elsewhere:.2g} m away: the state"
+            " is in a mirrored place, or the survey of a beacon is wrong."
+        )
+        return Judgement(
+            (Finding("fix_disagrees", text, weight=float(self._elsewhere_times)),),
+            shift=self._elsewhere,
+        )
+
+
+_PASSED = {
+    "found_again": "The platform was lost, and found again by a fix of one epoch.",
+    "update_failed": "An update of the estimator failed: the state was predicted alone.",
+}
+
+
+def _listed(names: dict[str, float]) -> str:
+    return ", ".join(sorted(names)) or "the beacons"

@@ -1,0 +1,211 @@
+"""Epochs that the online score has not heard yet, and what all of them together tell it.
+
+What it makes of an epoch is asked for every few seconds only, and of several it costs little more
+than of one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.estimation.graph.measurement import Measurement, Rows, joined, kind_of
+from magfusion.estimation.graph.state import MOTION, State, states_of
+from magfusion.estimation.integrity.suspects import Inertial, Stream
+from magfusion.estimation.measurements.earth import EarthField
+from magfusion.estimation.measurements.joint_phasors import JointPhasors
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
+from magfusion.estimation.online_integrity.asked import Asked
+from magfusion.model.parameters import Calibration
+from magfusion.model.samples import ImuSamples
+from magfusion.units import Array
+
+MEMORY = 60.0  # s; older innovations count less, for what is wrong may have changed
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """Of the innovations up to now, in typical errors of what is held.
+
+    Parameters
+    ----------
+    information : ndarray, shape (h, h)
+    gradient : ndarray, shape (h,)
+    response : ndarray, shape (15 + estimated, h)
+        What a unit of an error in them has done to the state.
+    time : float
+        (s)
+    """
+
+    information: Array
+    gradient: Array
+    response: Array
+    time: float
+
+
+class Passed(NamedTuple):
+    """What led to an epoch.
+
+    Parameters
+    ----------
+    transition : ndarray, shape (n, n)
+        Of the tangent.
+    world_from_body : tuple of ndarray, shape (3, 3)
+        Before and after.
+    gyro_body, accel_body : ndarray, shape (3,)
+        Their means (rad/s, m/s^2); zero where nothing was measured.
+    """
+
+    transition: Array
+    world_from_body: tuple[Array, Array]
+    gyro_body: Array
+    accel_body: Array
+
+
+class Epoch(NamedTuple):
+    """An epoch that waits to be heard.
+
+    Parameters
+    ----------
+    predicted : State
+    passed : Passed, optional
+        None where the state stayed.
+    measurements : tuple of Measurement
+        As the gate has left them.
+    """
+
+    predicted: State
+    passed: Passed | None
+    measurements: tuple[Measurement, ...] = ()
+
+
+def passed(before: State, after: State, transition: Array, imu: ImuSamples) -> Passed:
+    """Return what led to a prediction, of the inertial samples of the interval."""
+    gyro = accel = np.zeros(3)
+    if len(imu):
+        share = np.full(len(imu), 1.0 / len(imu))
+        gyro, accel = share @ imu.gyro_body, share @ imu.accel_body
+    return Passed(transition, (before.world_from_body, after.world_from_body), gyro, accel)
+
+
+def heard(sums: Sums, epochs: Sequence[Epoch], asked: Asked) -> Sums:
+    """Return the sums with the innovations of some epochs in a row."""
+    own, rest = slice(0, asked.size), asked.rest
+    error, jacobian = _rows(epochs, asked)
+    by_state, by_held = jacobian[..., : asked.whole], jacobian[..., asked.whole :] * asked.unit
+    cov = np.array([epoch.predicted.cov for epoch in epochs])
+    by_own, across, noise = by_state[..., own], by_state @ cov, np.eye(error.shape[1])
+    innovation = across @ np.swapaxes(by_state, 1, 2) + noise
+    alone = cov[:, own, own]
+    if len(rest):
+        considered = cov[:, rest]
+        learnt = np.linalg.solve(considered[:, :, rest], considered[:, :, own])
+        alone = alone - np.swapaxes(considered[:, :, own], 1, 2) @ learnt
+    known = by_own @ alone @ np.swapaxes(by_own, 1, 2) + noise
+    gain = np.swapaxes(np.linalg.solve(innovation, across[..., own]), 1, 2)
+    pushed, response = _pushed(epochs, asked), sums.response
+    shown = np.empty((*error.shape, len(asked.unit)))
+    for k, epoch in enumerate(epochs):
+        if epoch.passed is not None:
+            response = epoch.passed.transition[own, own] @ response
+            response[:9] -= pushed[k]
+        shown[k] = by_own[k] @ response - by_held[k]
+        response = response - gain[k] @ shown[k]
+    symmetric = 0.5 * (known + np.swapaxes(known, 1, 2))
+    solved = np.linalg.solve(symmetric, np.concatenate([shown, error[..., None]], axis=2))
+    told = np.swapaxes(shown, 1, 2) @ solved
+    time = np.maximum.accumulate([sums.time, *(epoch.predicted.time for epoch in epochs)])
+    kept = np.exp((time - time[-1]) / MEMORY)
+    whole = np.einsum("k,kij->ij", kept[1:], told)
+    return Sums(
+        kept[0] * sums.information + whole[:, :-1],
+        kept[0] * sums.gradient + whole[:, -1],
+        response,
+        float(time[-1]),
+    )
+
+
+def _pushed(epochs: Sequence[Epoch], asked: Asked) -> Array:
+    """Return what a unit of each error of the inertial sensors takes off, (epochs, 9, h)."""
+    out = np.zeros((len(epochs), 9, len(asked.unit)))
+    rows = [k for k, epoch in enumerate(epochs) if epoch.passed is not None]
+    led = [epoch.passed for epoch in epochs if epoch.passed is not None]
+    if not led:
+        return out
+    gyro, accel = (
+        np.array([getattr(p, name) for p in led]) for name in ("gyro_body", "accel_body")
+    )
+    turns = np.array([turn for p in led for turn in p.world_from_body])
+    stream = Stream(ImuSamples(np.arange(len(led), dtype=np.float64), gyro, accel), turns)
+    by_bias = np.array([p.transition[:9, 9:MOTION] for p in led])
+    for block in asked.held:
+        if isinstance(block.parameter, Inertial):
+            bias = block.parameter.as_bias(stream)
+            bias = bias[::2] if block.parameter.of_states else bias
+            out[rows, :, block.columns] = by_bias @ (bias * asked.unit[block.columns])
+    return out
+
+
+def _rows(epochs: Sequence[Epoch], asked: Asked) -> tuple[Array, Array]:
+    """Return errors (epochs, m) and Jacobians (epochs, m, whole + h), zero where there are less.
+
+    Rows that say nothing of the state are zero.
+    """
+    width, parts = asked.whole - MOTION + len(asked.unit), [list[_Row]() for _ in epochs]
+    alike: dict[object, list[tuple[int, Measurement]]] = {}
+    for k, epoch in enumerate(epochs):
+        for number, measurement in enumerate(epoch.measurements):
+            key = _alike(measurement, epoch.predicted.calibration, (k, number))
+            alike.setdefault(key, []).append((k, measurement))
+    for group in alike.values():
+        numbers = [k for k, _ in group]
+        states = [epochs[k].predicted for k in numbers]
+        rows = _linearized([measurement for _, measurement in group], states, asked)
+        jacobian = rows.jacobian(width).reshape(len(group), -1, MOTION + width)
+        error = rows.error.reshape(len(group), -1)
+        for k, *row in zip(numbers, error, jacobian, strict=True):
+            parts[k].append(_Row(*row))
+    most = max((sum(len(one.error) for one in own) for own in parts), default=0)
+    errors, jacobians = np.zeros((len(epochs), most)), np.zeros((len(epochs), most, MOTION + width))
+    for k, own in enumerate(parts):
+        begin = 0
+        for one in own:
+            end = begin + len(one.error)
+            errors[k, begin:end], jacobians[k, begin:end] = one
+            begin = end
+    untold = ~np.any(jacobians[..., : asked.whole], axis=2)
+    errors[untold], jacobians[untold] = 0.0, 0.0
+    return errors, jacobians
+
+
+class _Row(NamedTuple):
+    error: Array
+    jacobian: Array
+
+
+_OFFSET = (FieldPhasors, JointPhasors, EarthField)  # that know what offset the IMU was cut with
+
+
+def _alike(measurement: Measurement, calibration: Calibration, alone: tuple[int, int]) -> object:
+    """Return what measurements have in common that can be linearised at once."""
+    if isinstance(measurement, ZeroVelocity):  # which no calibration changes
+        return kind_of(measurement)
+    if not isinstance(measurement, _OFFSET):
+        return alone
+    own = (calibration.site, calibration.phase, calibration.drift, calibration.log_gain)
+    return kind_of(measurement), *map(id, own), id(calibration.others), calibration.imu_begin
+
+
+def _linearized(parts: list[Measurement], states: list[State], asked: Asked) -> Rows:
+    """Return the weighed rows of measurements of one kind, an epoch each."""
+    calibration = states[0].calibration
+    (whole,) = parts if len(parts) == 1 else joined(parts, range(len(parts)))
+    if len(parts) > 1 and isinstance(whole, _OFFSET):
+        # What the time offset of each is more than that of the first.
+        own = (s.calibration.imu_offset(t) for s, t in zip(states, whole.time, strict=True))
+        more = calibration.imu_offset(whole.time) - np.array(list(own))
+        whole = replace(whole, applied_offset=whole.applied_offset + more)
+    rows = whole.linearize(states_of(states), calibration, asked.asked)
+    return rows.weighed(whole.loss)[0]

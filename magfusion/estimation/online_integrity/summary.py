@@ -1,0 +1,90 @@
+"""What is to be said of a run, from what was said of its states as they were made."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.estimation.online_integrity.judgement import Judgement
+from magfusion.model.trust import Finding, Trust, Unverified, Verdict
+
+
+@dataclass(frozen=True)
+class Noted:
+    """A finding as it spoke most strongly, and the states that it was said of.
+
+    Parameters
+    ----------
+    first, last : float
+        Of those states (s).
+    states : int
+    """
+
+    finding: Finding
+    first: float
+    last: float
+    states: int = 1
+
+
+class Summary:
+    """Of all states up to now.
+
+    Attributes
+    ----------
+    unverified : tuple of Unverified
+        What the beginning could not check.
+    lost_states, lost_time, longest_loss : int, float, float
+        How many states were lost, how long in all, and how long at most until found again (s).
+    """
+
+    unverified: tuple[Unverified, ...]
+    lost_states: int
+    lost_time: float
+    longest_loss: float
+    _noted: dict[str, Noted]
+    _states: int
+    _lost_since: float | None
+    _last: float
+
+    def __init__(self) -> None:
+        self.unverified = ()
+        self.lost_states, self.lost_time, self.longest_loss = 0, 0.0, 0.0
+        self._noted, self._states, self._lost_since, self._last = {}, 0, None, -np.inf
+
+    def note(self, time: float, judgement: Judgement) -> None:
+        """Take in what was said of a state (s)."""
+        self._states += 1
+        if self._lost_since is not None:
+            self.lost_time += time - self._last
+            self.longest_loss = max(self.longest_loss, time - self._lost_since)
+        if judgement.verdict is Verdict.FAILED:
+            self.lost_states += 1
+            self._lost_since = time if self._lost_since is None else self._lost_since
+        else:
+            self._lost_since = None
+        self._last = time
+        for finding in judgement.findings:
+            self._add(time, finding)
+
+    def _add(self, time: float, finding: Finding) -> None:
+        before = self._noted.get(finding.code)
+        if before is None:
+            self._noted[finding.code] = Noted(finding, time, time)
+            return
+        strength = (finding.verdict.rank, finding.weight)
+        known = (before.finding.verdict.rank, before.finding.weight)
+        strongest = finding if strength > known else before.finding
+        states = before.states + (time > before.last)
+        self._noted[finding.code] = Noted(strongest, before.first, time, states)
+
+    @property
+    def trust(self) -> Trust:
+        """The worst of all states; but a loss that was found again leaves a doubt alone."""
+        found = []
+        for noted in self._noted.values():
+            finding = noted.finding
+            if finding.verdict is Verdict.FAILED and self._lost_since is None:
+                finding = replace(finding, verdict=Verdict.DOUBTFUL)
+            share = f" ({noted.states} of {self._states} states,"
+            share += f" {noted.first:.1f} to {noted.last:.1f} s)"
+            found.append(replace(finding, text=finding.text + share))
+        return Trust(tuple(found), self.unverified)

@@ -1,0 +1,1 @@
+"""What a solved graph gives beside its states: marginals, redundancy, noise."""

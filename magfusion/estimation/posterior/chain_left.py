@@ -1,0 +1,100 @@
+"""What is left of parameters that are held when all states and the calibration are eliminated.
+
+A stretch of the log at a time: the rows of all of it, with hundreds of columns, would be gigabytes.
+"""
+
+import numpy as np
+
+from magfusion.estimation.graph.factors import Factors
+from magfusion.estimation.graph.graph import Estimate, Graph
+from magfusion.estimation.graph.state import states_in
+from magfusion.estimation.posterior.chain_system import Normal, Piece, add_prior, field_piece
+from magfusion.estimation.posterior.native_rows import Columns, NativeRows
+from magfusion.estimation.solve.chain import inverses
+from magfusion.units import Array
+
+STRETCH = 128  # states that are eliminated at once
+
+
+def left_over(graph: Graph, estimate: Estimate, beside: Columns, native: NativeRows) -> Array:
+    """Return the normal equations of what is held, all that is estimated eliminated.
+
+    Of a log that has one calibration all along, whose prior is in the graph.
+
+    Returns
+    -------
+    ndarray, shape (1 + columns, 1 + columns)
+        Products of what the estimate leaves of the residual and of each column, the latter with
+        the sign of a right side: the gradient of the columns downhill is minus their products with
+        the residual.
+    """
+    count, carried = 1 + beside.number, None
+    states, whole = states_in(estimate.values), Normal(0, _size(graph), beside.number)
+    add_prior(whole, graph, estimate)
+    size = len(whole.corner)
+    gram = np.zeros((count + size, count + size))  # of right sides, then of the border
+    gram[:count, count:], gram[count:, count:] = whole.right_border.T, whole.corner
+    for begin in range(0, graph.epochs, STRETCH):
+        end = min(begin + STRETCH, graph.epochs)
+        normal = Normal(min(end + 1, graph.epochs) - begin, size, beside.number)
+        if carried is not None:
+            normal.diagonal[0], normal.sides[0] = carried
+        for epoch, own, after, border, right in native.of(beside, begin, end):
+            normal.add(epoch - begin, own, after, border, right)
+            _count(gram[:count, :count], right)
+        for factors in graph.factors:
+            every = factors.measurement.epoch
+            inside = (every >= begin) & (every < end)
+            if not np.any(inside):
+                continue
+            part = Factors(factors.measurement.rows(inside), graph.blocks)
+            own_piece = field_piece(
+                part, states, estimate.calibration, beside.blocks, beside.spread
+            )
+            _add(normal, gram[:count, :count], own_piece, begin)
+        gram[:count, count:] += normal.right_border.T
+        gram[count:, count:] += normal.corner
+        carried = _eliminated(normal, gram, end - begin)
+    if size:
+        across = gram[:count, count:]
+        return np.asarray(
+            gram[:count, :count] - across @ np.linalg.solve(gram[count:, count:], across.T)
+        )
+    return gram
+
+
+def _size(graph: Graph) -> int:
+    return sum(len(block.sigma) for block in graph.blocks)
+
+
+def _add(normal: Normal, gram: Array, piece: Piece, begin: int) -> None:
+    piece._replace(epoch=piece.epoch - begin).added_to(normal)
+    for channel in range(piece.right.shape[1]):  # most columns are felt by one beacon
+        _count(gram, piece.right[:, channel])
+
+
+def _count(gram: Array, right: Array) -> None:
+    """Add the products of right sides, shape (m, rows, columns), those that are not zero."""
+    flat = right.reshape(-1, right.shape[-1])
+    felt = np.flatnonzero(np.any(flat, axis=0))
+    own = flat[:, felt]
+    gram[np.ix_(felt, felt)] += own.T @ own
+
+
+def _eliminated(normal: Normal, gram: Array, number: int) -> tuple[Array, Array]:
+    """Eliminate the first states; take them from all products and return what is left of the next.
+
+    That is its own information, and its right sides and border.
+    """
+    of_each = inverses(normal.diagonal[None, :number], normal.following[None])[0]
+    sides = normal.sides
+    for i in range(min(number, len(normal.following))):
+        gain = of_each[i] @ normal.following[i]
+        sides[i + 1] -= gain.T @ sides[i]
+    rooted = np.swapaxes(np.linalg.cholesky(of_each), 1, 2) @ sides[:number]
+    flat = rooted.reshape(-1, rooted.shape[-1])
+    gram -= flat.T @ flat
+    if number == len(sides):
+        return normal.diagonal[-1], sides[-1]
+    last = normal.following[number - 1]
+    return normal.diagonal[number] - last.T @ of_each[number - 1] @ last, sides[number]

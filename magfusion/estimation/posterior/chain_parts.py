@@ -1,0 +1,142 @@
+"""What the rows of some channels add to normal equations, found once for all variants that have it.
+
+Most of what is considered is felt by one beacon alone, so that all parts together are hardly larger
+than their sum.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.estimation.posterior.chain_system import FieldRows, Normal, Piece
+from magfusion.estimation.solve.chain import Chain
+from magfusion.model.parameters import BeaconParameter
+from magfusion.units import Array, BoolArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What the rows of some channels add.
+
+    Parameters
+    ----------
+    channels : bool ndarray, shape (channels,)
+        None of what every variant has.
+    sums : Normal
+        With those right sides alone that they have any of.
+    columns : int ndarray
+        Which these are.
+    """
+
+    channels: BoolArray
+    sums: Normal
+    columns: IntArray
+
+    def added_to(self, normal: Normal) -> None:
+        """Add them to equations that have all right sides, but for the diagonal."""
+        own = self.sums
+        normal.border[...] += own.border
+        normal.corner += own.corner
+        normal.right_border[:, self.columns] += own.right_border
+        begin = 0
+        for run in np.split(self.columns, np.flatnonzero(np.diff(self.columns) > 1) + 1):
+            end = begin + len(run)
+            normal.right[..., run[0] : run[-1] + 1] += own.right[..., begin:end]
+            begin = end
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """The normal equations of a chain in parts.
+
+    Parameters
+    ----------
+    parts : tuple of Part
+    following : ndarray
+        As of `Normal`.
+    count : int
+        Of right sides.
+    """
+
+    parts: tuple[Part, ...]
+    following: Array
+    count: int
+
+    def of(self, channels: BoolArray) -> Iterator[Part]:
+        """Yield the parts of a variant that has some of the channels."""
+        return (part for part in self.parts if np.all(channels[part.channels]))
+
+    def diagonals(self, some: BoolArray) -> Array:
+        """Return the diagonal of some variants, shape (h, states, 15, 15)."""
+        found = np.zeros((len(some), *self.parts[0].sums.diagonal.shape))
+        for own, channels in zip(found, some, strict=True):
+            for part in self.of(channels):
+                own += part.sums.diagonal
+        return found
+
+    def forget_diagonals(self) -> None:
+        """Make room, once they were asked for."""
+        for part in self.parts:
+            part.sums.diagonal = part.sums.diagonal[:0].copy()
+
+    def chain(self, some: BoolArray) -> Chain:
+        """Return some variants, shape (h, channels), with diagonals of zeros.
+
+        Solving the chain overwrites them.
+        """
+        states, size = self.parts[0].sums.border.shape[0], len(self.parts[0].sums.corner)
+        chain, variants = Normal.blank(len(some), states, size, self.count, self.following)
+        for normal, channels in zip(variants, some, strict=True):
+            for part in self.of(channels):
+                part.added_to(normal)
+        return chain
+
+
+def parts_of(rest: Normal, rows: FieldRows, pieces: Iterable[Piece], kept: BoolArray) -> Parts:
+    """Return a chain in parts, of which each variant has all or nothing.
+
+    Parameters
+    ----------
+    rest : Normal
+        What every variant has; it is left without right sides.
+    rows : FieldRows
+        Of which the pieces are.
+    kept : bool ndarray, shape (variants, channels)
+        Channels that a variant has.
+    """
+    count, states, size = rest.right.shape[-1], len(rest.diagonal), len(rest.corner)
+    always = _with_felt_alone(rest, kept.shape[1])
+    patterns = np.unique(kept[:, np.any(kept, axis=0)], axis=1).T
+    groups = [np.all(pattern == kept.T, axis=1) for pattern in patterns]
+    columns = [_felt(rows, channels) for channels in groups]
+    sums = [Normal(states, size, len(own) - 1) for own in columns]
+    for piece in pieces:
+        for normal, channels, own in zip(sums, groups, columns, strict=True):
+            piece._replace(right=piece.right[..., own]).added_to(normal, channels)
+    parts = [Part(*one) for one in zip(groups, sums, columns, strict=True)]
+    return Parts((always, *parts), rest.following, count)
+
+
+def _with_felt_alone(rest: Normal, channels: int) -> Part:
+    """Return equations as a part, without right sides of zeros."""
+    felt = np.any(rest.right, axis=(0, 1)) | np.any(rest.right_border, axis=0)
+    felt[0] = True
+    columns = np.flatnonzero(felt)
+    rest.sides = np.concatenate([rest.right[..., columns], rest.border], axis=2)
+    rest.right_border = rest.right_border[:, columns]
+    return Part(np.zeros(channels, dtype=bool), rest, columns)
+
+
+def _felt(rows: FieldRows, channels: BoolArray) -> IntArray:
+    """Return the right sides that some channels feel: the first, and of what acts on them."""
+    every = rows.estimate.calibration.site.channels
+    names = {every[k][0] for k in np.flatnonzero(channels).tolist()}
+    acting = [
+        block.columns
+        for block in rows.considered
+        if not isinstance(block.parameter, BeaconParameter) or block.owner in names
+    ]
+    spread = [rows.spread[columns] for columns in acting]
+    felt = np.any(np.concatenate([rows.spread[:0], *spread]) != 0.0, axis=0)
+    return np.concatenate([[0], 1 + np.flatnonzero(felt)])

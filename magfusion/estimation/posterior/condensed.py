@@ -1,0 +1,148 @@
+"""What a log says of a calibration that it shares with others, its states eliminated.
+
+The linear graph at an estimate is eliminated down to the calibration, without the prior of what is
+shared; what is the log's own (drive phases, the IMU's clock) is eliminated with its prior.  What is
+left is a quadratic in the shared parameters: added over logs, with the prior once, it makes the
+step of Gauss and Newton that one graph of all the logs would make.
+"""
+
+from dataclasses import dataclass, replace
+from functools import reduce
+
+import gtsam
+import numpy as np
+
+from magfusion.estimation.graph.factors import CALIBRATION_KEY, CONSIDERED_KEY
+from magfusion.estimation.graph.graph import Estimate, Graph
+from magfusion.estimation.solve.bordered import eliminate_partial
+from magfusion.model.parameters import Block, Calibration, difference, dimension, placed
+from magfusion.model.prior import prior_sqrt_covariance, prior_sqrt_information
+from magfusion.units import Array, BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class Condensed:
+    """A quadratic in what several logs share, at the calibration where it was taken.
+
+    Parameters
+    ----------
+    information : ndarray, shape (s, s)
+        Of the log alone.
+    gradient : ndarray, shape (s,)
+        Downhill: ``information @ step = gradient`` where the log alone would go.
+    by_common : ndarray, shape (s, c)
+        What one sigma of each parameter that is considered, and the same in every log, adds to it.
+    by_place : ndarray, shape (s, s)
+        Covariance of what errors of the fields that are constant in place add to it.
+    by_log : ndarray, shape (s, s)
+        Covariance of what is considered of the log's own adds to it.
+    """
+
+    information: Array
+    gradient: Array
+    by_common: Array
+    by_place: Array
+    by_log: Array
+
+
+def columns_of(blocks: tuple[Block, ...], *, own: bool) -> BoolArray:
+    """Return which columns are the log's own, or those that logs share, shape (dimension,)."""
+    return np.array([b.parameter.each_log is own for b in blocks for _ in b.sigma], dtype=bool)
+
+
+def shared_blocks(blocks: tuple[Block, ...]) -> tuple[Block, ...]:
+    """Return the parameters that logs share, their columns following each other."""
+    return placed(block for block in blocks if not block.parameter.each_log)
+
+
+def condensed(
+    graph: Graph,
+    estimate: Estimate,
+    considered: tuple[Block, ...],
+    errors: tuple[Block, ...] = (),
+) -> Condensed:
+    """Condense the graph of a log to what it shares.
+
+    Parameters
+    ----------
+    graph : Graph
+        Its prior is left out but for the log's own parameters.
+    considered : tuple of Block
+        What is uncertain and not estimated.
+    errors : tuple of Block
+        Errors of the beacons' fields that are constant in place.
+
+    Raises
+    ------
+    RuntimeError
+        GTSAM's own, of states that the log leaves open.
+    """
+    assert graph.declared is not None
+    site, size = graph.declared.site, dimension(graph.blocks)
+    uncertain = placed((*considered, *errors))
+    spread = prior_sqrt_covariance(site, uncertain)
+    alone = replace(graph, declared=None)
+    system = (
+        alone.beside(estimate, uncertain, spread, graph.by_considered(spread), explaining=True)
+        if uncertain
+        else alone.linearized(estimate)
+    )
+    _, rest = eliminate_partial(system, _all_but_the_calibration(graph))
+    order = gtsam.Ordering()
+    order.push_back(CALIBRATION_KEY)
+    if uncertain:
+        order.push_back(CONSIDERED_KEY)
+    hessian, right = rest.hessian(order)
+    whole = np.concatenate([right[:size, None], -hessian[:size, size:]], axis=1)
+    left, whole = _without_own(graph, estimate.calibration, hessian[:size, :size], whole)
+    gradient, moved = whole[:, 0], whole[:, 1:]
+    of_log = columns_of(considered, own=True)
+    common, own = moved[:, : len(of_log)][:, ~of_log], moved[:, : len(of_log)][:, of_log]
+    place = moved[:, len(of_log) :]
+    return Condensed(left, gradient, common, place @ place.T, own @ own.T)
+
+
+def _all_but_the_calibration(graph: Graph) -> gtsam.Ordering:
+    every, out = graph.ordering, gtsam.Ordering()
+    for i in range(every.size()):
+        if every.at(i) != CALIBRATION_KEY:
+            out.push_back(every.at(i))
+    return out
+
+
+def _without_own(
+    graph: Graph, calibration: Calibration, information: Array, right: Array
+) -> tuple[Array, Array]:
+    """Eliminate the log's own parameters with their prior."""
+    assert graph.declared is not None
+    own = columns_of(graph.blocks, own=True)
+    blocks = placed(block for block in graph.blocks if block.parameter.each_log)
+    information, right = information.copy(), right.copy()
+    if blocks:
+        whitening = prior_sqrt_information(graph.declared.site, blocks)
+        prior, part = whitening.T @ whitening, np.ix_(own, own)
+        information[part] += prior
+        right[own, 0] -= prior @ difference(graph.declared, calibration, blocks)
+        gain = np.linalg.solve(information[part], information[np.ix_(own, ~own)]).T
+        right = right[~own] - gain @ right[own]
+        information = information[np.ix_(~own, ~own)] - gain @ information[np.ix_(own, ~own)]
+    else:
+        right = right[~own]
+    return 0.5 * (information + information.T), right
+
+
+def summed(parts: list[Condensed]) -> Condensed:
+    """Return what several logs say together, all taken at one calibration."""
+
+    def both(a: Condensed, b: Condensed) -> Condensed:
+        return Condensed(**{k: v + getattr(b, k) for k, v in vars(a).items()})
+
+    return reduce(both, parts)
+
+
+def taken_at(
+    part: Condensed, taken: Calibration, calibration: Calibration, shared: tuple[Block, ...]
+) -> Condensed:
+    """Return a quadratic as it is at another calibration than that where it was taken."""
+    step = difference(taken, calibration, shared)
+    return replace(part, gradient=part.gradient - part.information @ step)

@@ -1,0 +1,149 @@
+"""The posterior covariance of all poses of a log and of its calibration.
+
+GTSAM's Bayes tree is asked for one pose at a time, and for one considered parameter at a time.  The
+chain of states gives all of them in one sweep; the tree vouches for it at some poses.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from gtsam.symbol_shorthand import X
+
+from magfusion.estimation.graph.considered import responses
+from magfusion.estimation.graph.factors import CALIBRATION_KEY
+from magfusion.estimation.graph.graph import Estimate, Graph
+from magfusion.estimation.graph.state import MOTION
+from magfusion.estimation.measurements.phasors import leaves_out
+from magfusion.estimation.posterior.chain_system import AT_ONCE, chain_system, column_groups
+from magfusion.estimation.solve.bordered import eliminate, last_marginal
+from magfusion.estimation.solve.chain import solve_chain
+from magfusion.estimation.solve.memory import give_back_memory
+from magfusion.model.parameters import Block, dimension
+from magfusion.units import Array
+
+POSE = 6
+VOUCHED = 5  # poses at which the tree is asked too
+AGREED = 1e-6  # of a sigma; rounding of a well-posed log is far below
+
+
+@dataclass(frozen=True, eq=False)
+class _Marginals:
+    """What the chain gives.
+
+    Parameters
+    ----------
+    pose_cov : ndarray, shape (n, 6, 6)
+        Of what is estimated alone.
+    by_considered : ndarray, shape (n, 6, 6)
+        What considered parameters add to it.
+    calibration_cov : ndarray, shape (dimension, dimension)
+        Of what is estimated alone.
+    response : ndarray, shape (dimension, considered)
+    """
+
+    pose_cov: Array
+    by_considered: Array
+    calibration_cov: Array
+    response: Array
+
+    @property
+    def whole(self) -> tuple[Array, Array, Array]:
+        """As `marginals` returns it."""
+        poses = self.pose_cov + self.by_considered
+        return poses, self.calibration_cov + self.response @ self.response.T, self.response
+
+
+def marginals(
+    graph: Graph, estimate: Estimate, considered: tuple[Block, ...] = ()
+) -> tuple[Array, Array, Array]:
+    """Return the posterior covariance of every pose and of the calibration.
+
+    Parameters
+    ----------
+    considered : tuple of Block
+        Uncertain parameters that were not estimated: what their errors do to the estimate is added
+        (a consider covariance).
+
+    Returns
+    -------
+    pose_cov : ndarray, shape (n, 6, 6)
+        Calibration marginalised, its gauge included.
+    calibration_cov : ndarray, shape (dimension, dimension)
+    calibration_response : ndarray, shape (dimension, considered)
+        What one sigma of what is considered does to the calibration: its part of that covariance.
+    """
+    linear, ordering = graph.linearized(estimate), graph.ordering
+    tree = eliminate(linear, ordering)
+    if is_chain(graph, considered):
+        rows = np.unique(np.linspace(0, graph.epochs - 1, VOUCHED).astype(int)).tolist()
+        vouched = {i: np.array(tree.marginalCovariance(X(i))) for i in rows}
+        calibration = last_marginal(tree, linear, ordering) if graph.blocks else None
+        del tree, linear  # of a long log they are as much again as what follows
+        give_back_memory()
+        found = _of_chain(graph, estimate, considered)
+        if _agrees(found, vouched, calibration):
+            return found.whole
+        linear = graph.linearized(estimate)
+        tree = eliminate(linear, ordering)
+    poses = np.array([tree.marginalCovariance(X(i)) for i in range(graph.epochs)])
+    calibration = last_marginal(tree, linear, ordering) if graph.blocks else np.zeros((0, 0))
+    response = np.zeros((len(calibration), 0))
+    del tree, linear
+    if considered and graph.measurements:
+        keys, by_pose, by_calibration = [X(i) for i in range(graph.epochs)], [], []
+        for step in responses(graph, estimate, considered):
+            by_pose.append(step.vector(keys).reshape(-1, 6))
+            if graph.blocks:
+                by_calibration.append(step.at(CALIBRATION_KEY))
+        every = np.array(by_pose)
+        poses += np.einsum("hni,hnj->nij", every, every)
+        if graph.blocks:
+            response = np.array(by_calibration).T
+            calibration += response @ response.T
+    return poses, calibration, response
+
+
+def is_chain(graph: Graph, considered: tuple[Block, ...]) -> bool:
+    """Tell whether one sweep gives all covariances: of one calibration, no log of many hours."""
+    columns = [group.stop - group.start for group in column_groups(considered, graph.epochs)]
+    most = 1 + max(columns) + dimension(graph.blocks)
+    too_long = 8.0 * graph.epochs * MOTION * most > AT_ONCE
+    if graph.declared is None or len(graph.segments) > 1 or graph.shift is not None:
+        return False
+    return not too_long and not leaves_out(graph.measurements)
+
+
+def _of_chain(graph: Graph, estimate: Estimate, considered: tuple[Block, ...]) -> _Marginals:
+    """Return all covariances in one sweep."""
+    considered = considered if graph.measurements else ()
+    added, responses, solved = np.zeros((graph.epochs, POSE, POSE)), [], None
+    for columns in column_groups(considered, graph.epochs):
+        normal, fields = chain_system(graph, estimate, considered, columns)
+        if fields is not None:
+            for piece in fields.pieces():
+                piece.added_to(normal)
+        known: Array | None = None if solved is None else solved.inverse
+        found = solve_chain(normal.chain(), POSE, known, covariance=known is None)
+        del normal, fields  # before the next group: of a long log they are much
+        response = found.states[0, ..., 1:]
+        added += response @ np.swapaxes(response, 1, 2)
+        responses.append(found.border[0, :, 1:])
+        solved = found._replace(states=added[None]) if solved is None else solved
+        del response, found
+        give_back_memory()
+    assert solved is not None
+    return _Marginals(solved.cov[0], added, solved.border_cov[0], np.concatenate(responses, axis=1))
+
+
+def _agrees(found: _Marginals, vouched: dict[int, Array], calibration: Array | None) -> bool:
+    """Tell whether the tree gives the same: rounding along a chain of bad condition may grow."""
+    if not all(np.all(np.isfinite(part)) for part in vars(found).values()):
+        return False
+    pairs = [(found.pose_cov[i], cov) for i, cov in vouched.items()]
+    if calibration is not None:
+        pairs.append((found.calibration_cov, calibration))
+    for one, other in pairs:
+        sigma = np.sqrt(np.diagonal(other))
+        if not np.all(np.abs(one - other) < AGREED * sigma[:, None] * sigma):
+            return False
+    return True

@@ -1,0 +1,157 @@
+"""The rows of inertial factors and of priors of the motion, in arrays, with columns of others."""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from magfusion.estimation.graph.factors import PIECE
+from magfusion.estimation.graph.graph import Estimate, Graph
+from magfusion.estimation.graph.state import MOTION
+from magfusion.model.parameters import Block, difference, dimension
+from magfusion.units import Array, IntArray
+
+_FIRST, _WIDTH = {"x": 0, "v": 6, "b": 9}, {"x": 6, "v": 3, "b": 6}  # in a state's tangent vector
+
+
+NativePiece = tuple[IntArray, Array, Array | None, Array, Array]
+
+
+class Columns(NamedTuple):
+    """Parameters that are not estimated, and what they do.
+
+    Parameters
+    ----------
+    blocks : tuple of Block
+    spread : ndarray, shape (dimension, columns)
+        What makes a step of them out of each column.
+    inertial : callable, optional
+        Of some intervals (int ndarray): what the columns do to the whitened error of their inertial
+        factors, shape (m, 15, columns).
+    """
+
+    blocks: tuple[Block, ...]
+    spread: Array
+    inertial: Callable[[IntArray], Array] | None = None
+
+    @property
+    def number(self) -> int:
+        """Number of columns."""
+        return self.spread.shape[1] if self.blocks else 0
+
+
+@dataclass(eq=False)
+class _Kind:
+    """Factors of the same variables, by the first state of each."""
+
+    names: tuple[tuple[str, int], ...]
+    inertial: bool
+    epoch: IntArray
+    jacobian: Array  # (m, rows, columns of the variables)
+    right: Array  # (m, rows)
+
+
+@dataclass(eq=False)
+class NativeRows:
+    """The rows at an estimate, linearised once whatever columns stand beside them.
+
+    Parameters
+    ----------
+    graph : Graph
+    estimate : Estimate
+    """
+
+    graph: Graph
+    estimate: Estimate
+    kinds: list[_Kind] = field(init=False)
+
+    def __post_init__(self) -> None:
+        linear = self.graph.native.linearize(self.estimate.values)
+        found: dict[tuple[tuple[tuple[str, int], ...], bool], list[tuple[int, Array, Array]]]
+        found, links = defaultdict(list), linear.size() - (self.graph.epochs - 1)
+        for i in range(linear.size()):
+            factor = linear.at(i)
+            assert isinstance(factor, gtsam.JacobianFactor)
+            symbols = [gtsam.Symbol(key) for key in list(factor.keys())]
+            names = [(chr(symbol.chr()), symbol.index()) for symbol in symbols]
+            first = min(index for _, index in names)
+            kind = tuple((name, index - first) for name, index in names), i >= links
+            found[kind].append((first, factor.getA(), factor.getb()))
+        self.kinds = [
+            _Kind(
+                *kind,
+                np.array([first for first, _, _ in every]),
+                np.array([by for _, by, _ in every]),
+                np.array([b for _, _, b in every]),
+            )
+            for kind, every in found.items()
+        ]
+
+    def of(self, columns: Columns, begin: int = 0, end: int | None = None) -> Iterator[NativePiece]:
+        """Yield the rows of factors whose first state is one of some, as `Normal.add` takes them.
+
+        Those of which no column is felt have the first of the right sides alone.
+
+        Parameters
+        ----------
+        begin, end : int
+            Of the states; all where nothing is said.
+        """
+        for _, rows in self.kinds_of(columns, begin, end):
+            yield rows
+
+    def kinds_of(
+        self, columns: Columns, begin: int = 0, end: int | None = None
+    ) -> Iterator[tuple[bool, NativePiece]]:
+        """Yield the same, and whether they are of inertial factors."""
+        for kind in self.kinds:
+            inside = kind.epoch >= begin
+            inside &= kind.epoch < (self.graph.epochs if end is None else end)
+            every = np.flatnonzero(inside)
+            for first in range(0, len(every), PIECE):
+                for rows in self._of(kind, every[first : first + PIECE], columns):
+                    yield kind.inertial, rows
+
+    def _of(self, kind: _Kind, some: IntArray, columns: Columns) -> Iterator[NativePiece]:
+        jacobian, epoch = kind.jacobian[some], kind.epoch[some]
+        rows = jacobian.shape[:2]
+        own, after = np.zeros((*rows, MOTION)), np.zeros((*rows, MOTION))
+        border = np.zeros((*rows, dimension(self.graph.blocks)))
+        beside = kind.inertial and columns.inertial is not None
+        right = np.zeros((*rows, 1 + (columns.number if beside else 0)))
+        right[..., 0], column = kind.right[some], 0
+        for name, later in kind.names:
+            target, width = own if later == 0 else after, _WIDTH[name]
+            part = jacobian[..., column : column + width]
+            target[..., _FIRST[name] : _FIRST[name] + width] = part
+            column += width
+        if kind.inertial and self.graph.links and border.shape[2]:
+            border[...], moved = self._by_blocks(epoch)
+            right[..., 0] -= (border @ moved[..., None])[..., 0]
+        if kind.inertial and columns.inertial is not None:
+            right[..., 1:] = -columns.inertial(epoch)
+        linked = any(later for _, later in kind.names)
+        for once in each_once(epoch):
+            ahead = after[once] if linked else None
+            yield epoch[once], own[once], ahead, border[once], right[once]
+
+    def _by_blocks(self, epoch: IntArray) -> tuple[Array, Array]:
+        """Return what is estimated does to inertial factors, and by how much it has moved."""
+        blocks, by, moved = self.graph.blocks, [], []
+        for link in (self.graph.links[k] for k in epoch.tolist()):
+            assert link.by_calibration is not None
+            by.append(link.by_calibration[:, : dimension(blocks)])
+            moved.append(difference(link.calibration, self.estimate.calibration, blocks))
+        return np.array(by), np.array(moved)
+
+
+def each_once(epoch: IntArray) -> Iterator[IntArray]:
+    """Yield rows in groups in which no state comes twice."""
+    left = np.arange(len(epoch))
+    while len(left):
+        _, first = np.unique(epoch[left], return_index=True)
+        yield left[first]
+        left = np.delete(left, first)

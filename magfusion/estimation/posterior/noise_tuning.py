@@ -1,0 +1,211 @@
+"""Noise that tunes itself: what the residuals of a pass say of the noise that was declared.
+
+For each beacon its noise and its model error, and the densities of gyro and accelerometer, each
+with its declared value as a prior of a factor of two.  An estimate takes part of every error with
+it; how much is left in the residuals is found by drawing errors of the declared kind, and giving
+them to the same linear system that made the estimate (a variance component estimation by Monte
+Carlo, K.-R. Koch and J. Kusche, J. Geodesy 76, 2002).  Faults come first: a Student distribution of
+few degrees of freedom lets what is false a while say little of the noise of the rest.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from magfusion.estimation.graph.graph import Estimate, Graph
+from magfusion.estimation.posterior.residual_shares import ChannelErrors, Leavings
+from magfusion.estimation.posterior.variance_components import BeaconErrors, likeliest, parts_of
+from magfusion.model.parameters import Block, Calibration
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array, BoolArray
+
+SETTLED = 0.05  # of a logarithm; a smaller change is none
+GYRO, ACCEL = slice(0, 3), slice(6, 9)  # rows of an inertial factor that each determines
+FAULT = 3.0  # of a declared model error; more is no error of that kind, and is not covered by it
+OF_IMU = ("gyro_noise", "accel_noise")  # a beacon may be called "imu", too
+# Of a motion prior, by what of the IMU stands for it; the rate is that of the bias, in its rows.
+OF_MOTION = {"angular_accel_density": "gyro_bias_walk", "accel_density": "accel_noise"}
+WALK = slice(12, 15)
+PLAUSIBLE = 6.0  # by a factor of more, either way, white noise is a fault under another name
+LEFT = 1e-3  # of an error; of which less is left says nothing
+# Of a beacon's noise; where less is left no IMU holds the pose, the beacon alone does, and by its
+# own residuals, which it takes with it, it would seem better and better from pass to pass.
+SELF_MADE = 0.5
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """One standard deviation of the noise, as declared and as found.
+
+    Parameters
+    ----------
+    owner : str
+        Beacon, "imu" or "motion_prior".
+    key : {'noise_factor', 'model_error', 'gyro_noise', 'accel_noise', or of `OF_MOTION`}
+    declared, found : float
+        In the unit of the site's file.
+    """
+
+    owner: str
+    key: str
+    declared: float
+    found: float
+
+    @property
+    def factor(self) -> float:
+        """Found over declared."""
+        return self.found / self.declared
+
+
+def tuned_site(site: Site, tuned: Sequence[Tuned]) -> Site:
+    """Return a site with the noise that was found."""
+    of_imu: dict[str, Any] = {t.key: t.found for t in tuned if t.key in OF_IMU}
+    of_imu |= {OF_MOTION[t.key]: t.found for t in tuned if t.key in OF_MOTION}
+    platform = replace(site.platform, imu=replace(site.platform.imu, **of_imu))
+    beacons = []
+    for beacon in site.beacons:
+        named = (t for t in tuned if t.owner == beacon.name and t.key not in (*OF_IMU, *OF_MOTION))
+        own: dict[str, Any] = {t.key: t.found for t in named}
+        beacons.append(replace(beacon, **own))
+    return replace(site, platform=platform, beacons=tuple(beacons))
+
+
+def with_noise(calibration: Calibration, tuned: Sequence[Tuned]) -> Calibration:
+    """Return a calibration whose site has the noise that was found."""
+    return replace(calibration, site=tuned_site(calibration.site, tuned))
+
+
+def plausible(tuned: Sequence[Tuned]) -> bool:
+    """Tell whether what was found is noise: a fault is none, and must not be hidden by it."""
+    white = [t.factor for t in tuned if t.key != "model_error" and t.key not in OF_MOTION]
+    return all(1.0 / PLAUSIBLE < factor < PLAUSIBLE for factor in white)
+
+
+def as_declared(tuned: Sequence[Tuned]) -> tuple[Tuned, ...]:
+    """Return the noise as it was declared."""
+    return tuple(replace(t, found=t.declared) for t in tuned)
+
+
+def settled(before: Sequence[Tuned], after: Sequence[Tuned]) -> bool:
+    """Tell whether two tunings differ by less than matters."""
+    old = {(t.owner, t.key): t.found for t in before}
+    return all(
+        abs(np.log(t.found / old.get((t.owner, t.key), t.declared))) < SETTLED for t in after
+    )
+
+
+def tune(
+    graph: Graph,
+    estimate: Estimate,
+    samples: FieldSamples,
+    poses: Trajectory,
+    declared: Site,
+    windows: float,
+    alike: Array,
+    blind: BoolArray | None = None,
+    considered: tuple[Block, ...] = (),
+) -> tuple[Tuned, ...]:
+    """Return the noise that the residuals of a solved graph are likeliest with.
+
+    Parameters
+    ----------
+    samples : FieldSamples
+        As they were measured in the graph.
+    poses : Trajectory
+        At the samples.
+    declared : Site
+        Whose noise is the prior.
+    windows : float
+        How many windows hold each sample.
+    alike : ndarray, shape (n,)
+        How many epochs have the same model error.
+    blind : bool ndarray, shape (n,), optional
+        Epochs whose noise is another: of a motion that was found without an IMU.
+    considered : tuple of Block
+        Parameters that are not estimated: what their errors do to residuals is no noise.
+    """
+    system = Leavings(graph, estimate, samples, poses, windows, considered)
+    now = estimate.calibration.site
+    lag = max(1, round(windows))
+    prior = declared.beacons
+    errors: list[BeaconErrors] = []
+    self_made: list[bool] = []
+    for i in range(len(now.beacons)):
+        channels = [_without(channel, blind) for channel in system.channels_of(i)]
+        own = prior[i].model_error
+        usual = declared.model_error if own is None else own
+        mapped = now.beacons[i].field_map is not None
+        sizes = prior[i].noise_factor, usual
+        errors.append(BeaconErrors(channels, sizes, bent=not mapped and usual > 0.0))
+        self_made.append(not declared.platform.inertial and _left_of_noise(channels) < SELF_MADE)
+    found = parts_of(errors, alike, lag)
+    parts = {i: part for i, part in enumerate(found) if part is not None}
+    # Rare large errors say little, which makes those of a whole log seem smaller than they are.
+    taken = [part.taken for part in parts.values() if part.model is not None]
+    less = float(np.exp(np.mean(np.log(taken)))) if taken else 1.0
+    out: list[Tuned] = []
+    for i, part in parts.items():
+        name, (noise, usual) = prior[i].name, part.sizes
+        white = max(part.white, 1.0) if self_made[i] else part.white
+        out.append(Tuned(name, "noise_factor", noise, white * noise))
+        if part.model is not None:
+            factor = min(part.model / min(less, 1.0), FAULT)  # faults come first
+            if not declared.platform.inertial:  # poses that nothing else ties follow a smooth error
+                factor = max(factor, 1.0)
+            out.append(Tuned(name, "model_error", usual, factor * usual))
+    smooth = [part.smooth for part in parts.values() if part.model is not None]
+    return (*out, *_tuned_imu(system, now, declared, float(np.mean(smooth)) if smooth else 0.0))
+
+
+def _without(own: ChannelErrors, blind: BoolArray | None) -> ChannelErrors:
+    if blind is None:
+        return own
+    kept = ~blind[own.epoch]
+    noise, rough, smooth, inertial = (part[kept] for part in own.left)
+    variance = own.variance[0][kept], own.variance[1][kept]
+    left = noise, rough, smooth, inertial
+    return replace(own, epoch=own.epoch[kept], seen=own.seen[kept], left=left, variance=variance)
+
+
+def _left_of_noise(channels: list[ChannelErrors]) -> float:
+    """Return the share of a beacon's noise that its residuals still have."""
+    left = sum(float(np.sum(own.left[0] ** 2)) for own in channels)
+    given = sum(float(np.sum(own.variance[0])) * own.size[0] ** 2 for own in channels)
+    return left / given if given > 0.0 else 1.0
+
+
+def _tuned_imu(system: Leavings, now: Site, declared: Site, smooth: float) -> list[Tuned]:
+    """Return the densities of gyro and accelerometer.
+
+    Parameters
+    ----------
+    smooth : float
+        Share of the model error's variance that is smooth.
+    """
+    plain = system.inertial()
+    found = []
+    owner, of_turn, names = "imu", GYRO, {name: name for name in OF_IMU}
+    if not declared.platform.inertial:
+        owner, of_turn, names = "motion_prior", WALK, OF_MOTION
+    for (name, key), rows in zip(names.items(), (of_turn, ACCEL), strict=True):
+        scale = system.sigma[:, rows]
+        square, noise, *model, own = (np.sum((p[:, rows] / scale) ** 2, axis=1) for p in plain)
+        bent = (1.0 - smooth) * model[0] + smooth * model[1]
+        before, usual = getattr(declared.platform.imu, key), getattr(now.platform.imu, key)
+        here = system.ordinary
+        every = [float(np.mean(p[here])) / 3.0 for p in (noise, bent, own)]
+        if not np.any(here) or every[2] < LEFT:
+            continue
+        count = int(np.sum(here))
+        known = np.full((1, 1, count), every[2] * (before / usual) ** 2)
+        fixed = np.full((1, count), every[0] + every[1])
+        # Neighbours in time share what is left of them.
+        weight = np.full((1, count), min(1.0, (every[2] + fixed[0, 0]) ** 2 / every[2]))
+        log = likeliest(square[here][None], known, fixed, weight, 3)[0]
+        # What is declared below these holds scale and vibration too, which are not white.
+        found.append(Tuned(owner, name, before, float(before * np.exp(max(log[0], 0.0)))))
+    return found

@@ -1,0 +1,86 @@
+"""Passes that swing about their fixed point are led into it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.estimation.posterior.convergence import (
+    OFFSET_CONVERGED,
+    POSITION_CONVERGED,
+    pose_steps,
+)
+from magfusion.model.parameters import Block, Calibration, difference, retract
+from magfusion.model.rotation import rotations_of
+from magfusion.model.trajectory import Trajectory
+from magfusion.units import Array
+
+LEAST = 0.2  # share of a step that is taken at least
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """What a pass moved, and the share of it that was taken.
+
+    Parameters
+    ----------
+    moved : ndarray
+        In units of what is taken for converged.
+    """
+
+    moved: Array
+    share: float
+
+    @staticmethod
+    def of(
+        last: "Step | None",
+        before: Trajectory,
+        after: Trajectory,
+        old: Calibration,
+        new: Calibration,
+    ) -> "Step":
+        """Return the step of a pass, shortened where it undoes the one before.
+
+        What is demodulated about a trajectory depends on it in ways that no Jacobian of the pass
+        has.  Where that sends each pass back across the fixed point, the secant through the last
+        two steps says where it is (Aitken's relaxation; Küttler and Wall, Comput. Mech. 43, 2008,
+        Eq 44).
+        """
+        ends = after.time[[0, -1]]
+        shifted = (new.imu_offset(ends) - old.imu_offset(ends)) / OFFSET_CONVERGED
+        by_place = (after.position_world - before.position_world) / POSITION_CONVERGED
+        moved = np.concatenate([shifted, by_place.ravel() / np.sqrt(len(after.time))])
+        if last is None or moved @ last.moved >= 0.0:
+            return Step(moved, 1.0)
+        change = moved - last.moved
+        share = -last.share * float(last.moved @ change) / float(change @ change)
+        return Step(moved, float(np.clip(share, LEAST, 1.0)))
+
+
+def part_of_the_way(
+    before: Trajectory,
+    after: Trajectory,
+    old: Calibration,
+    new: Calibration,
+    blocks: tuple[Block, ...],
+    share: float,
+) -> tuple[Trajectory, Calibration]:
+    """Return states and a calibration that are a share of the way between two."""
+    if share == 1.0:
+        return after, new
+    step = share * pose_steps(before, after)
+    turn = rotations_of(step[:, :3])
+    moved = before.world_from_body @ step[:, 3:, None]
+
+    def mixed(a: Array | None, b: Array | None) -> Array | None:
+        return b if a is None or b is None else a + share * (b - a)
+
+    states = replace(
+        after,
+        world_from_body=before.world_from_body @ turn,
+        position_world=before.position_world + moved[..., 0],
+        velocity_world=mixed(before.velocity_world, after.velocity_world),
+        gyro_bias_body=mixed(before.gyro_bias_body, after.gyro_bias_body),
+        accel_bias_body=mixed(before.accel_bias_body, after.accel_bias_body),
+    )
+    back = (share - 1.0) * difference(old, new, blocks)
+    return states, retract(new, blocks, back)

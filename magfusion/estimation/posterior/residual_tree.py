@@ -1,0 +1,114 @@
+"""What a log leaves of errors, by GTSAM's elimination: of any graph."""
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+
+from magfusion.estimation.graph.factors import CONSIDERED_KEY
+from magfusion.estimation.graph.graph import Estimate, Graph
+from magfusion.estimation.graph.inertial import ROWS
+from magfusion.estimation.measurements.phasors import FieldPhasors
+from magfusion.estimation.solve.bordered import eliminate, eliminate_in_sequence
+from magfusion.model.parameters import Block
+from magfusion.model.prior import prior_sqrt_covariance
+from magfusion.units import Array, IntArray
+
+
+def left_by_tree(
+    graph: Graph,
+    estimate: Estimate,
+    considered: tuple[Block, ...],
+    fields: Sequence[Array],
+    inertial: Sequence[Array],
+) -> tuple[Array, Array]:
+    """Return the same as `magfusion.estimation.posterior.residual_chain.left_by_chain`."""
+    system = _System(graph, estimate, considered)
+    shape = next(
+        (len(m.epoch), m.measured.shape[1], 6)
+        for m in graph.measurements
+        if isinstance(m, FieldPhasors)
+    )
+    left = [system.left()]
+    for own, beside in zip(fields, inertial, strict=True):
+        system.put(own.reshape(len(own), -1), beside)
+        left.append(system.left())
+    return (
+        np.array([field.reshape(shape) for field, _ in left]),
+        np.array([own for _, own in left]),
+    )
+
+
+class _System:
+    """The linear system of a solved graph, with right-hand sides of its own."""
+
+    def __init__(self, graph: Graph, estimate: Estimate, considered: tuple[Block, ...]) -> None:
+        self._linear, self._ordering, begin = _linear(graph, estimate, considered)
+        every = _jacobians(self._linear)
+        last = graph.native.size()
+        self._every, self._inertial = every, every[last - graph.epochs + 1 : last]
+        self._fields: list[gtsam.JacobianFactor] = []
+        self._told: list[slice | IntArray] = []
+        for factors in graph.factors:
+            end = begin + len(factors.measurement.epoch)
+            if isinstance(factors.measurement, FieldPhasors):
+                self._fields += every[begin:end]
+                self._told += factors.told
+                self._width = factors.measurement.measured[0].size
+            begin = end
+        self._net = eliminate_in_sequence(self._linear, self._ordering)
+
+    def put(self, fields: Array, inertial: Array) -> None:
+        """Take other right-hand sides: of fields (n, rows), and of inertial factors."""
+        for factor in self._every:
+            factor.getb()[...] = 0.0
+        for factor, own, told in zip(self._fields, fields, self._told, strict=True):
+            part = own[told]
+            factor.getb()[: part.size] = part
+        for factor, own in zip(self._inertial, inertial, strict=True):
+            factor.getb()[: own.size] = own
+
+    def left(self) -> tuple[Array, Array]:
+        """Return what the linear system leaves of its right-hand sides."""
+        step = self._step()
+        rows = np.zeros((len(self._fields), self._width))
+        for row, factor, told in zip(rows, self._fields, self._told, strict=True):
+            row[told] = factor.error_vector(step)[: row[told].size]
+        own = [factor.error_vector(step)[:ROWS] for factor in self._inertial]
+        return rows, np.array(own).reshape(-1, ROWS)
+
+    def _step(self) -> gtsam.VectorValues:
+        """Return the solution of the linear system with the right-hand sides that it has now."""
+        if self._net is None:
+            return eliminate(self._linear, self._ordering).optimize()
+        # One elimination serves them all: its triangle and its transpose are solved with each.
+        uphill = self._linear.gradientAtZero()
+        step = self._net.backSubstitute(self._net.backSubstituteTranspose(uphill))
+        return step.scale(-1.0)
+
+
+def _linear(
+    graph: Graph, estimate: Estimate, considered: tuple[Block, ...]
+) -> tuple[gtsam.GaussianFactorGraph, gtsam.Ordering, int]:
+    """Return a linear graph that estimates what is considered too, and where its fields begin."""
+    ordering = graph.ordering
+    if not considered or graph.declared is None:
+        return graph.linearized(estimate), ordering, graph.native.size()
+    spread = prior_sqrt_covariance(graph.declared.site, considered)
+    by_inertial = graph.by_considered(spread)
+    linear = graph.beside(estimate, considered, spread, by_inertial, explaining=True)
+    fields = linear.size() - sum(len(part.measurement.epoch) for part in graph.factors)
+    count = spread.shape[1]
+    unit = gtsam.noiseModel.Unit.Create(count)
+    linear.push_back(gtsam.JacobianFactor(CONSIDERED_KEY, np.eye(count), np.zeros(count), unit))
+    ordering.push_back(CONSIDERED_KEY)
+    return linear, ordering, fields
+
+
+def _jacobians(linear: gtsam.GaussianFactorGraph) -> list[gtsam.JacobianFactor]:
+    out = []
+    for i in range(linear.size()):
+        factor = linear.at(i)
+        assert isinstance(factor, gtsam.JacobianFactor)
+        out.append(factor)
+    return out

@@ -1,0 +1,311 @@
+"""Variance components of a beacon's residuals: noise, and what the model of its field lacks.
+
+An error that is constant in place goes with a beacon's field by a matrix, which changes with place.
+How smoothly it does nobody declares; so a rough and a smooth kind are told apart by how residuals
+change from epoch to epoch, and both together have the declared size as their prior.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from magfusion.estimation.posterior.residual_shares import ChannelErrors
+from magfusion.estimation.solve.bounded import minimise_curved
+from magfusion.units import Array
+
+PRIOR = float(np.log(2.0))  # of the logarithm of a declared sigma
+LEAST, MOST = 0.1, 1e3  # of a factor; that a noise is smaller yet, no log tells for sure
+STUDENT = 4.0  # degrees of freedom: what is false says little
+# Gain, by components, with which that distribution finds the variance of normal residuals.
+NORMAL = {3: 1.322946, 6: 1.224631}
+SCALES = 8  # epochs in a row that are compared, so far apart that they share no sample
+WEIGHINGS = 5  # times that the epochs are weighed by what is found, at first as if noise were all
+NONE = 1e-4  # of a part that was not declared: as good as none
+# Parts of which one sigma was declared: noise, and a model error that is rough or smooth.
+KINDS = (slice(0, 1), slice(1, 3))
+
+
+class BeaconParts(NamedTuple):
+    """What the residuals of one beacon are likeliest made of.
+
+    Parameters
+    ----------
+    sizes : tuple of float
+        Noise factor and model error as declared.
+    white : float
+        Factor of the declared noise, by all that is white.
+    model : float, optional
+        Factor of the declared model error; None where none was looked for.
+    smooth : float
+        Share of its variance that is smooth.
+    taken : float
+        Factor found in errors that were drawn with those that were found, over theirs.
+    """
+
+    sizes: tuple[float, float]
+    white: float
+    model: float | None = None
+    smooth: float = 0.0
+    taken: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class BeaconErrors:
+    """Errors of all channels of one beacon.
+
+    Parameters
+    ----------
+    channels : list of ChannelErrors
+    sizes : tuple of float
+        Noise factor and model error as declared.
+    bent : bool
+        Whether a model error is looked for.
+    """
+
+    channels: list[ChannelErrors]
+    sizes: tuple[float, float]
+    bent: bool
+
+
+def parts_of(beacons: Sequence[BeaconErrors], alike: Array, lag: int) -> list[BeaconParts | None]:
+    """Return what the residuals of each beacon are made of; None where there are too few.
+
+    Parameters
+    ----------
+    alike : ndarray, shape (n,)
+        How many epochs have the same model error.
+    lag : int
+        Epochs that share samples.
+    """
+    fitted = _fitted(beacons, alike, lag)
+    bent = [k for k, (log, _) in enumerate(fitted) if len(log) and beacons[k].bent]
+    drawn = [_drawn(beacons[k], *fitted[k]) for k in bent]
+    again = dict(zip(bent, _fitted(drawn, alike, lag), strict=True))
+    found: list[BeaconParts | None] = []
+    for k, (log, white) in enumerate(fitted):
+        if k in again:
+            model, smooth = _total(log), float(np.exp(2.0 * (log[2] - _logarithm(log[1:3]))))
+            taken = _total(again[k][0]) / model
+            found.append(BeaconParts(beacons[k].sizes, white, model, smooth, taken))
+        else:
+            found.append(BeaconParts(beacons[k].sizes, white) if len(log) else None)
+    return found
+
+
+def _total(log: Array) -> float:
+    return float(np.exp(_logarithm(log[1:3])))
+
+
+def _logarithm(log: Array) -> float:
+    """Return the logarithm of a standard deviation of several parts."""
+    return float(0.5 * np.logaddexp.reduce(2.0 * log))
+
+
+def _drawn(beacon: BeaconErrors, log: Array, white: float) -> BeaconErrors:
+    """Return errors that were drawn, of these sizes, in the place of those seen."""
+    of_noise, usual = white * beacon.sizes[0], beacon.sizes[1]
+    of_rough, of_smooth = np.exp(log[1:3]) * usual
+    drawn = []
+    for own in beacon.channels:
+        noise, rough, smooth, inertial = own.left
+        size, model = own.size
+        bent = (of_rough * rough + of_smooth * smooth) / model
+        drawn.append(replace(own, seen=of_noise / size * noise + bent + inertial))
+    return replace(beacon, channels=drawn)
+
+
+def _fitted(beacons: Sequence[BeaconErrors], alike: Array, lag: int) -> list[tuple[Array, float]]:
+    """Return logarithms of the factors of all parts, and the factor of all that is white."""
+    scaled = [by_scale(beacon.channels, alike, lag) for beacon in beacons]
+    found = [(np.zeros(0), 1.0)] * len(beacons)
+    for bent in (False, True):
+        chosen = [k for k, b in enumerate(beacons) if b.bent == bent and len(scaled[k][0])]
+        if chosen:
+            sizes = np.array([beacons[k].sizes for k in chosen])
+            several = _fitted_alike([scaled[k] for k in chosen], sizes, lag, bent)
+            for k, one in zip(chosen, several, strict=True):
+                found[k] = one
+    return found
+
+
+def _fitted_alike(
+    scaled: list[tuple[Array, Array, Array]], sizes: Array, lag: int, bent: bool
+) -> list[tuple[Array, float]]:
+    """Return what `_fitted` does, of beacons that have the same parts.
+
+    Parameters
+    ----------
+    scaled : list of tuple
+        By `by_scale`, of each beacon.
+    sizes : ndarray, shape (k, 2)
+    """
+    most = max(len(square) for square, _, _ in scaled)
+    square, near = np.zeros((len(scaled), most)), np.ones((len(scaled), most))
+    expected, weighed = np.zeros((len(scaled), 5, most)), np.zeros((len(scaled), most))
+    expected[:, 4] = 1.0  # of rows that a beacon does not have, whose weight is none
+    for k, (seen, parts, close) in enumerate(scaled):
+        rows = slice(0, len(seen))
+        square[k, rows], expected[k, :, rows], near[k, rows] = seen, parts, close
+        weighed[k, rows] = 1.0 / lag
+    known, fixed, weight = (
+        sizes[:, [0, 1, 1, 1], None] ** 2 * expected[:, :4],
+        expected[:, 4],
+        weighed,
+    )
+    if not bent:
+        known, fixed = known[:, :1], fixed + known[:, 1]
+    log: Array | None = None
+    for _ in range(WEIGHINGS):
+        log = likeliest(square, known, fixed, weight, 6, KINDS if bent else KINDS[:1], log)
+        parts = np.exp(2.0 * log)[:, :, None] * known
+        of_model = np.sum(parts[:, 1:3], axis=1) if bent else fixed
+        of_model = of_model / (np.sum(parts, axis=1) + fixed)
+        weight = (1.0 - of_model + of_model * near) * weighed
+    # What is white but goes with the field, as of a jitter among gradients, is noise all told.
+    usual = np.sum(known[:, 0], axis=1)
+    white = np.sum(parts[:, ::3], axis=(1, 2)) / usual
+    # Of a strong beacon less noise than declared is not to be told from a little model error.
+    unsure = LEAST**2 * np.sum(known[:, 3:], axis=(1, 2)) / usual
+    assert log is not None
+    white = np.sqrt(np.maximum(white, np.minimum(white + unsure, 1.0)))
+    return list(zip(log, white.tolist(), strict=True))
+
+
+def by_scale(channels: list[ChannelErrors], alike: Array, lag: int) -> tuple[Array, Array, Array]:
+    """Return squares of a beacon's residuals on several scales of time, and their expectation.
+
+    Noise is alike on all scales; an error that is constant in place is mostly in the longest.  How
+    much of it is in the shorter ones depends on how smooth it is, which nobody declares: what they
+    have is no measure of its size unless that is found, too.
+
+    Returns
+    -------
+    square : ndarray, shape (m,)
+    expected : ndarray, shape (5, m)
+        Of a component, by noise, by a rough and by a smooth model error of size one, by a relative
+        error of size one that is white, and by inertial noise.
+    near : ndarray, shape (m,)
+        Share of it that is independent, where model error prevails.
+    """
+    every, seen, left, given, near = _haar(SCALES), [], [], [], []
+    for own in channels:
+        used = len(own.seen) // (SCALES * lag) * SCALES * lag
+        shape = (-1, SCALES, lag)
+        squares = []
+        for v in (own.seen, *own.left):
+            rows = np.einsum("hs,bslk->hblk", every, v[:used].reshape(*shape, 6))
+            squares.append(np.sum(rows**2, axis=3).reshape(SCALES, -1))
+        seen.append(squares[0])
+        left.append(np.stack(squares[1:]))
+        given.append([np.mean(v[:used].reshape(shape), axis=1).ravel() for v in own.variance])
+        close = np.mean(alike[own.epoch][:used].reshape(shape), axis=1).ravel()
+        near.append(np.minimum(SCALES * lag / close, 1.0))
+    drawn = np.concatenate(given, axis=1)
+    # Of a wrong motion too, a stronger field has more.
+    drawn = np.stack([*drawn, drawn[1], drawn[1]])
+    noise, model = channels[0].size
+    total = np.array([noise, model, model, 1.0]) ** 2 * np.sum(drawn, axis=1)
+    kept = np.sum(np.concatenate(left, axis=2), axis=2)
+    share = np.divide(kept, total[:, None], out=np.ones((4, SCALES)), where=total[:, None] > 0.0)
+    parts = share[:, :, None] * drawn[:, None] / 6.0
+    white = share[0][:, None] * drawn[1] / 6.0
+    expected = np.stack([*parts[:3], white, parts[3]]).reshape(5, -1)
+    return np.concatenate(seen, axis=1).ravel(), expected, np.tile(np.concatenate(near), SCALES)
+
+
+@cache
+def _haar(size: int) -> Array:
+    """Return the orthonormal Haar transform, shape (size, size): the mean first."""
+    if size == 1:
+        return np.ones((1, 1))
+    means = np.kron(_haar(size // 2), [1.0, 1.0])
+    steps = np.kron(np.eye(size // 2), [1.0, -1.0])
+    return np.concatenate([means, steps]) / np.sqrt(2.0)
+
+
+def likeliest(
+    square: Array,
+    parts: Array,
+    fixed: Array,
+    weight: Array,
+    components: int,
+    kinds: Sequence[slice] = (slice(0, 1),),
+    near: Array | None = None,
+) -> Array:
+    """Return the logarithm of what each part's standard deviation is too small by.
+
+    Of each of k beacons, or whatever else has residuals of its own.
+
+    Parameters
+    ----------
+    square : ndarray, shape (k, m)
+        Squared norms of residuals.
+    parts : ndarray, shape (k, kinds, m)
+        Expected square of a component by each kind of noise, as declared.
+    fixed : ndarray, shape (k, m)
+        And by all else.
+    weight : ndarray, shape (k, m)
+        Of each: how much of it is independent.
+    components : int
+        Of each residual.
+    kinds : sequence of slice
+        Parts of which one sigma was declared for all together.  Of the others nothing was: there
+        may be none of them.
+    near : ndarray, shape (k, kinds), optional
+        What was found with other weights: the search begins there.  A part of next to nothing,
+        where the cost has no slope, begins as a little one, unless a little were less likely.
+
+    Returns
+    -------
+    ndarray, shape (k, kinds)
+    """
+    count = parts.shape[1]
+    first, least = np.full(count, np.log(LEAST)), np.full(count, NONE)
+    for kind in kinds:
+        first[kind] = -0.5 * np.log(kind.stop - kind.start)
+        least[kind.start] = LEAST
+    gain, width = NORMAL[components], STUDENT + components
+
+    scaled = gain * square
+    reach, constant = scaled / STUDENT, width * scaled
+    doubled = 2.0 * weight
+    # Which parts belong to each kind, and which belong together; of both kinds in one operation.
+    of_kind = np.zeros((count, len(kinds)))
+    for k, kind in enumerate(kinds):
+        of_kind[kind, k] = 1.0
+    together = of_kind @ of_kind.T
+
+    def cost(log: Array) -> Array:
+        squares = np.exp(2.0 * log)
+        variance = (squares[:, None] @ parts)[:, 0] + fixed
+        bounded = width * np.log1p(reach / variance) + components * np.log(variance)
+        prior = np.log(squares @ of_kind) / PRIOR
+        return 0.5 * (weight * bounded).sum(axis=1) + 0.125 * (prior**2).sum(axis=1)
+
+    def curved(log: Array) -> tuple[Array, Array]:
+        squares = np.exp(2.0 * log)
+        by = squares[:, :, None] * parts
+        variance = by.sum(axis=1) + fixed
+        heavy = STUDENT * variance + scaled
+        left = (components - constant / heavy) / variance
+        bend = (STUDENT * constant / heavy**2 - left) / variance
+        curvature = (by * (doubled * bend)[:, None]) @ by.transpose(0, 2, 1)
+        total = squares @ of_kind
+        share = squares * ((1.0 / total) @ of_kind.T)
+        off = (0.5 / PRIOR**2 * np.log(total)) @ of_kind.T
+        slope = (by @ (weight * left)[:, :, None])[:, :, 0] + off * share
+        outer = ((1.0 / PRIOR**2 - 2.0 * off) * share)[:, :, None] * share[:, None]
+        curvature += together * outer
+        curvature.reshape(len(log), -1)[:, :: count + 1] += 2.0 * slope
+        return slope, curvature
+
+    start = np.tile(first, (len(parts), 1))
+    if near is not None:
+        little = np.log(LEAST)
+        stays = (near < little) & (curved(near)[0] > 0.0)
+        start = np.where(stays, near, np.maximum(near, little))
+    limits = np.log(np.stack([least, np.full(count, MOST)], axis=1))
+    return minimise_curved(cost, curved, start, limits)

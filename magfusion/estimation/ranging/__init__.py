@@ -1,0 +1,1 @@
+"""Distance and direction from one well to another."""

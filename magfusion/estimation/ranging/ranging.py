@@ -1,0 +1,132 @@
+"""Where a well is from another, by a magnet that turns as it passes a sensor at rest."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.estimation.ranging.ranging_data import POSE, RangingWindows
+from magfusion.estimation.ranging.ranging_model import RangingModel
+from magfusion.estimation.ranging.ranging_starts import starts
+from magfusion.estimation.solve.batched import (
+    Normal,
+    Solution,
+    minimise,
+    moved_poses,
+    normal_equations,
+)
+from magfusion.model.field import skew
+from magfusion.model.site import Site
+from magfusion.units import Array, BoolArray, IntArray
+
+PASSES, PASSES_OF_BEST, FOLLOWED = 40, 60, 3
+THINNED = 24  # windows, about, that starts are tried on
+KEPT = 24  # starts that are followed
+
+
+@dataclass(frozen=True, eq=False)
+class Ranged:
+    """The sensor's pose from the magnet, of the likeliest start and of its rivals.
+
+    Parameters
+    ----------
+    world_from_body : ndarray, shape (3, 3)
+        Attitude of the high side's frame in that of the rotor.
+    position_world : ndarray, shape (3,)
+        Of the sensor when both are at the depths that the windows count from (m).
+    names : tuple of str
+        Of what was estimated beside the pose.
+    values, prior_sigma : ndarray, shape (names,)
+    cov : ndarray, shape (6 + names, 6 + names)
+        Rotation and translation in the axes of the high side's frame (rad, m), then the names.
+    chi_square : float
+        Without priors.
+    freedom : int
+    rival_chi_square : float
+        Of the next best minimum elsewhere; infinite where there is none.
+    conditioning : float
+        Smallest over largest singular value of the whitened Jacobian by pose, columns made equal.
+    converged : bool
+    """
+
+    world_from_body: Array
+    position_world: Array
+    names: tuple[str, ...]
+    values: Array
+    prior_sigma: Array
+    cov: Array
+    chi_square: float
+    freedom: int
+    rival_chi_square: float
+    residual: Array
+    converged: bool
+
+
+def _moved(state: Array, step: Array) -> Array:
+    """Return states moved along the screws of their steps, which a turn about the magnet is."""
+    turn, angle = step[:, :3], np.linalg.norm(step[:, :3], axis=1)[:, None, None]
+    small = np.maximum(angle, 1e-4)
+    cross = skew(turn)
+    first = np.where(angle < 1e-4, 0.5 - angle**2 / 24.0, (1.0 - np.cos(small)) / small**2)
+    second = np.where(angle < 1e-4, 1.0 / 6.0, (small - np.sin(small)) / small**3)
+    bent = (np.eye(3) + first * cross + second * cross @ cross) @ step[:, 3:6, None]
+    poses = moved_poses(state[:, :12], np.concatenate([turn, bent[..., 0]], axis=1))
+    return np.concatenate([poses, state[:, 12:] + step[:, POSE:]], axis=1)
+
+
+def find_range(site: Site, windows: RangingWindows) -> Ranged:
+    """Return where the sensor is from the magnet.
+
+    Parameters
+    ----------
+    site : Site
+        Its only beacon is a rotor.
+    """
+    every = max(len(windows.fields) // THINNED, 1)
+    thin = RangingModel(site, windows.rows(slice(every // 2, None, every)))
+    tried = _solved(thin, starts(thin)[:KEPT], PASSES)
+    found = _solved(RangingModel(site, windows), tried.state[:FOLLOWED], PASSES_OF_BEST)
+    # Weighed about the likeliest: its rivals by the same weights, as a likelihood asks.
+    model = RangingModel(site, windows, about=found.state[0])
+    found = _solved(model, found.state, PASSES_OF_BEST)
+    best = found.state[:1]
+    error, _ = model.residuals(best)
+    rival = found.cost[_elsewhere(model, found.state, windows)]
+    used = 2 * 3 * int(np.sum(windows.fields.valid))
+    used -= 0 if windows.angle_known else len(windows.fields) + POSE - 5
+    return Ranged(
+        world_from_body=best[0, :9].reshape(3, 3),
+        position_world=best[0, 9:12],
+        names=model.names,
+        values=best[0, 12:],
+        prior_sigma=model.prior,
+        cov=np.linalg.pinv(found.information[0], hermitian=True),
+        chi_square=float(np.sum(error**2)),
+        freedom=max(used - POSE, 1),
+        rival_chi_square=float(np.min(rival - found.cost[0], initial=np.inf)),
+        residual=error[0],
+        converged=bool(found.converged[0]),
+    )
+
+
+def _solved(model: RangingModel, starts: Array, passes: int) -> Solution:
+    """Return where starts lead to, the likeliest first."""
+
+    def normal(rows: IntArray, state: Array) -> Normal:
+        del rows
+        return normal_equations(*model.with_priors(state))
+
+    found = minimise(normal, starts, _moved, passes=passes)
+    order = np.argsort(np.where(np.isfinite(found.cost), found.cost, np.inf))
+    return Solution(
+        found.state[order], found.cost[order], found.information[order], found.converged[order]
+    )
+
+
+def _elsewhere(model: RangingModel, states: Array, windows: RangingWindows) -> BoolArray:
+    """Return which states are not the first, as seen from the sensor."""
+    rotation, place = states[:, :9].reshape(-1, 3, 3), states[:, 9:12]
+    middle = float(np.median(windows.magnet))
+    seen = np.einsum("kba,kb->ka", rotation, middle * model.axis - place)
+    along = np.einsum("kba,b->ka", rotation, model.axis)
+    far = np.linalg.norm(seen - seen[0], axis=1) > 0.05 * np.linalg.norm(seen[0])
+    return far | (np.linalg.norm(along - along[0], axis=1) > 0.1)

@@ -1,0 +1,150 @@
+"""Where two wells are from each other, in a driller's words, with the sigma of each."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.estimation.ranging.ranging import Ranged
+from magfusion.estimation.ranging.ranging_data import FIRST, POSE, RangingWindows
+from magfusion.model.field import skew
+from magfusion.units import Array
+
+LATERAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])  # to the right and to the high side
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where the magnet is from the sensor at some depths of both.
+
+    Parameters
+    ----------
+    place : ndarray, shape (n, 3)
+        Ahead (down the sensor's hole), to the right looking down it, and up to its high side (m).
+    cov : ndarray, shape (n, 3, 3)
+        (m^2)
+    """
+
+    place: Array
+    cov: Array
+
+
+@dataclass(frozen=True)
+class Abreast:
+    """The two wells where the sensor is.
+
+    Parameters
+    ----------
+    distance, distance_sigma : float
+        From the sensor to the line of the magnet's way, centre to centre (m).
+    direction, direction_sigma : float
+        Of its nearest point from the high side, clockwise looking down the hole (rad).
+    depth, depth_sigma : float
+        Measured depth of the magnet when it is nearest (m).
+    """
+
+    distance: float
+    distance_sigma: float
+    direction: float
+    direction_sigma: float
+    depth: float
+    depth_sigma: float
+
+
+@dataclass(frozen=True)
+class Divergence:
+    """Angles of the magnet's well against the sensor's, to the right and up, with sigma (rad)."""
+
+    right: float
+    right_sigma: float
+    up: float
+    up_sigma: float
+
+
+class Wells:
+    """What a range says of two wells.
+
+    Parameters
+    ----------
+    axis : ndarray, shape (3,)
+        Of the magnet, along its way.
+    excess : float
+        By which the covariance is too small.
+    """
+
+    def __init__(
+        self, found: Ranged, windows: RangingWindows, axis: Array, excess: float = 1.0
+    ) -> None:
+        self._windows, self._back = windows, found.world_from_body.T
+        self._along, self._place = self._back @ axis, self._back @ found.position_world
+        names = found.names
+        self._scale = names.index("depth_scale") if "depth_scale" in names else None
+        self._factor = 1.0 if self._scale is None else 1.0 + float(found.values[self._scale])
+        self._cov = excess * found.cov
+
+    def _side(self, magnet: float, sensor: float) -> tuple[Array, Array]:
+        """Return the magnet in the high side's frame (3,) (m), and its derivatives (3, n)."""
+        travel = magnet - self._windows.magnet_from
+        turned = self._factor * travel * self._along - self._place
+        by = np.zeros((3, len(self._cov)))
+        by[:, :3], by[:, 3:POSE] = skew(turned), -np.eye(3)
+        if self._scale is not None:
+            by[:, POSE + self._scale] = travel * self._along
+        return turned - (sensor - self._windows.sensor_from) * FIRST, by
+
+    def places(self, magnet: Array, sensor: Array) -> Places:
+        """Return where the magnet is from the sensor at measured depths of both (n,) (m)."""
+        words = np.concatenate([FIRST[None], LATERAL])
+        each = [self._side(float(m), float(s)) for m, s in zip(magnet, sensor, strict=True)]
+        slopes = np.array([words @ by for _, by in each])
+        return Places(
+            np.array([words @ place for place, _ in each]),
+            slopes @ self._cov @ np.swapaxes(slopes, 1, 2),
+        )
+
+    def abreast(self, sensor: float) -> Abreast:
+        """Return the wells where the sensor is at a depth."""
+        start, _ = self._side(self._windows.magnet_from, sensor)
+        travel = -float(start @ self._along)
+        magnet = self._windows.magnet_from + travel / self._factor
+        place, by = self._side(magnet, sensor)
+        turned = np.zeros_like(by)
+        turned[:, :3] = skew(self._along)
+        distance = float(np.linalg.norm(place))
+        right, up = LATERAL @ place
+        across = float(np.hypot(right, up))
+        slope = (place / distance) @ by
+        # The nearest point moves along the line as that turns and shifts.
+        along = self._along @ by + place @ turned
+        moved = by - np.outer(self._along, along)
+        turning = (np.array([up, -right]) @ LATERAL / across**2) @ moved
+        depth = -along / self._factor
+        if self._scale is not None:
+            depth[POSE + self._scale] = -travel / self._factor**2
+        return Abreast(
+            distance,
+            self._sigma(slope),
+            float(np.arctan2(right, up) % (2.0 * np.pi)),
+            self._sigma(turning),
+            magnet,
+            self._sigma(depth),
+        )
+
+    def divergence(self) -> Divergence:
+        """Return how the wells lead apart, down the magnet's."""
+        by = np.zeros((3, len(self._cov)))
+        by[:, :3] = skew(self._along)
+        forward = float(FIRST @ self._along)
+        right, up = LATERAL @ self._along
+        slopes = [
+            (forward * row - value * FIRST) @ by / (forward**2 + value**2)
+            for row, value in zip(LATERAL, (right, up), strict=True)
+        ]
+        return Divergence(
+            float(np.arctan2(right, forward)),
+            self._sigma(slopes[0]),
+            float(np.arctan2(up, forward)),
+            self._sigma(slopes[1]),
+        )
+
+    def _sigma(self, slope: Array) -> float:
+        return float(np.sqrt(max(float(slope @ self._cov @ slope), 0.0)))

@@ -1,0 +1,1 @@
+"""Integration over the rests of a platform that stands still for long."""

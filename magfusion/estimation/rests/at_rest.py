@@ -1,0 +1,385 @@
+"""Whole rests as one epoch each: what hours of integration make of beacons far below the noise."""
+
+import itertools
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.data_checks.signal import Heard
+from magfusion.estimation.rests.rest_lengths import coherent, piece_length, walk
+from magfusion.estimation.rests.rest_witness import (
+    Freed,
+    Judged,
+    Known,
+    freed_pieces,
+    judged,
+    witness_of,
+    witnessed,
+)
+from magfusion.model.audibility import tones_of
+from magfusion.model.samples import FieldSamples, Log, Waveform
+from magfusion.model.site import Beacon, Site
+from magfusion.model.strapdown import resting
+from magfusion.model.trust import Finding, Verdict
+from magfusion.receiver.hum import hum_of
+from magfusion.receiver.integration import (
+    LEAST_LENGTHS,
+    Integrated,
+    Search,
+    chance_of_any,
+    searched,
+)
+from magfusion.receiver.pieces import Pieces
+from magfusion.receiver.slots import has_schedule
+from magfusion.receiver.windows import LockinSettings, default_settings, sent_frequencies_hz
+from magfusion.units import Array, BoolArray
+
+TOO_SHORT = "rest too short"
+LEAST_RATE = 1e-3  # rad/s; a bias of the gyroscope may look like that
+
+
+@dataclass(frozen=True, eq=False)
+class AtRest:
+    """The rests of a log, an epoch each.
+
+    Parameters
+    ----------
+    fields : FieldSamples
+        Synchronised beacons are there whether or not they are heard; of others a phase that is not
+        heard is none.
+    chance : ndarray, shape (n, channels)
+        Probability that noise alone is so loud, with all frequencies that were tried.
+    heard : bool ndarray, shape (n, channels)
+        Where that is less than was asked.
+    dropped : mapping
+        Reason to number of rests.
+    findings : tuple of Finding
+        What is not heard, and how weak it must be.
+    gain : ndarray, shape (n, channels), optional
+        How many times smaller the reference sensor made the sigma of a phasor; NaN where it has no
+        part in it.
+    """
+
+    fields: FieldSamples
+    chance: Array
+    heard: BoolArray
+    dropped: Mapping[str, int]
+    findings: tuple[Finding, ...] = ()
+    gain: Array | None = None
+
+    def log(self, log: Log) -> Log:
+        """Return a log with these epochs in place of its waveform."""
+        noticed = (*log.noticed, *self.findings)
+        return replace(
+            log, waveform=None, fields=self.fields, drive=None, reference=None, noticed=noticed
+        )
+
+    def amplitude(self) -> Array:
+        """Return the sizes of phasors, freed of what noise adds to a square, (n, channels) (T)."""
+        size = np.sum(np.abs(self.fields.phasor_sensor) ** 2, axis=-1)
+        noise = 2.0 * np.trace(self.fields.phasor_cov, axis1=-2, axis2=-1)
+        return np.sqrt(np.maximum(size - noise, 0.0))
+
+    def hearing(self, site: Site) -> Heard:
+        """Return how each beacon is heard, by its loudest tone."""
+        names = tuple(b.name for b in site.beacons)
+        size = self.amplitude()
+        sigma = np.sqrt(np.trace(self.fields.phasor_cov, axis1=-2, axis2=-1) / 3.0)
+        own = [[c for c, (b, _) in enumerate(site.channels) if b == name] for name in names]
+        loudest = [np.nanmax(np.nan_to_num(size[:, c]), axis=1) for c in own]
+        snr = [np.nanmax(np.nan_to_num(size[:, c] / sigma[:, c]), axis=1) for c in own]
+        loud = [np.any(self.heard[:, c], axis=1) for c in own]
+        return Heard(
+            self.fields.time,
+            names,
+            np.stack(snr, axis=1),
+            np.stack(loudest, axis=1),
+            np.stack(loud, axis=1),
+        )
+
+
+def at_rest(
+    log: Log,
+    site: Site,
+    lockin: LockinSettings | None = None,
+    false_alarm: float = 1e-3,
+    least: int = 1,
+) -> AtRest:
+    """Return the rests of a log with a waveform, an epoch each.
+
+    Parameters
+    ----------
+    lockin : LockinSettings, optional
+        Length of the pieces, and the mains; chosen by the tones where there is none.
+    false_alarm : float
+        Probability that a rest without a beacon is taken for one with it.
+    least : int
+        So many epochs are made: where there are fewer rests, each is divided.
+
+    Raises
+    ------
+    InputError
+        Where there is no waveform, no long rest, or coils are driven in time slots.
+    """
+    if log.waveform is None:
+        raise InputError("holds no magnetometer.parquet to integrate at rest; give the raw log")
+    check_tones(site)
+    usual = default_settings(site)
+    given = usual if lockin is None else lockin
+    longest = coherent(site)
+    dropped = Counter[str]()
+    parts: list[Rest] = []
+    found = rests(log, site)
+    divided = -(-least // max(len(found), 1))
+    for span in found:
+        duration = span[1] - span[0]
+        length, parted = piece_length(site, usual, lockin, duration / divided), divided
+        if length is None:
+            length, parted = piece_length(site, usual, lockin, duration), 1
+        if length is None:
+            dropped[TOO_SHORT] += 1
+            continue
+        count = max(int(np.ceil(duration / longest)), parted)
+        ends = np.linspace(*span, count + 1)
+        for begin, end in itertools.pairwise(ends):
+            one = (float(begin), float(end))
+            parts.append(rest_epoch(log, one, site, length, given.mains_hz, false_alarm))
+    if not parts:
+        need = LEAST_LENGTHS * usual.window
+        short = f" ({dropped[TOO_SHORT]} are shorter)" if dropped else ""
+        raise InputError(
+            f"--at-rest: the log has no rest of {need:.3g} s{short}; leave the platform longer, or"
+            " declare platform.motion by how it vibrates"
+        )
+    fields = FieldSamples.joined([part.fields for part in parts])
+    chance = np.stack([part.chance for part in parts])
+    heard = chance < false_alarm
+    findings = (*believed(log), *unheard_in(fields, heard, site, false_alarm))
+    gain = None
+    if log.reference is not None:
+        gain = np.array([[tone.gain for tone in part.tones] for part in parts])
+        findings += witnessed([part.tones for part in parts], site)
+    free = np.array([not _beacon(site, name).synchronised for name, _ in site.channels])
+    gone = free & ~heard
+    phasor = np.where(gone[..., None], np.nan, fields.phasor_sensor)
+    fields = replace(fields, phasor_sensor=phasor)
+    return AtRest(fields, chance, heard, dropped, findings, gain)
+
+
+def check_tones(site: Site) -> None:
+    """Refuse tones that whole rests are not integrated by.
+
+    Raises
+    ------
+    InputError
+    """
+    if has_schedule(site):
+        raise InputError("--at-rest integrates tones, and a beacon has time slots; leave it out")
+    if tones_of(site).reused:
+        raise InputError(
+            "--at-rest integrates each tone for one beacon, and beacons share a frequency; leave it"
+            " out"
+        )
+
+
+def rests(log: Log, site: Site) -> list[tuple[float, float]]:
+    """Return beginning and end of each stretch in which the platform rests (s).
+
+    Without inertial samples who asks for rest is believed: it is the whole log.
+    """
+    assert log.waveform is not None
+    first, last = float(log.waveform.time[0]), float(log.waveform.time[-1])
+    if not log.inertial:
+        return [(first, last)]
+    stamps = log.imu.time + site.platform.imu.time_offset
+    gyro, motion = log.imu.gyro_body, site.platform.motion
+    still = resting(stamps, gyro, log.imu.accel_body, motion=motion)
+    still[1:] &= np.diff(stamps) < motion.rest_span
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
+    slow = max(LEAST_RATE, 5.0 * site.platform.imu.gyro_bias_sigma)
+    found = []
+    for begin, end in edges.reshape(-1, 2):
+        # A turn that is even has a quiet gyroscope, too.
+        turns = np.linalg.norm(np.mean(gyro[begin:end], axis=0)) > slow
+        span = max(float(stamps[begin]), first), min(float(stamps[end - 1]), last)
+        # What a half span before the first sample was quiet, too, is at rest.
+        ends = begin == np.argmax(still), end == len(still) - np.argmax(still[::-1])
+        half = 0.5 * motion.rest_span
+        span = (
+            first if ends[0] and span[0] - first < 2.0 * half else span[0],
+            last if ends[1] and last - span[1] < 2.0 * half else span[1],
+        )
+        if not turns and span[1] > span[0]:
+            found.append(span)
+    return found
+
+
+def _beacon(site: Site, name: str) -> Beacon:
+    return next(b for b in site.beacons if b.name == name)
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """One rest, or as much of it as is one epoch.
+
+    Parameters
+    ----------
+    fields : FieldSamples
+        Of one epoch.
+    chance : ndarray, shape (channels,)
+        Probability that noise alone is so loud.
+    tones : list of Judged
+    known : Known, optional
+        For later parts of a stream, of which it was one.
+    """
+
+    fields: FieldSamples
+    chance: Array
+    tones: list[Judged]
+    known: Known | None
+
+
+def rest_epoch(
+    log: Log,
+    span: tuple[float, float],
+    site: Site,
+    length: float,
+    mains_hz: float,
+    false_alarm: float,
+    known: Known | None = None,
+) -> Rest:
+    """Return the epoch of a rest.
+
+    Parameters
+    ----------
+    span : tuple of float
+        Its beginning and end (s).
+    length : float
+        Of the pieces (s).
+    known : Known, optional
+        What earlier parts of a stream tell of its reference.
+    """
+    assert log.waveform is not None
+    rows = slice(*np.searchsorted(log.waveform.time, span))
+    wave = Waveform(log.waveform.time[rows], log.waveform.measured_sensor[rows])
+    hum = hum_of(wave, mains_hz)
+    time, nominal_hz = 0.5 * (span[0] + span[1]), sent_frequencies_hz(site)
+    witness = witness_of(wave, log.reference, nominal_hz, hum, known)
+
+    def by(sent_hz: Array) -> Freed:
+        return freed_pieces(wave, span, sent_hz, length, hum, witness, known)
+
+    found, sent_hz = by(nominal_hz), nominal_hz.copy()
+    searches = _searches(found.best(), site, nominal_hz)
+    if searches:
+        for c, (name, _) in enumerate(site.channels):
+            if name in searches:
+                sent_hz[c] *= 1.0 + searches[name].drift
+        found = by(sent_hz)
+    found = replace(found, raw=_at_declared_drives(found.raw, site, time))
+    best = _at_declared_drives(found.best(), site, time)
+    tones = [judged(found, best, c, time, site, false_alarm) for c in range(len(nominal_hz))]
+    single = [one.tone for one in tones]
+    phase = np.exp(2j * np.pi * (sent_hz - nominal_hz) * time)
+    cov = np.stack(
+        [
+            one.cov + _wandered(one, site, float(nominal_hz[c]), span[1] - span[0], name)
+            for c, (one, (name, _)) in enumerate(zip(single, site.channels, strict=True))
+        ]
+    )
+    fields = FieldSamples(
+        time=np.array([time]),
+        window=np.array([span[1] - span[0]]),
+        channels=site.channels,
+        phasor_sensor=(np.stack([one.phasor for one in single]) * phase[:, None])[None],
+        phasor_cov=cov[None],
+    )
+    if known is not None and witness is not None:
+        normals = tuple(None if one is None else one.normal for one in found.relations)
+        known = Known(witness.clock, witness.lag, normals)
+    return Rest(fields, _chances(single, site, searches), tones, known)
+
+
+def _searches(found: Pieces, site: Site, nominal_hz: Array) -> dict[str, Search]:
+    """Return how the frequency of each beacon without synchronisation was found."""
+    searches = {}
+    for beacon in site.beacons:
+        if not beacon.synchronised:
+            tones = [c for c, (name, _) in enumerate(site.channels) if name == beacon.name]
+            searches[beacon.name] = searched(found, tones, nominal_hz, site.clock.drift_largest)
+    return searches
+
+
+def _at_declared_drives(found: Pieces, site: Site, time: float) -> Pieces:
+    """Return pieces as they were at the currents of a rest's middle, where these were recorded."""
+    if site.drives is None:
+        return found
+    phasor = found.phasor.copy()
+    for c, (name, tone) in enumerate(site.channels):
+        own = site.drives.at(name, tone, np.append(found.centre, time))
+        if own is not None:
+            share = np.exp(own[0] + 1j * own[1])
+            phasor[:, c] *= (share[-1] / share[:-1])[:, None]
+    return replace(found, phasor=phasor)
+
+
+def _wandered(
+    one: Integrated, site: Site, frequency_hz: float, duration: float, name: str
+) -> Array:
+    """Return the covariance of what the drive wanders within a rest, shape (3, 3) (T^2)."""
+    variance = walk(site, frequency_hz, duration)
+    square = np.real(np.outer(one.phasor, np.conj(one.phasor)))
+    if not _beacon(site, name).synchronised:
+        solved = np.linalg.solve(one.cov, one.phasor)
+        ratio = float(np.real(np.conj(one.phasor) @ solved))
+        variance += (one.centroid / one.spread) ** 2 / max(ratio, 1.0)
+    return np.asarray(variance * square)
+
+
+def _chances(single: list[Integrated], site: Site, searches: Mapping[str, Search]) -> Array:
+    own = [one.chance for one in single]
+    for name, search in searches.items():
+        tones = [c for c, (beacon, _) in enumerate(site.channels) if beacon == name]
+        together = chance_of_any([own[c] for c in tones], search.trials)
+        for c in tones:
+            own[c] = together
+    return np.array(own)
+
+
+def believed(log: Log) -> tuple[Finding, ...]:
+    """Return that nothing in the log says that the platform rests."""
+    if log.inertial:
+        return ()
+    text = (
+        "The log has no IMU: all of it is taken for one rest. If the platform moved, cut the log"
+        " (--start, --end), or record an IMU beside it."
+    )
+    return (Finding("few_data", text, Verdict.TRUSTWORTHY),)
+
+
+def unheard_in(
+    fields: FieldSamples, heard: BoolArray, site: Site, false_alarm: float
+) -> tuple[Finding, ...]:
+    """Return what is said of the tones that are not told from noise, in no rest."""
+    below = []
+    sigma = np.sqrt(np.trace(fields.phasor_cov, axis1=-2, axis2=-1) / 3.0)
+    size = np.sqrt(np.sum(np.abs(fields.phasor_sensor) ** 2, axis=-1))
+    for c in np.flatnonzero(~heard.any(axis=0)).tolist():
+        name, tone = site.channels[c]
+        most = float(np.min(size[:, c] + 2.0 * sigma[:, c]))
+        which = f"{name}, tone {tone}" if (name, 1) in site.channels else name
+        below.append(f"{which} (below {most:.2g} T)")
+    if not below:
+        return ()
+    none = not np.any(heard)
+    text = (
+        f"Below the noise, at a false-alarm rate of {false_alarm:g} a rest: {', '.join(below)}."
+        " Rest longer, come nearer, or send louder."
+    )
+    if none:
+        text = f"no beacon is heard. {text}"
+    verdict = Verdict.FAILED if none else Verdict.TRUSTWORTHY
+    return (Finding("low_signal", text, verdict, 1e3 if none else 1.0),)

@@ -1,0 +1,167 @@
+"""A rest as far as it has come: the phasors of its stretches as one, in constant memory.
+
+Information adds up, so that nothing is kept of a stretch but its share.  Where phases and clocks
+may wander, what is older weighs less.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magfusion.estimation.rests.at_rest import Rest
+from magfusion.estimation.rests.rest_lengths import walk
+from magfusion.model.samples import FieldSamples
+from magfusion.model.site import Site
+from magfusion.receiver.integration import trace_chance
+from magfusion.receiver.windows import sent_frequencies_hz
+from magfusion.units import Array, ComplexArray
+
+LEAST_FREEDOM = 8.0  # of a covariance that is told by few readings
+LOOKS = 6.0 / np.pi**2  # of the false alarms, the first look may have; then a fourth, a ninth
+
+
+@dataclass(frozen=True, eq=False)
+class Running:
+    """What all stretches of a rest tell together.
+
+    Parameters
+    ----------
+    begin, end : float
+        Of the rest, as far as it has come (s).
+    information : ndarray, shape (channels, 3, 3)
+        Of a phasor's real part, and of its imaginary part alike (1/T^2).
+    weighted : complex ndarray, shape (channels, 3)
+        The phasors by it (1/T).
+    squares : ndarray, shape (channels,)
+        Sum of the squares of the stretches' shares, by their traces.
+    freedom : ndarray, shape (channels,)
+        Readings behind the covariances.
+    least_chance : ndarray, shape (channels,)
+        Of all stretches, that noise alone is so loud; of beacons without synchronisation.
+    looks : int
+        Stretches.
+    """
+
+    begin: float
+    end: float
+    information: Array
+    weighted: ComplexArray
+    squares: Array
+    freedom: Array
+    least_chance: Array
+    looks: int = 0
+
+    @staticmethod
+    def begun(begin: float, channels: int) -> "Running":
+        """Return a rest of which nothing has come."""
+        return Running(
+            begin,
+            begin,
+            np.zeros((channels, 3, 3)),
+            np.zeros((channels, 3), dtype=np.complex128),
+            np.zeros(channels),
+            np.zeros(channels),
+            np.ones(channels),
+        )
+
+    @property
+    def duration(self) -> float:
+        """How long it has lasted (s)."""
+        return self.end - self.begin
+
+    def beside(self, rest: Rest, site: Site, end: float, longest: float, asked: float) -> "Running":
+        """Return it with one more stretch.
+
+        Parameters
+        ----------
+        longest : float
+            As long as phases stay (s): of a longer rest, what is older counts less.
+        asked : float
+            False-alarm probability, with which a stretch tells the phase of a beacon without
+            synchronisation.
+        """
+        window = float(rest.fields.window[0])
+        kept = max(1.0 - window / longest, 0.0) if self.duration + window > longest else 1.0
+        phasor, cov = rest.fields.phasor_sensor[0], rest.fields.phasor_cov[0]
+        known, weighted = kept * self.information, kept * self.weighted
+        squares, freedom = kept**2 * self.squares, kept * self.freedom
+        for c, (name, _) in enumerate(site.channels):
+            own, value = np.linalg.inv(cov[c]), phasor[c]
+            if not _synchronised(site, name):
+                if rest.chance[c] >= asked:
+                    continue
+                value = value * _onto(weighted[c], value)
+            known[c] += own
+            weighted[c] += own @ value
+            squares[c] += float(np.trace(own)) ** 2
+            freedom[c] += rest.tones[c].tone.freedom
+        return Running(
+            self.begin,
+            end,
+            known,
+            weighted,
+            squares,
+            freedom,
+            np.minimum(self.least_chance, rest.chance),
+            self.looks + 1,
+        )
+
+    def fields(self, site: Site, longest: float) -> FieldSamples:
+        """Return the epoch that the rest is so far; its time is that of its end."""
+        channels, sent_hz = len(site.channels), sent_frequencies_hz(site)
+        phasor = np.full((channels, 3), np.nan, dtype=np.complex128)
+        cov = np.tile(np.eye(3), (channels, 1, 1))
+        stands = min(self.duration, longest)
+        for c in range(channels):
+            total = float(np.trace(self.information[c]))
+            if total == 0.0:
+                continue
+            cov[c] = self._widened(c, np.linalg.inv(self.information[c]))
+            phasor[c] = np.linalg.solve(self.information[c], self.weighted[c])
+            square = np.real(np.outer(phasor[c], np.conj(phasor[c])))
+            cov[c] += walk(site, float(sent_hz[c]), stands) * square
+        return FieldSamples(
+            np.array([self.end]),
+            np.array([max(self.duration, 1e-3)]),
+            site.channels,
+            phasor[None],
+            cov[None],
+        )
+
+    def _widened(self, channel: int, cov: Array) -> Array:
+        """Return a covariance with what weights by estimated ones lose (as Meier, 1953)."""
+        total = float(np.trace(self.information[channel]))
+        spread = 1.0 - float(self.squares[channel]) / total**2
+        each = max(float(self.freedom[channel]) / max(self.looks, 1) - 4.0, 4.0)
+        return np.asarray(cov * (1.0 + 2.0 * spread / each))
+
+    def chance(self, site: Site) -> Array:
+        """Return the probability that noise alone is so loud in any of so many looks, (channels,).
+
+        Of the k-th look it is taken k^2 times, so that all looks together have one rate of false
+        alarms.
+        """
+        out = np.ones(len(site.channels))
+        for c, (name, _) in enumerate(site.channels):
+            if not _synchronised(site, name):
+                out[c] = min(1.0, self.looks * float(self.least_chance[c]))
+                continue
+            if float(np.trace(self.information[c])) == 0.0:
+                continue
+            phasor = np.linalg.solve(self.information[c], self.weighted[c])
+            cov = self._widened(c, np.linalg.inv(self.information[c]))
+            freedom = max(float(self.freedom[c]), LEAST_FREEDOM)
+            trace = float(np.real(np.conj(phasor) @ np.linalg.solve(cov, phasor)))
+            alone = trace_chance(trace * freedom / (freedom - 4.0), int(freedom))
+            out[c] = min(1.0, alone * max(self.looks, 1) ** 2 / LOOKS)
+        return out
+
+
+def _synchronised(site: Site, name: str) -> bool:
+    return next(b for b in site.beacons if b.name == name).synchronised
+
+
+def _onto(known: ComplexArray, value: ComplexArray) -> complex:
+    """Return the turn of a phasor onto what is known of it; none where nothing is."""
+    along = complex(np.vdot(value, known))
+    return along / abs(along) if abs(along) > 0.0 else 1.0 + 0.0j

@@ -1,0 +1,246 @@
+"""Whole rests as they last: an estimate of the pose that sharpens while the platform stands.
+
+Every stretch of a rest is integrated as a whole rest is, with its reference and its mains, and what
+it tells is added to the stretches before.  Nothing else is kept: hours take as much memory as
+minutes.  From rest to rest nothing is carried.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magfusion.errors import InputError
+from magfusion.estimation.data_checks.stream_buffer import Buffer, check_clock
+from magfusion.estimation.demodulation.demodulation import gravity_at_rest
+from magfusion.estimation.rests.at_rest import (
+    Rest,
+    believed,
+    check_tones,
+    rest_epoch,
+    rests,
+    unheard_in,
+)
+from magfusion.estimation.rests.rest_lengths import coherent, piece_length
+from magfusion.estimation.rests.rest_running import Running
+from magfusion.estimation.rests.rest_witness import Known, witnessed
+from magfusion.estimation.snapshot.explained_fixes import ExplainedFixes, explained_fixes
+from magfusion.model.parameters import initial_calibration
+from magfusion.model.samples import FieldSamples, ImuSamples, Log, Waveform
+from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Risk, Trust
+from magfusion.receiver.windows import LockinSettings, default_settings
+from magfusion.units import Array, BoolArray
+
+FIRST, LATER = 60.0, 120.0  # s; of the first stretch of a rest, and of those after it
+LOOK = 2.0  # s; so often it is looked whether the platform rests
+PATIENCE = 10.0  # s; a reference is waited for
+SAME_REST = 0.5  # of the span of rest: what is missing between two stretches of one rest
+MARGIN = 4.0  # s; of inertial samples that are kept before a stretch
+
+
+@dataclass(frozen=True, eq=False)
+class RestState:
+    """What is known of a rest so far.
+
+    Parameters
+    ----------
+    time : float
+        (s)
+    standing : bool
+        False once the platform has moved: then nothing else is told.
+    duration : float
+        Of the rest, as far as it was integrated (s).
+    samples : FieldSamples, optional
+        Its phasors, an epoch.
+    heard : bool ndarray, shape (channels,)
+    found : ExplainedFixes, optional
+        None while no beacon is heard.
+    trust : Trust
+    gain : ndarray, shape (channels,)
+        How many times smaller the reference makes the sigmas of the newest stretch; NaN where it
+        has no part in it.
+    """
+
+    time: float
+    standing: bool
+    duration: float
+    samples: FieldSamples | None
+    heard: BoolArray
+    found: ExplainedFixes | None
+    trust: Trust
+    gain: Array
+
+
+class RestNavigator:
+    """A running estimate of where a platform rests.
+
+    Parameters
+    ----------
+    lockin : LockinSettings, optional
+        Length of the pieces, and the mains; chosen by the tones where there is none.
+    false_alarm : float
+        Probability, a rest and beacon, that noise is taken for it in any of its states.
+    risk : Risk, optional
+        What the protection levels promise.
+
+    Raises
+    ------
+    InputError
+        Where the site's tones are not integrated, or it has not one magnetometer of three axes.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        lockin: LockinSettings | None = None,
+        false_alarm: float = 1e-3,
+        risk: Risk | None = None,
+    ) -> None:
+        check_tones(site)
+        if site.platform.further or site.platform.magnetometer.lacking:
+            raise InputError("--at-rest integrates one magnetometer of three axes; leave it out")
+        self.site, self._asked, self._risk = site, false_alarm, risk
+        self._usual, self._lockin = default_settings(site), lockin
+        self._longest = coherent(site)
+        self._imu, self._wave = Buffer("imu", 6), Buffer("magnetometer", 3)
+        self._reference = Buffer("reference", 3)
+        self._looked = self._done = -np.inf
+        self._running: Running | None = None
+        self._known = Known()
+        self._made: list[RestState] = []
+        self.too_short = 0
+
+    # What goes in
+
+    def add_imu(self, time: Array, gyro_body: Array, accel_body: Array) -> None:
+        """Take inertial samples: times (k,), rates and specific forces (k, 3)."""
+        check_clock("imu", time, self._newest)
+        self._imu.add(time, np.hstack([gyro_body, accel_body]))
+
+    def add_magnetometer(self, time: Array, measured_sensor: Array) -> None:
+        """Take raw samples: times (k,), fields (k, 3) (T); then go on as far as can be."""
+        check_clock("magnetometer", time, self._newest)
+        self._wave.add(time, measured_sensor)
+        self.advance()
+
+    def add_reference(self, time: Array, measured_sensor: Array) -> None:
+        """Take samples of a reference sensor, by its own clock: times (k,), fields (k, 3) (T)."""
+        check_clock("reference", time, self._newest)
+        self._reference.add(time, measured_sensor)
+
+    @property
+    def _newest(self) -> float:
+        return max(self._imu.newest, self._wave.newest, self._reference.newest)
+
+    # What comes out
+
+    def take(self) -> list[RestState]:
+        """Return the states made since this was last asked."""
+        made, self._made = self._made, []
+        return made
+
+    @property
+    def kept(self) -> int:
+        """How many samples are kept."""
+        return len(self._imu) + len(self._wave) + len(self._reference)
+
+    # How it goes on
+
+    def end(self) -> None:
+        """Take in what is left at the end of a log."""
+        self.advance(last=True)
+
+    def advance(self, *, last: bool = False) -> None:
+        """Integrate every stretch that has come."""
+        inertial = self.site.platform.inertial
+        newest = self._wave.newest
+        if inertial:
+            newest = min(newest, self._imu.newest + self.site.platform.imu.time_offset)
+        if not last and np.isfinite(self._reference.newest):
+            newest = min(newest, max(self._reference.newest, newest - PATIENCE))
+        if not (last or newest >= self._looked + LOOK) or len(self._wave) < 2:
+            return
+        self._looked = newest
+        log = self._log()
+        span = self.site.platform.motion.rest_span
+        for begin, until in rests(log, self.site):
+            if until <= max(self._done, begin):
+                continue
+            moved = inertial and until < newest - 2.0 * span
+            until = min(until, newest)
+            self._stand(log, max(begin, self._done), until, over=moved or last)
+            if moved and self._running is not None:
+                self._made.append(_moved(until, self._running, len(self.site.channels)))
+                self._running = None
+        if self._running is None:
+            self._done = max(self._done, newest - LATER)
+        self._forget(self._done - MARGIN - span)
+
+    def _stand(self, log: Log, begin: float, until: float, *, over: bool) -> None:
+        """Integrate what has come of a rest."""
+        running, gap = self._running, SAME_REST * self.site.platform.motion.rest_span
+        if running is None or begin > running.end + gap:
+            running = self._running = Running.begun(begin, len(self.site.channels))
+        begin = max(begin, running.end)
+        while until - begin > 0.0:
+            wanted = LATER if running.looks else FIRST
+            if until - begin < wanted and not over:
+                break
+            # What would be left of a rest that is over is none for itself.
+            end = until if over and until - begin < wanted + 0.5 * LATER else begin + wanted
+            running = self._stretch(log, running, (begin, end))
+            begin = end
+        self._running, self._done = running, begin
+
+    def _stretch(self, log: Log, running: Running, span: tuple[float, float]) -> Running:
+        length = piece_length(self.site, self._usual, self._lockin, span[1] - span[0])
+        if length is None:
+            self.too_short += 1
+            return replace(running, end=span[1])
+        mains_hz = (self._lockin or self._usual).mains_hz
+        parts = (log, span, self.site, length, mains_hz, self._asked, self._known)
+        rest = rest_epoch(*parts)
+        self._known = rest.known or self._known
+        running = running.beside(rest, self.site, span[1], self._longest, self._asked)
+        self._made.append(self._state(log, running, rest))
+        return running
+
+    def _state(self, log: Log, running: Running, rest: Rest) -> RestState:
+        """Return what is known after a stretch."""
+        samples = running.fields(self.site, self._longest)
+        heard = running.chance(self.site) < self._asked
+        # A last moment of the rest has its gravity behind it.
+        shown = replace(samples, time=samples.time - self.site.platform.motion.rest_span)
+        findings = (*believed(log), *unheard_in(samples, heard[None], self.site, self._asked))
+        gain = np.array([tone.gain for tone in rest.tones])
+        if np.isfinite(self._reference.newest):
+            findings += witnessed([rest.tones], self.site)
+        found = None
+        if np.any(heard):
+            calibration = initial_calibration(self.site, float(shown.time[0]))
+            gravity = gravity_at_rest(log.imu, self.site, shown.time) if log.inertial else None
+            found = explained_fixes(shown, calibration, gravity=gravity, risk=self._risk)
+        trust = Trust(tuple(findings)) | (Trust() if found is None else found.trust)
+        return RestState(running.end, True, running.duration, samples, heard, found, trust, gain)
+
+    def _log(self) -> Log:
+        imu, rows = self._imu.rows()
+        wave, field = self._wave.rows()
+        other, heard = self._reference.rows()
+        reference = Waveform(other, heard) if len(other) > 1 else None
+        samples = ImuSamples(imu, rows[:, :3], rows[:, 3:])
+        inertial = self.site.platform.inertial
+        whole = Log("stream", 0, "stream", samples, Waveform(wave, field), inertial=inertial)
+        return replace(whole, reference=reference)
+
+    def _forget(self, before: float) -> None:
+        self._imu.forget(before - self.site.platform.imu.time_offset, -np.inf)
+        self._wave.forget(before, -np.inf)
+        self._reference.forget(before - PATIENCE, -np.inf)
+
+
+def _moved(time: float, running: Running, channels: int) -> RestState:
+    none = np.zeros(channels, dtype=bool)
+    nothing: tuple[Finding, ...] = ()
+    gain = np.full(channels, np.nan)
+    return RestState(time, False, running.duration, None, none, None, Trust(nothing), gain)

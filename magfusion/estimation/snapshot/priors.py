@@ -1,0 +1,128 @@
+"""A calibration against what the site declared: of each parameter, and of all together.
+
+A change ``d`` from the declared values has the covariance ``C = P0 - P`` where the declared values
+are part of the fit (prior ``P0``, posterior ``P``), and ``C = P0 + P`` where they are not.  Then
+``d^T C^+ d`` is a chi square of as many degrees of freedom as the data determined directions, and
+each component is normal.  All tests share a false-alarm budget (S. Holm, Scandinavian Journal of
+Statistics 6, 1979).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import log_ndtr
+
+from magfusion.estimation.data_checks.statistics import FALSE_ALARMS, SURE, holm, log_p_chi_square
+from magfusion.model.trust import Finding, Trust, Verdict
+from magfusion.units import Array
+
+MOVED = 0.01  # of the prior's variance, below which the data said nothing along a direction
+NAMED = 3  # parameters in a sentence
+
+
+class Contradiction(NamedTuple):
+    """What a calibration says against the declared values.
+
+    Parameters
+    ----------
+    findings : tuple of Finding
+        None, or one.
+    excess : float
+        By which variances are too small, one where nothing is contradicted.
+    """
+
+    findings: tuple[Finding, ...]
+    excess: float
+
+
+def contradiction(
+    names: Sequence[str],
+    change: Array,
+    change_cov: Array,
+    prior_cov: Array,
+    remedy: str,
+    of: str = "The calibration",
+) -> Contradiction:
+    """Return whether parameters moved farther from their declared values than was declared.
+
+    Parameters
+    ----------
+    names : sequence of str
+        As the report has them.
+    change : ndarray, shape (n,)
+        Found less declared.
+    change_cov, prior_cov : ndarray, shape (n, n)
+        Of the change, were the declared sigmas right, and of the declared values; parameters whose
+        prior variance is zero are left out.
+    remedy : str
+        Sentence that ends the reason.
+    """
+    prior = np.sqrt(np.diagonal(prior_cov))
+    kept = np.flatnonzero(prior > 0.0)
+    scaled = change[kept] / prior[kept]
+    cov = change_cov[np.ix_(kept, kept)] / prior[kept, None] / prior[kept]
+    value, vector = np.linalg.eigh(0.5 * (cov + cov.T))
+    said = value > MOVED
+    square = float(np.sum((vector[:, said].T @ scaled) ** 2 / value[said]))
+    freedom = int(np.sum(said))
+    if freedom == 0:
+        return Contradiction((), 1.0)
+    sigma = np.sqrt(np.maximum(np.diagonal(cov), 0.0))
+    told = sigma**2 > MOVED
+    deviation = np.where(told, np.abs(scaled) / np.where(told, sigma, 1.0), 0.0)
+    single = np.where(told, np.log(2.0) + log_ndtr(-deviation), 0.0)
+    chance = np.append(single, log_p_chi_square(square, freedom))
+    speaks, least = holm(chance), float(np.min(chance))
+    if not np.any(speaks):
+        return Contradiction((), 1.0)
+    order = np.argsort(single)[: max(1, min(NAMED, int(np.sum(speaks[:-1]))))]
+    most = ", ".join(f"{names[kept[i]]} by {deviation[i]:.1f}" for i in order)
+    text = (
+        f"{of} contradicts the site: most changed {most} sigmas; all together a chi square of"
+        f" {square:.3g} where {freedom} is expected. {remedy}"
+    )
+    verdict = Verdict.FAILED if least < np.log(2.0 * SURE) else Verdict.DOUBTFUL
+    weight = least / np.log(FALSE_ALARMS / len(chance))
+    found = Finding("prior", text, verdict, float(weight))
+    return Contradiction((found,), max(1.0, square / freedom, float(np.max(deviation)) ** 2))
+
+
+TOLERATED = 1.5  # root mean square of whitened residuals, below which sigmas are right enough
+NOTHING_EXPLAINED = 10.0  # and from which the model is not that of what was measured
+
+
+def unexplained(
+    what: str, chi_square: float, freedom: float, remedy: str, limit: float = FALSE_ALARMS
+) -> Contradiction:
+    """Return whether residuals are larger than was declared, and more than chance.
+
+    Parameters
+    ----------
+    what : str
+        Of which the residuals are: "beacon A".
+    chi_square : float
+        Sum of the squared whitened residuals.
+    freedom : float
+        Numbers that are independent, less what was fitted.
+    limit : float
+        Share of the false alarms of this test.
+    """
+    if freedom <= 0.0:
+        return Contradiction((), 1.0)
+    excess = chi_square / freedom
+    rms, chance = float(np.sqrt(excess)), float(log_p_chi_square(chi_square, freedom))
+    if rms <= TOLERATED or chance > np.log(limit):
+        return Contradiction((), 1.0)
+    verdict = Verdict.FAILED if rms > NOTHING_EXPLAINED else Verdict.DOUBTFUL
+    text = (
+        f"The residual of {what} is {rms:.3g} where about 1 is expected, over {freedom:.0f}"
+        f" numbers. {remedy}"
+    )
+    return Contradiction((Finding("field_residuals", text, verdict, rms / TOLERATED),), excess)
+
+
+def trust_of(*parts: Contradiction) -> tuple[Trust, float]:
+    """Return what several tests say, and by what a covariance is too small after all of them."""
+    findings = tuple(finding for part in parts for finding in part.findings)
+    return Trust(findings), max((part.excess for part in parts), default=1.0)

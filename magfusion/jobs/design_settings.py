@@ -1,0 +1,115 @@
+"""What the design of an installation is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from magfusion.errors import InputError
+from magfusion.jobs.settings import RandomSettings, RiskSettings, argument, option
+
+ALL = "all"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DesignSettings(RiskSettings, RandomSettings):
+    """Which hall, how many beacons of what kind, and how long to seek."""
+
+    site: Path = argument("Site file: its platform, and a beacon of which copies are placed")
+    beacons: int = option(4, "New beacons to place", least=1, most=30)
+    hall: Path | None = option(
+        None, "YAML file of the hall: walls, mounting, forbidden places, where to navigate"
+    )
+    box: str | None = option(
+        None,
+        "A hall without a file, m: xmin,xmax,ymin,ymax,zmin,zmax",
+        note="default: about the site's beacons",
+    )
+    keep: str | None = option(
+        None,
+        f"Beacons of the site that stay: their names, or {ALL}",
+        metavar="NAME,...",
+        note="default: none; all are placed anew",
+    )
+    template: str | None = option(
+        None, "Beacon of the site of which copies are placed", note="default: the first"
+    )
+    objective: Literal["worst", "D", "A"] = option(
+        "worst",
+        "What is made small: the worst protection level; the mean logarithm of the determinant (D)"
+        " or the mean trace (A) of the position's covariance",
+    )
+    axes: Literal["3", "7", "13"] = option(
+        "7", "Directions of a beacon's axis: the world's, and diagonals"
+    )
+    grid: float | None = option(
+        None, "Of the mounting places", unit="m", above=0.0, note="default: as --spacing"
+    )
+    spacing: float | None = option(
+        None,
+        "Of the points of use",
+        unit="m",
+        above=0.0,
+        note="default: a twentieth of the hall's longer side",
+    )
+    apart: float = option(1.0, "Least distance of two beacons", unit="m", least=0.2, most=1e4)
+    clearance: float = option(
+        0.5, "Least distance of a beacon from the points of use", unit="m", least=0.2, most=1e4
+    )
+    moment: float | None = option(
+        None,
+        "Of each new beacon's strongest coil",
+        unit="A m^2",
+        least=1e-6,
+        most=1e6,
+        note="default: as the template",
+    )
+    moment_budget: float | None = option(
+        None,
+        "Of all new beacons together, divided as serves best",
+        unit="A m^2",
+        least=1e-6,
+        most=1e7,
+    )
+    band: str = option("10,100", "Where tones may be, Hz: low,high")
+    window: float = option(
+        0.4,
+        "Over which tones are averaged and told apart",
+        unit="s",
+        least=0.02,
+        most=4.0,
+    )
+    mains_hz: float = option(
+        50.0, "Mains, whose harmonics are kept free", unit="Hz", least=0.0, most=1e3, note="0: none"
+    )
+    starts: int = option(8, "Random layouts from which the search starts", least=1, most=1000)
+    random: int = option(0, "Random layouts to compare with", least=0, most=10_000)
+    minutes: float = option(
+        10.0, "After which the search ends with the best that it has", least=0.01, most=1e5
+    )
+    motion: int | None = option(
+        None,
+        "Place no beacons: say where to hold the platform next for a calibration, so many stops",
+        least=1,
+        most=100,
+    )
+    stop: float = option(2.0, "Length of such a stop", unit="s", least=0.02, most=3600.0)
+    poses: Literal["open", "known"] = option(
+        "open", "Whether the stops' poses are measured: known for calibrate beacon"
+    )
+    earlier: Path | None = option(
+        None, "Start from the site.yaml of an earlier design of the same hall", name="continue"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.moment is not None and self.moment_budget is not None:
+            raise InputError("give --moment, or --moment-budget to have it divided; not both")
+        if self.hall is not None and self.box is not None:
+            raise InputError("give --hall, or --box where there is no file; not both")
+
+    @property
+    def poses_known(self) -> bool:
+        """Whether the stops' poses are measured."""
+        return self.poses == "known"

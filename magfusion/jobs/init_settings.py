@@ -1,0 +1,42 @@
+"""What is said of an installation when its site file is begun."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from magfusion.jobs.settings import TopicSettings, option
+
+
+@dataclass(frozen=True, kw_only=True)
+class InitSettings(TopicSettings):
+    """What is said of an installation; on a terminal, what nobody said is asked."""
+
+    beacon: tuple[str, ...] = option(
+        (),
+        "A beacon, in the keys of a site; again for each",
+        metavar="'NAME KEY=VALUE ...'",
+        note="frequency_hz, and position_m, rpy_deg, moment_a_m2, axes, radius_m, synchronised",
+    )
+    log: Path | None = option(
+        None, "Recording in which to find the tones of the beacons", note="default: none"
+    )
+    imu: str | None = option(None, "Inertial sensor, of those that --list-imus names")
+    magnetometer: str | None = option(
+        None, "Magnetometer, of those that --list-magnetometers names"
+    )
+    lever: str | None = option(None, "Magnetometer from the IMU, in its axes, m", metavar="X,Y,Z")
+    mounting: str | None = option(
+        None, "Magnetometer against the IMU, degrees", metavar="ROLL,PITCH,YAW"
+    )
+    location: str | None = option(
+        None, "Place, for gravity and the Earth's field", metavar="LAT,LON,HEIGHT,DATE"
+    )
+    list_imus: bool = option(False, "List the inertial sensors that are known by name")
+    list_magnetometers: bool = option(False, "List the magnetometers that are known by name")
+
+    @property
+    def described(self) -> bool:
+        """Whether anything was said of the installation itself."""
+        said = (self.imu, self.magnetometer, self.lever, self.mounting, self.location)
+        return bool(self.beacon) or any(one is not None for one in said)

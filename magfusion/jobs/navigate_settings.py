@@ -1,0 +1,100 @@
+"""What navigation is asked for, along a log or by records on standard input."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from magfusion.errors import InputError
+from magfusion.jobs.live import LiveSettings
+from magfusion.jobs.rates import RateSettings
+from magfusion.jobs.region import RegionSettings
+from magfusion.jobs.rest_settings import RestSettings
+from magfusion.jobs.settings import (
+    EarthSettings,
+    EstimateSettings,
+    ReplayedSettings,
+    RiskSettings,
+    WindowSettings,
+    argument,
+    option,
+)
+
+if TYPE_CHECKING:
+    from magfusion.estimation.online.navigator import NavigatorSettings
+    from magfusion.jobs.inputs import Job
+
+
+@dataclass(frozen=True, kw_only=True)
+class NavigateSettings(
+    RegionSettings,
+    WindowSettings,
+    RestSettings,
+    ReplayedSettings,
+    EarthSettings,
+    EstimateSettings,
+    RiskSettings,
+    LiveSettings,
+    RateSettings,
+):
+    """How to navigate as data come, along a log or by records on standard input."""
+
+    log: Path = argument("Log to replay, or - for records on standard input")
+    estimator: Literal["smoother", "ekf"] = option(
+        "smoother", "Fixed-lag smoother, or Kalman filter"
+    )
+    lag: float = option(4.0, "Window of the smoother", unit="s", least=0.5, most=60.0)
+    delay: float = option(
+        0.0,
+        "How late samples may come",
+        unit="s",
+        least=0.0,
+        most=10.0,
+        note="so much later are states",
+    )
+    horizon: float = option(
+        0.0,
+        "So far ahead of the inertial samples are states between epochs",
+        unit="s",
+        least=0.0,
+        most=1.0,
+    )
+    blend: float = option(
+        0.0,
+        "So long a correction takes to enter states between epochs",
+        unit="s",
+        least=0.0,
+        most=10.0,
+        note="0: at once",
+    )
+    checkpoint: Path | None = option(
+        None, "Checkpoint file", note="default: in the output while the job runs"
+    )
+    every: float = option(30.0, "Between checkpoints", unit="s", least=0.1, most=86400.0)
+    resume: bool = option(False, "Continue from the checkpoint, if there is one")
+    keep_going: bool = option(False, "Count bad records, and skip them")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.rate == "field" and (self.horizon or self.blend):
+            raise InputError(
+                "--horizon and --blend are of states between epochs; give --rate imu, or --rate HZ"
+            )
+
+    def navigator(self, job: Job) -> NavigatorSettings:
+        """Return the settings of the estimator."""
+        from magfusion.estimation.online.navigator import NavigatorSettings
+
+        return NavigatorSettings(
+            estimator=self.estimator,
+            lag=self.lag,
+            delay=self.delay,
+            estimate=self.groups,
+            earth=self.earth,
+            lockin=self.lockin(job),
+            risk=self.risks,
+            rate=self.rates,
+            horizon=self.horizon,
+            blend=self.blend,
+        )

@@ -1,0 +1,118 @@
+"""From the ground up: the wings of the package, and the rooms of each.
+
+A wing imports only from those before it, and within a wing a room (a folder, or a loose file) only
+from those before it.  A new room goes as low as its imports let it.
+"""
+
+WINGS = [
+    "units",
+    "errors",
+    "model",
+    "files",
+    "receiver",
+    "simulation",
+    "estimation",
+    "calibration",
+    "papers",
+    "results",
+    "jobs",
+    "cli",
+    "__main__",
+    "__init__",
+]
+
+ROOMS = {
+    wing: rooms.split()
+    for wing, rooms in {
+        "model": """
+            altered correlation drive field_map fixed_axes groups hall hermite marks numpy_tools
+            perturbation physics platform_motion probe progress quaternion region response rotor
+            scipy_notes temperature time_division trust
+            magnetometer rotation
+            site trajectory
+            antenna channel_effects coil_field once one_axis receive_coils samples strapdown
+            audibility field ground moments without_imu
+            parameters path_field strapdown_steps
+            noise prior waveform
+        """,
+        "files": """
+            atomic bag_topics blas_threads commit lost_rows messages parquet_bounds plain_data
+            plain_table plausible row_table site_draft site_ground site_values standard_streams
+            without_pandas
+            bag_rows checkpoint correlation field_map kept probe row_file survey table yaml_files
+            attitude_table drive_columns fields hall instruments readings_table site_casing
+            site_correlation site_motion site_region site_response site_rotor site_warming
+            trajectory_table wells_file
+            bag depth_table fix_table marks_table result_states rotor_columns site_plain site_text
+            temperature_table tum
+            inertial_tables odometry_bag site_magnetometer stream
+            euroc named_records named_samples site_schema stream_contents
+            log site
+            foreign open
+            table_stream
+            long_log
+        """,
+        "receiver": """
+            ambient bursts cells ellipse even_samples hum noise range_ends rotor rotor_phase
+            sampling_clock turn windows
+            admission ambient_left pieces slots
+            design drive integration marked_bursts receiver reference slot_phasors slot_timing
+            cycles lockin reference_clock
+            even_clocks lockin_receiver slot_receiver
+            joint marked
+            receivers
+        """,
+        "simulation": """
+            atmosphere demo_site ground layers magnetometers monte_carlo motion perturbed pipe shaft
+            slots
+            disturbance inertial rails rotor rotor_beacons
+            drift field wells
+            waveform worlds
+            log
+            endurance
+        """,
+        "estimation": """
+            solve data_checks graph measurements posterior snapshot ranging demodulation batch
+            integrity initialization online_integrity online orientation rests
+        """,
+        "calibration": """
+            allan antenna beacon fieldmap graph magnetometer steady_field stops
+            allan_fit antenna_graph antenna_observability antenna_probe antenna_site beacon_refined
+            ellipsoid magnetometer_graph rest
+            antenna_tracking magnetometer_start
+            magnetometer_log
+            magnetometer_size
+        """,
+        "papers": """
+            p000_tracker p001_magnetometer p004_fingerprints register
+            p002_beacon
+        """,
+        "results": """
+            consistency errors figures gauge odometry page_style pose_information provenance
+            recording_file ros_messages shapes trend
+            coverage drift live_foxglove observability odometry_dds odometry_mavlink recording_plots
+            refinement rest_figures shown transfer verdict
+            coverage_colours design motion_coverage recording_layout recording_trust screen
+            plots recording recording_drift
+            page_motion recording_coverage recording_design recording_live
+            page
+            report
+        """,
+        "jobs": """
+            antenna_inputs fix_coil joint_kept receiver_axes region_option rotor_inputs state_rows
+            written
+            inputs navigate_results
+            allan_noise checkpoint failure orientation settings without_beacons
+            allan antenna_settings attitude_database calibrate_beacon calibrate_fieldmap
+            calibrate_magnetometer check design_settings drift_world evaluate export init_settings
+            live papers range_wells rates region replay rest_settings simulate_passes smooth_result
+            survey view
+            antenna_fit demodulate design_motion drift_figures fix import_log init_questions
+            joint_tasks match_trust navigate_settings simulate stream
+            antenna_report antenna_trust coverage drift init joint_run match navigate_rests
+            calibrate_antenna design_figures joint_result navigate
+            calibrate_log design smooth
+            demo
+        """,
+    }.items()
+}
