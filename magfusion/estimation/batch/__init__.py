@@ -1,1 +1,1 @@
-"""A whole log at once: its graph, several logs, several magnetometers, a self survey."""
+"""One or several whole logs: preparation, start, graph, passes, self survey."""

@@ -1,1 +1,1 @@
-"""What the samples alone say of themselves, before any estimator has them."""
+"""Checks of samples, spectra and stamps, before any estimate."""

@@ -1,1 +1,1 @@
-"""From samples of the sensor to the phasors of each beacon in each epoch."""
+"""Phasors of each beacon from samples, along a motion that is known or assumed."""

@@ -1,1 +1,1 @@
-"""The factor graph: its states, its factors, and the inertial data between epochs."""
+"""The factor graph: states, factors, and the inertial data between epochs."""

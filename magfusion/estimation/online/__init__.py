@@ -1,1 +1,1 @@
-"""As the data arrive: navigator, filter, fixed lag, and what a checkpoint holds."""
+"""Estimation as data arrive: navigator, Kalman filter, fixed-lag smoother."""

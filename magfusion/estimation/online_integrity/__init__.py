@@ -1,1 +1,1 @@
-"""The gate, recovery, the bank and the levels of an estimator that runs."""
+"""Integrity of a running estimate: gate, recovery, separation, levels."""

@@ -1,1 +1,1 @@
-"""What a solved graph says beside its states: marginals, residuals, noise."""
+"""What a solved graph gives beside its states: marginals, redundancy, noise."""

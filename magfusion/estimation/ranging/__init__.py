@@ -1,1 +1,1 @@
-"""From one log of a well to the place of the other well."""
+"""Distance and direction from one well to another."""

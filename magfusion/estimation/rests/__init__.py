@@ -1,1 +1,1 @@
-"""Magnetometer and inertial data of a platform that stands still."""
+"""Integration over the rests of a platform that stands still for long."""
