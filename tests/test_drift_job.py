@@ -12,7 +12,7 @@ from magfusion.errors import InputError
 from magfusion.files.checkpoint import Checkpoint, write_checkpoint
 from magfusion.jobs import drift, drift_world
 from magfusion.jobs.drift import DriftSettings, overall, run_drift, summarise
-from magfusion.jobs.drift_figures import drift_of, judged, settled, verdict_of_one
+from magfusion.jobs.drift_figures import drift_of, judged, nees_limits, settled, verdict_of_one
 from magfusion.jobs.drift_world import WorldRun, WorldTask, run_world
 from magfusion.results.drift import QUANTITIES, ErrorSeries
 
@@ -100,13 +100,23 @@ def test_one_world_alone_drifts_only_by_more_than_it_claims(slope_deg, verdict):
     assert found["ekf_attitude_drift"] == verdict
 
 
-@pytest.mark.parametrize(("worlds", "verdict"), [(1, "undecided"), (4, "fail")])
+@pytest.mark.parametrize(("worlds", "verdict"), [(1, "pass"), (4, "fail")])
 def test_sigmas_too_large_need_several_worlds_to_be_told_from_luck(worlds, verdict):
     """One survey may happen to err little; not all of them."""
     _, findings = judged("ekf", [a_run(world, sigma_error=0.5) for world in range(worlds)])
     found = next(f for f in findings if f.name == "ekf_pose_consistency")
     assert found.verdict == verdict
-    assert "too large" in found.sentence
+    assert ("too large" in found.sentence) == (verdict == "fail")
+
+
+def test_the_limits_of_the_nees_follow_from_the_number_of_worlds():
+    """Six errors of a survey are drawn in a world: the mean of their squares spreads by it."""
+    draws = np.random.default_rng(38).standard_normal((20_000, 6, 6))
+    for worlds in (1, 6):
+        low, high = nees_limits(worlds)
+        level = np.mean(draws[:, :worlds] ** 2, axis=(1, 2))
+        assert 0.007 < np.mean(level < low) < 0.013
+        assert 0.007 < np.mean(level > high) < 0.013
 
 
 def test_the_machine_growing_slower_is_not_the_estimator_growing_slower():

@@ -215,6 +215,17 @@ def states_of(states: list[State]) -> States:
     )
 
 
+def pose_steps(reference: States, states: States) -> Array:
+    """Return the tangent vectors (n, 6) that take the poses of ``reference`` to those of states."""
+    pairs = zip(_poses(reference), _poses(states), strict=True)
+    return np.array([old.localCoordinates(new) for old, new in pairs]).reshape(-1, 6)
+
+
+def _poses(states: States) -> list[gtsam.Pose3]:
+    pairs = zip(states.world_from_body, states.position_world, strict=True)
+    return [gtsam.Pose3(gtsam.Rot3(rotation), place) for rotation, place in pairs]
+
+
 def as_trajectory(states: list[State]) -> Trajectory:
     """Return states as a trajectory with biases and the covariance of the poses."""
     return Trajectory(

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from magfusion.estimation.graph.measurement import Loss, Measurement, Rows, group_distances
-from magfusion.estimation.graph.state import State, States, states_of
+from magfusion.estimation.graph.state import State, States, pose_steps, states_of
 from magfusion.estimation.measurements.signs import whitened_along
 from magfusion.model.audibility import are_many
 from magfusion.model.field import skew
@@ -67,6 +67,8 @@ class FieldPhasors(Measurement):
         units of that of an epoch alone.
     heard : bool ndarray, shape (n, channels), optional
         Those that are predicted; None for all.
+    world_from_body, position_world : ndarray, shape (n, 3, 3) and (n, 3), optional
+        Pose at which the fields are linearised, in place of the states': an iterated update's.
     predicted : Predictions
         Shared by all that differ from this in their weights alone.
     """
@@ -82,6 +84,8 @@ class FieldPhasors(Measurement):
     robust: str | None = None
     excess: Array | None = None
     heard: BoolArray | None = None
+    world_from_body: Array | None = None
+    position_world: Array | None = None
     predicted: "Predictions" = field(default_factory=lambda: Predictions(), compare=False)
 
     @property
@@ -104,6 +108,8 @@ class FieldPhasors(Measurement):
 
     def error(self, states: States, calibration: Calibration) -> Array:
         """Return the whitened error, shape (n, channels, 6), without a derivative."""
+        if self.world_from_body is not None:
+            return self.linearize(states, calibration, ()).error
         if self.ahead is not None or np.any(calibration.clock_offsets):
             value, _, _, _ = self.unwhitened(states, calibration, ())
             return (self.sqrt_information @ (value - self.measured)[..., None])[..., 0]
@@ -117,14 +123,30 @@ class FieldPhasors(Measurement):
         self, states: States, calibration: Calibration, blocks: tuple[Block, ...]
     ) -> Rows:
         """Return the rows at an estimate, a group for each channel."""
+        at = self._linearization_points(states)
         value, by_pose, by_velocity, by_calibration = self.predicted.of(
-            self, states, calibration, blocks
+            self, at, calibration, blocks
         )
+        if at is not states:
+            value = value + (by_pose @ pose_steps(at, states)[:, None, :, None])[..., 0]
         return Rows(
             error=(self.sqrt_information @ (value - self.measured)[..., None])[..., 0],
             by_pose=self.sqrt_information @ by_pose,
             by_velocity=None if by_velocity is None else self.sqrt_information @ by_velocity,
             by_calibration=self._whitened(by_calibration, calibration.site, blocks),
+        )
+
+    def linearized_at(self, world_from_body: Array, position_world: Array) -> "FieldPhasors":
+        """Return the measurement of one epoch linearised at a pose, (3, 3) and (3,) (m)."""
+        return replace(
+            self, world_from_body=world_from_body[None], position_world=position_world[None]
+        )
+
+    def _linearization_points(self, states: States) -> States:
+        if self.world_from_body is None or self.position_world is None:
+            return states
+        return replace(
+            states, world_from_body=self.world_from_body, position_world=self.position_world
         )
 
     def _whitened(self, by_blocks: Array, site: Site, blocks: tuple[Block, ...]) -> Array:

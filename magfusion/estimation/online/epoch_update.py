@@ -12,6 +12,7 @@ from magfusion.estimation.initialization.online import OnlineStart
 from magfusion.estimation.integrity.place_witness import of_place
 from magfusion.estimation.measurements.earth import EarthField, EarthWeight, speed_sigma
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
+from magfusion.estimation.measurements.linearization import is_curved, relinearized
 from magfusion.estimation.measurements.phasors import FieldPhasors
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.online.ekf import ErrorStateFilter
@@ -138,7 +139,7 @@ class EpochUpdate:
         else:
             if lost and found.apart and self._found_again(estimator, found, predicted):
                 return self._judged(estimator.state, None)
-            point, refused = self._linearization_point(found, state)
+            found, point, refused = self._linearization_point(found, state)
             explained, valid = state if point is None else point, found.samples.valid[0]
             phasors = self._weighed_phasors(found, explained, asked=point is None)
             if self.metal.comes:
@@ -285,25 +286,31 @@ class EpochUpdate:
     def _lost(self, state: State) -> bool:
         return self.gate.lost or not _no_wider(state.cov[POSITION, POSITION], LOST_POSITION)
 
-    def _linearization_point(self, found: Measured, state: State) -> tuple[State | None, BoolArray]:
-        """Return where to linearise if a prediction is too wide for it, and what disagrees."""
+    def _linearization_point(
+        self, found: Measured, state: State
+    ) -> tuple[Measured, State | None, BoolArray]:
+        """Return fields as they are linearised, the fix where if one is needed, what disagrees."""
         samples = found.samples
         nothing = np.zeros(len(samples.channels), dtype=bool)
-        if not found.apart:  # of a state that is near enough, or its windows were not asked for
-            return None, nothing
+        # Of a state that is near enough, or its windows were not asked for.
+        if not isinstance(found.phasors, FieldPhasors):
+            return found, None, nothing
         if not _wide(state):
             self._pointing.over()
-            return None, nothing
+            if not is_curved(state):
+                return found, None, nothing
+            at = relinearized(found.phasors, state, self.blocks)
+            return found if at is None else replace(found, phasors=at), None, nothing
         if not self._pointing.due(state.time):
-            return None, samples.valid[0]
+            return found, None, samples.valid[0]
         fix = agreed_fix(samples, state.calibration, prior_of(state))
         if fix is None:
-            return None, nothing
+            return found, None, nothing
         if not explains(fix, samples, state.calibration):
-            return None, samples.valid[0]
+            return found, None, samples.valid[0]
         self.gate.counts["found by a fix"] += 1
         self._pointing.over()
-        return at_fix(state, fix), fix.refused
+        return found, at_fix(state, fix), fix.refused
 
     def _found_again(self, estimator: Estimator, found: Measured, predicted: Propagated) -> bool:
         """Give the pose up that explains nothing any more, and start from a fix."""

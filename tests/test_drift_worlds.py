@@ -1,0 +1,29 @@
+"""The drift test on fresh worlds, by the installed command: sigmas are right, both ways."""
+
+import json
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from magfusion.jobs.drift_figures import nees_limits
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("estimator", "worlds", "hours"), [("ekf", 6, 3.0), ("smoother", 4, 2.0)], ids=["ekf", "lag"]
+)
+def test_poses_and_biases_of_fresh_worlds_are_consistent_in_either_half(
+    estimator: str, worlds: int, hours: float, tmp_path: Path
+) -> None:
+    """A platform at rest is measured once a minute, so that each prediction is 20 cm wide."""
+    command = ["magfusion", "drift", "--hours", str(hours), "--worlds", str(worlds)]
+    command += ["--estimator", estimator, "--seed", "101", "-o", str(tmp_path / "drift")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads((tmp_path / "drift" / "report.json").read_text())
+    low, high = nees_limits(worlds)
+    for part in ("pose", "bias"):
+        assert found[f"{estimator}_{part}_consistency_verdict"] == "pass"
+        for half in ("first", "last"):
+            assert low < found[f"{estimator}_{part}_nees_{half}_half"] < high
