@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.data_checks.statistics import (
     WITNESS_BUDGET,
     holm,
@@ -24,13 +25,7 @@ def calibration_change(case: Case) -> Testimony:
     result = case.result
     if not result.blocks:
         return NOTHING
-    spread = prior_sqrt_covariance(result.declared.site, result.blocks)
-    change = difference(result.declared, result.calibration, result.blocks)
-    cov = spread @ spread.T - result.calibration_cov
-    moved = result.calibration_response  # what is not estimated disturbs the change as well
-    cov = cov + 2.0 * moved @ moved.T
-    scale = np.sqrt(np.diagonal(spread @ spread.T))
-    change, cov = change / scale, cov / scale[:, None] / scale
+    change, cov = _change_of(result)
     tests = [distance(change, cov, [block]) for block in result.blocks]
     kinds = list(dict.fromkeys(block.parameter for block in result.blocks))
     of_kind = {kind: [b for b in result.blocks if b.parameter == kind] for kind in kinds}
@@ -38,28 +33,46 @@ def calibration_change(case: Case) -> Testimony:
     whole = distance(change, cov, list(result.blocks))
     every = [*tests, *joint.values(), whole]
     speaks = holm([log_p for _, _, log_p in every], WITNESS_BUDGET)
-    said = [(t, yes and t[0] > TOLERATED * t[1]) for t, yes in zip(every, speaks, strict=True)]
-    if not any(yes for _, yes in said):
+    # Of each test: the parameter that it is of, if it is of one.
+    of_test = [*(block.parameter for block in result.blocks), *kinds, None]
+    loud = [
+        (kind, square / freedom)
+        for kind, (square, freedom, _), yes in zip(of_test, every, speaks, strict=True)
+        if yes and square > TOLERATED * freedom
+    ]
+    if not loud:
         return NOTHING
-    excess = max(square / freedom for (square, freedom, _), yes in said if yes)
-    speaking = {b.parameter for b, (_, yes) in zip(result.blocks, said, strict=False) if yes}
-    speaking |= {k for k, (_, yes) in zip(kinds, said[len(tests) :], strict=False) if yes}
+    speaking = {kind for kind, _ in loud}
     findings = [
         _finding(kind, of_kind[kind], *joint[kind], change) for kind in kinds if kind in speaking
     ]
-    if not findings:
-        square, freedom, log_p = whole
-        findings = [
-            Finding(
-                "prior",
-                "All together, the calibration moved farther from its declared values than their"
-                f" sigmas allow: a chi square of {square:.3g} on {freedom}. Declare sigmas that are"
-                f" {np.sqrt(square / freedom):.2g} times as large.",
-                Verdict.DOUBTFUL,
-                float(sigmas(log_p)),
-            )
-        ]
-    return Testimony(tuple(findings), factor=np.full(len(case.pose_cov), excess))
+    excess = max(ratio for _, ratio in loud)
+    return Testimony(
+        tuple(findings or [_of_all(*whole)]), factor=np.full(len(case.pose_cov), excess)
+    )
+
+
+def _change_of(result: Smoothed) -> tuple[Array, Array]:
+    """Return by how much the calibration moved, in declared sigmas, and the covariance of that."""
+    spread = prior_sqrt_covariance(result.declared.site, result.blocks)
+    change = difference(result.declared, result.calibration, result.blocks)
+    cov = spread @ spread.T - result.calibration_cov
+    moved = result.calibration_response  # what is not estimated disturbs the change as well
+    cov = cov + 2.0 * moved @ moved.T
+    scale = np.sqrt(np.diagonal(spread @ spread.T))
+    return change / scale, cov / scale[:, None] / scale
+
+
+def _of_all(square: float, freedom: int, log_p: float) -> Finding:
+    """Return that the calibration moved too far, though no kind of parameter alone did."""
+    return Finding(
+        "prior",
+        "All together, the calibration moved farther from its declared values than their"
+        f" sigmas allow: a chi square of {square:.3g} on {freedom}. Declare sigmas that are"
+        f" {np.sqrt(square / freedom):.2g} times as large.",
+        Verdict.DOUBTFUL,
+        float(sigmas(log_p)),
+    )
 
 
 def distance(change: Array, cov: Array, blocks: list[Block]) -> tuple[float, int, float]:
