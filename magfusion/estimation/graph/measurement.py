@@ -156,6 +156,10 @@ class Measurement(ABC):
         """Return which groups of rows are predicted, shape (n, groups); None for all."""
         return None
 
+    def at_states(self) -> Self:
+        """Return the measurement linearised where its states are, if an update has it elsewhere."""
+        return self
+
     def rows(self, kept: BoolArray | slice) -> Self:
         """Return the measurement at some of its epochs."""
         return replace(

@@ -142,6 +142,12 @@ class FieldPhasors(Measurement):
             self, world_from_body=world_from_body[None], position_world=position_world[None]
         )
 
+    def at_states(self) -> "FieldPhasors":
+        """Return the measurement linearised where its states are."""
+        if self.world_from_body is None:
+            return self
+        return replace(self, world_from_body=None, position_world=None)
+
     def _linearization_points(self, states: States) -> States:
         if self.world_from_body is None or self.position_world is None:
             return states

@@ -129,6 +129,7 @@ class SlidingWindow:
         self.nodes = [*nodes, Node(new, tuple(measurements), predicted.link)]
         try:
             cov = self._iterate(passed=passed)
+            self.nodes[-1] = _at_states(self.nodes[-1])
             for _ in range(0 if linearization_point is None else ITERATIONS_FAR - 1):
                 cov = self._iterate()
             self._tell_passed(cov)
@@ -284,6 +285,10 @@ class SlidingWindow:
         cov[MOTION:, MOTION:] += noise
         wide = np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))
         return wide, wide @ mean
+
+
+def _at_states(node: Node) -> Node:
+    return replace(node, measurements=tuple(m.at_states() for m in node.measurements))
 
 
 def _prior_of(state: State) -> Prior:
