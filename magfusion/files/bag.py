@@ -157,9 +157,14 @@ def _chosen(
             f"{path}: has several topics for {role}: {', '.join(names)};"
             f" name one by --topics {role}=... (in Python, by Topics), or keep one in the bag."
         )
-    if len({c.msgtype for c in connections}) > 1:
-        raise InputError(f"{path}: topic {names[0]} has several types; record it with one.")
+    _refuse_several_types(connections, path)
     return connections
+
+
+def _refuse_several_types(connections: list[Connection], path: Path) -> None:
+    if len({c.msgtype for c in connections}) > 1:
+        topic = connections[0].topic
+        raise InputError(f"{path}: topic {topic} has several types; record it with one.")
 
 
 def _sorted(place: str, msgtype: str, stamps: IntArray, values: Array) -> _Stream:

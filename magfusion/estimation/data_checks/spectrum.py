@@ -15,7 +15,7 @@ from scipy.ndimage import median_filter
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.turning import field_body
 from magfusion.model.quaternion import turned
-from magfusion.model.samples import ImuSamples, Log
+from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import Site
 from magfusion.model.strapdown import turn_at, turn_from_gyro
 from magfusion.model.trust import Finding, Verdict
@@ -222,11 +222,7 @@ def beside_lines(log: Log, site: Site, lockin: LockinSettings | None) -> LockinS
     wave = log.waveform
     if wave is None or len(wave) < 2 or has_schedule(site) or not site.beacons:
         return lockin
-    end = float(wave.time[0]) + BEGINNING
-    few, first = wave.time < end, log.imu.time < end
-    imu = ImuSamples(log.imu.time[first], log.imu.gyro_body[first], log.imu.accel_body[first])
-    wave = wave.rows(few)
-    found = spectrum(replace(log, waveform=wave, imu=imu), site)
+    found = spectrum(_until(log, wave, float(wave.time[0]) + BEGINNING), site)
     if found is None:
         return lockin
     try:
@@ -236,15 +232,22 @@ def beside_lines(log: Log, site: Site, lockin: LockinSettings | None) -> LockinS
     tones = np.array([f for _, f in _tones(site)])
     chosen: tuple[float, ...] = ()
     for line in undeclared(found, site):
+        if len(chosen) == MOST_FITTED:
+            break
         if _consequence(found, line, site, settings)[0] <= CONSEQUENCE:
             continue
         others = np.array([*tones, *chosen])
         trial = _fitting(line.frequency_hz, others, site, settings, chosen, asked=bool(lockin))
-        if trial is None or len(chosen) == MOST_FITTED:
-            continue
-        if separable(1.0 / found.rate_hz, trial, tones):
+        if trial is not None and separable(1.0 / found.rate_hz, trial, tones):
             settings, chosen = trial, trial.lines_hz
     return settings if chosen else lockin
+
+
+def _until(log: Log, wave: Waveform, end: float) -> Log:
+    """Return the waveform and the inertial samples of a log up to a time."""
+    first = log.imu.time < end
+    imu = ImuSamples(log.imu.time[first], log.imu.gyro_body[first], log.imu.accel_body[first])
+    return replace(log, waveform=wave.rows(wave.time < end), imu=imu)
 
 
 def _fitting(

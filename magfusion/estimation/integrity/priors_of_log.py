@@ -26,30 +26,35 @@ def calibration_change(case: Case) -> Testimony:
     if not result.blocks:
         return NOTHING
     change, cov = _change_of(result)
-    tests = [distance(change, cov, [block]) for block in result.blocks]
-    kinds = list(dict.fromkeys(block.parameter for block in result.blocks))
-    of_kind = {kind: [b for b in result.blocks if b.parameter == kind] for kind in kinds}
+    of_kind: dict[Parameter, list[Block]] = {}
+    for block in result.blocks:
+        of_kind.setdefault(block.parameter, []).append(block)
     joint = {kind: distance(change, cov, blocks) for kind, blocks in of_kind.items()}
     whole = distance(change, cov, list(result.blocks))
-    every = [*tests, *joint.values(), whole]
-    speaks = holm([log_p for _, _, log_p in every], WITNESS_BUDGET)
-    # Of each test: the parameter that it is of, if it is of one.
-    of_test = [*(block.parameter for block in result.blocks), *kinds, None]
-    loud = [
-        (kind, square / freedom)
-        for kind, (square, freedom, _), yes in zip(of_test, every, speaks, strict=True)
-        if yes and square > TOLERATED * freedom
-    ]
-    if not loud:
+    # Of each block, of each kind of parameter, and of all.
+    tests = [(block.parameter, distance(change, cov, [block])) for block in result.blocks]
+    excess = _too_far([*tests, *joint.items(), (None, whole)])
+    if not excess:
         return NOTHING
-    speaking = {kind for kind, _ in loud}
     findings = [
-        _finding(kind, of_kind[kind], *joint[kind], change) for kind in kinds if kind in speaking
+        _finding(kind, blocks, *joint[kind], change)
+        for kind, blocks in of_kind.items()
+        if kind in excess
     ]
-    excess = max(ratio for _, ratio in loud)
-    return Testimony(
-        tuple(findings or [_of_all(*whole)]), factor=np.full(len(case.pose_cov), excess)
-    )
+    factor = np.full(len(case.pose_cov), max(excess.values()))
+    return Testimony(tuple(findings or [_of_all(*whole)]), factor=factor)
+
+
+def _too_far(
+    tests: list[tuple[Parameter | None, tuple[float, int, float]]],
+) -> dict[Parameter | None, float]:
+    """Return the kinds of parameter of tests that fail, with the largest chi square per freedom."""
+    speaks = holm([log_p for _, (_, _, log_p) in tests], WITNESS_BUDGET)
+    excess: dict[Parameter | None, float] = {}
+    for (kind, (square, freedom, _)), yes in zip(tests, speaks, strict=True):
+        if yes and square > TOLERATED * freedom:
+            excess[kind] = max(square / freedom, excess.get(kind, 0.0))
+    return excess
 
 
 def _change_of(result: Smoothed) -> tuple[Array, Array]:

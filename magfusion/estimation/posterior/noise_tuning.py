@@ -135,9 +135,12 @@ def tune(
     errors = [_errors_of(system, i, now, declared, blind) for i in range(len(now.beacons))]
     found = parts_of(errors, alike, lag)
     parts = {i: part for i, part in enumerate(found) if part is not None}
-    # Rare large errors say little, which makes those of a whole log seem smaller than they are.
-    taken = [part.taken for part in parts.values() if part.model is not None]
-    less = float(np.exp(np.mean(np.log(taken)))) if taken else 1.0
+    modelled = [part for part in parts.values() if part.model is not None]
+    less, smooth = 1.0, 0.0
+    if modelled:
+        # Rare large errors say little, which makes those of a whole log seem smaller than they are.
+        less = float(np.exp(np.mean(np.log([part.taken for part in modelled]))))
+        smooth = float(np.mean([part.smooth for part in modelled]))
     out: list[Tuned] = []
     for i, part in parts.items():
         name, (noise, usual) = prior[i].name, part.sizes
@@ -150,8 +153,7 @@ def tune(
             if alone:  # poses that nothing else ties follow a smooth error
                 factor = max(factor, 1.0)
             out.append(Tuned(name, "model_error", usual, factor * usual))
-    smooth = [part.smooth for part in parts.values() if part.model is not None]
-    return (*out, *_tuned_imu(system, now, declared, float(np.mean(smooth)) if smooth else 0.0))
+    return (*out, *_tuned_imu(system, now, declared, smooth))
 
 
 def _errors_of(

@@ -139,8 +139,7 @@ def _chosen(
     reader: AnyReader,
     told: Findings,
 ) -> Topic | None:
-    column = next((entry for entry in entries if entry.column), None)
-    if column is not None:
+    for column in (entry for entry in entries if entry.column):
         told.problems.append(
             f"{path}: --map '{column}': a bag's columns are known; name the topic, as"
             f" {role}=/topic."
@@ -148,20 +147,19 @@ def _chosen(
         return None
     if entries:
         return _asked(path, role, entries[0], found, reader, told)
-    fitting = [(name, kind) for name, kind in found if kind in ROW_OF[role]]
+    fitting = [one for one in found if one[1] in ROW_OF[role]]
     fitting = [one for one in fitting if one[1] in USUAL] or fitting
-    if len(fitting) > 1:
+    if len(fitting) == 1:
+        return Topic(*fitting[0])
+    if fitting:
         names = ", ".join(name for name, _ in fitting)
         told.problems.append(f"{path}: several topics may be {role}: {names}; name one.")
         told.proposals.append(f"{role}={fitting[0][0]}")
-        return None
-    if not fitting:
-        if role == "magnetometer":
-            names = ", ".join(f"{name} ({kind})" for name, kind in found) or "none"
-            kinds = " or ".join(ROW_OF[role])
-            told.problems.append(f"{path}: no topic is of {kinds}, for {role} (found {names}).")
-        return None
-    return Topic(*fitting[0])
+    elif role == "magnetometer":
+        names = ", ".join(f"{name} ({kind})" for name, kind in found) or "none"
+        kinds = " or ".join(ROW_OF[role])
+        told.problems.append(f"{path}: no topic is of {kinds}, for {role} (found {names}).")
+    return None
 
 
 def _asked(
