@@ -99,13 +99,7 @@ def load_site(
             f"{path}: platform.magnetometers: this job takes one magnetometer; give a site that has"
             f" but one of {', '.join(str(m.name) for m in entry.platform.every)}."
         )
-    location, field_world = None, entry.world.earth_field_t
-    if entry.world.location is not None:
-        location = model_of(Location, entry.world.location)
-        try:
-            field_world = _reference_field(location)
-        except InputError as error:
-            raise InputError(f"{path}: world.{error}") from error
+    location, field_world = _location_and_field(entry, path)
     maps, ground = _field_maps(entry, path), entry.world.conductivity_s_m
     sensors = tuple(map(magnetometer_of, entry.platform.every))
     site = Site(
@@ -135,6 +129,17 @@ def load_site(
     if entry.correlation is None:
         return site
     return replace(site, correlation=load_correlation(site, path.parent / entry.correlation))
+
+
+def _location_and_field(entry: SiteEntry, path: Path) -> tuple[Location | None, Array | None]:
+    """Return the place, if the file gives it, and the Earth's field there, or that of the file."""
+    if entry.world.location is None:
+        return None, entry.world.earth_field_t
+    location = model_of(Location, entry.world.location)
+    try:
+        return location, _reference_field(location)
+    except InputError as error:
+        raise InputError(f"{path}: world.{error}") from error
 
 
 def _refuse_unknown(entry: SiteEntry, path: Path) -> None:
