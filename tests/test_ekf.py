@@ -326,6 +326,30 @@ def test_an_update_is_that_of_a_graph_in_which_the_clocks_walk():
     assert np.min(kept[MOTION:]) < 0.8
 
 
+@pytest.mark.parametrize("lag", [None, 1.0])
+def test_moments_that_nothing_measures_walk_as_declared(lag):
+    """In the filter from epoch to epoch; in the window as epochs leave it."""
+    rng = np.random.default_rng(SEED)
+    site = replace(a_site(), clock=ClockModel(log_moment_walk=0.5))  # in an hour
+    blocks = choose_blocks(site, ("moments",), parameters=PHASOR_PARAMETERS)
+    state = a_state(site, blocks, rng)
+    walk, offset = calibration_process_noise(site, blocks), site.platform.imu.time_offset
+    imu = an_imu(state.time, state.time + 8.0, rng)
+    light = (
+        ErrorStateFilter(state, blocks) if lag is None else SlidingWindow(state, blocks, lag, walk)
+    )
+    for epoch in range(1, 21):
+        later = state.time + 0.4 * epoch
+        added = walk if lag is None else None
+        light.absorb(propagate(light.state, imu, later, site, offset, added, blocks=blocks), [])
+    gained = np.diag(light.state.cov)[MOTION:] - np.diag(state.cov)[MOTION:]
+    passed = gained * 3600.0 / 0.5**2  # s
+    # What is within the window has not walked yet.
+    inside = 0.0 if lag is None else lag + 0.4
+    assert np.all((passed > 7.999 - inside) & (passed < 8.001))
+    assert lag is None or np.all(passed < 8.001 - lag + 0.4)
+
+
 def nonlinear_solution(residual, scale):
     """Return the step of least squares (n,), by SciPy from zero, and its covariance there."""
     found = least_squares(
