@@ -1,5 +1,7 @@
 """Arguments of another type than a function takes, refused where they are given."""
 
+from itertools import permutations
+
 
 def check_arguments(function: str, **arguments: tuple[object, type]) -> None:
     """Refuse arguments of other types; the function's own parameters are the keywords, in order.
@@ -19,7 +21,7 @@ def check_arguments(function: str, **arguments: tuple[object, type]) -> None:
     if all(map(isinstance, given, wanted)):
         return
     call = f"{function}({', '.join(arguments)})"
-    if all(any(isinstance(value, kind) for value in given) for kind in wanted):
+    if any(all(map(isinstance, order, wanted)) for order in permutations(given)):
         raise TypeError(f"{call}: the arguments are swapped; give them in this order")
     name, (value, kind) = next(
         (name, pair) for name, pair in arguments.items() if not isinstance(*pair)

@@ -19,6 +19,7 @@ COLOURS = {
     "start": "#1a7f37",
 }
 BAND = "#c9d8ee"
+DASHED = {"truth", "expected"}
 
 
 def draw_charts(charts: list[Chart]) -> NDArray[np.object_]:
@@ -36,7 +37,7 @@ def draw(axes: Axes, chart: Chart) -> None:
     for band in chart.bands:
         axes.fill_between(band.x, band.low, band.high, color=BAND, label=band.label)
     for line in chart.lines:
-        style = "." if line.dots else "-"
+        style = "." if line.dots else "--" if line.colour in DASHED else "-"
         axes.plot(line.x, line.y, style, color=COLOURS[line.colour], label=line.label, lw=1.2)
     for mark in chart.marks:
         axes.plot(mark.x, mark.y, "o", color=COLOURS[mark.colour])
