@@ -178,12 +178,14 @@ def test_only_solve_optimises() -> None:
 
 
 SIMULATOR_SEES = {
+    "arguments",
     "correlation",
     "marks",
     "physics",
     "response",
     "rotor",
     "samples",
+    "short_repr",
     "site",
     "trajectory",
 }  # of the model

@@ -34,6 +34,7 @@ from magfusion.files.site_schema import (
 )
 from magfusion.files.site_warming import warming_entry
 from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
+from magfusion.model.arguments import check_arguments
 from magfusion.model.field_map import FieldMap
 from magfusion.model.physics.earth import earth_field_world
 from magfusion.model.platform_motion import NO_IMU
@@ -165,7 +166,13 @@ def save_site(site: Site, path: Path | str) -> None:
     path : Path
         Replaced as a whole, or left as it was if anything fails.  Field maps are written beside
         it, as ``<stem>_field_map.parquet``, a correlation as ``<stem>_correlation.parquet``.
+
+    Raises
+    ------
+    TypeError
+        Where the first argument is no site.
     """
+    check_arguments("save_site", site=(site, Site))
     path, site = Path(path), as_declared(site)
     maps = {b.name: b.field_map for b in site.every_beacon if b.field_map is not None}
     beside = path.with_name(f"{path.stem}_field_map.parquet")

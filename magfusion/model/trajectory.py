@@ -1,11 +1,16 @@
 """A trajectory: poses over time."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magfusion.model.rotation import slerp
+from magfusion.model.short_repr import one_line
 from magfusion.units import Array, BoolArray
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 # Of one pose, by the name of each part.
 _SHAPES: tuple[tuple[str, tuple[int, ...]], ...] = (
@@ -20,8 +25,35 @@ _SHAPES: tuple[tuple[str, tuple[int, ...]], ...] = (
 FEW = 1024  # times at which columns are interpolated at once
 
 
+class PoseAccess:
+    """Position and attitude under short names, of what has one pose or a pose a row."""
+
+    world_from_body: Array
+    position_world: Array
+
+    @property
+    def position(self) -> Array:
+        """Position of the body in the world, shape (..., 3) (m): ``position_world``."""
+        return self.position_world
+
+    @property
+    def rotation(self) -> "Rotation":
+        """Attitude, which takes vectors from body to world axes, as SciPy's `Rotation`."""
+        from scipy.spatial.transform import Rotation  # a twentieth of every start
+
+        return Rotation.from_matrix(self.world_from_body)
+
+    @property
+    def euler(self) -> Array:
+        """Roll, pitch, yaw, shape (..., 3) (rad): turned by yaw, then pitch, then roll.
+
+        As ``rpy_deg`` of a site, and as ``rotation.as_euler("xyz")``.
+        """
+        return np.asarray(self.rotation.as_euler("xyz"))
+
+
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(PoseAccess):
     """Poses of the body over time; optional parts are None where they are not known.
 
     Parameters
@@ -61,6 +93,16 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def __repr__(self) -> str:
+        spans = [f"{self.time[0]:g} to {self.time[-1]:g} s"] if len(self) else []
+        known = [n for n, _ in _SHAPES[3:] if getattr(self, n) is not None]
+        return one_line(type(self).__name__, [f"{len(self)} poses", *spans, *known])
+
+    @property
+    def cov(self) -> Array | None:
+        """Covariance of rotation, then position, shape (n, 6, 6): ``pose_cov`` (rad, m)."""
+        return self.pose_cov
 
 
 def interpolate(

@@ -8,8 +8,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.model.arguments import check_arguments
 from magfusion.model.marks import Marks
 from magfusion.model.samples import FieldSamples, Log, Waveform
+from magfusion.model.short_repr import short_repr
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.disturbance import Ambient, Bending, Spheres, draw_bending, draw_spheres
@@ -99,6 +101,8 @@ class SimulationConfig:
         How beacons turn that are magnets on shafts.
     """
 
+    __repr__ = short_repr
+
     box_world: Array
     duration: float = 60.0
     motion: MotionKind = "walk"
@@ -139,6 +143,8 @@ class SimulatedLog:
         With the iron that was drawn.
     """
 
+    __repr__ = short_repr
+
     log: Log
     true_site: Site
     drives: Drives
@@ -159,9 +165,17 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
 
     Raises
     ------
+    TypeError
+        Where the arguments are not a site, a configuration and a generator, in this order.
     InputError
         If the configuration or the site cannot be simulated.
     """
+    check_arguments(
+        "simulate_log",
+        site=(site, Site),
+        config=(config, SimulationConfig),
+        rng=(rng, np.random.Generator),
+    )
     calibration_rng, motion_rng, imu_rng, magnetometer_rng, iron_rng, field_rng = rng.spawn(6)
     declared = with_earth_field(site)
     true_site = perturb_site(declared, calibration_rng) if config.perturb else declared

@@ -14,7 +14,8 @@ from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.model.altered import altered
 from magfusion.model.parameters import Block, Calibration, difference, retract
-from magfusion.model.trajectory import Trajectory
+from magfusion.model.short_repr import short_repr
+from magfusion.model.trajectory import PoseAccess, Trajectory
 from magfusion.units import Array, IntArray
 
 MOTION = 15
@@ -23,7 +24,7 @@ ACCEL_BIAS, GYRO_BIAS = slice(9, 12), slice(12, 15)
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class State(PoseAccess):
     """Motion and calibration at one time.
 
     Parameters
@@ -37,6 +38,8 @@ class State:
         (m/s^2, rad/s)
     cov : ndarray, shape (15 + calibration, 15 + calibration)
     """
+
+    __repr__ = short_repr
 
     time: float
     world_from_body: Array
