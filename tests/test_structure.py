@@ -127,8 +127,8 @@ def test_only_the_plots_import_matplotlib() -> None:
     assert all(name.startswith("magfusion/results/plots/") for name in _importers("matplotlib"))
 
 
-def test_only_the_ekf_imports_filterpy() -> None:
-    assert _importers("filterpy") <= {"magfusion/estimation/online/ekf.py"}
+def test_only_one_file_imports_filterpy() -> None:
+    assert _importers("filterpy") == {"magfusion/estimation/graph/kalman.py"}
 
 
 def test_no_file_of_the_package_can_hold_code() -> None:

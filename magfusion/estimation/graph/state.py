@@ -137,27 +137,6 @@ def between(reference: State, state: State, blocks: tuple[Block, ...]) -> Array:
     )
 
 
-def consider_update(step: Array, cov: Array, prior_cov: Array, number: int) -> tuple[Array, Array]:
-    """Return step and covariance that learn nothing of the last parameters (Schmidt's filter).
-
-    What is known well enough is not estimated, but what it may be wrong by stays in the covariance
-    of all else, as long as the estimator runs.
-
-    Parameters
-    ----------
-    step : ndarray, shape (n,)
-    cov, prior_cov : ndarray, shape (n, n)
-        After the measurement, and of the considered parameters.
-    number : int
-        Of them.
-    """
-    if number:
-        step, cov = step.copy(), cov.copy()
-        step[-number:] = 0.0
-        cov[-number:, -number:] = prior_cov[-number:, -number:]
-    return step, cov
-
-
 @dataclass(frozen=True, eq=False)
 class States:
     """States of several epochs as arrays.
