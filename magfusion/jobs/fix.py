@@ -181,10 +181,12 @@ def run_fix(
     trust = found.trust | Trust(of_place(site, fixes.time, *(part[:, 0] for part in first)))
     trust |= Trust(recorded(recording, site, BRIDGED, beacons=True, hearing=hearing))
     trust |= Trust(contradicting_magnetometers(samples, calibration))
-    trust |= Trust(() if rested is None else rested.findings)
+    of_rests = Figures()
+    if rested is not None:
+        trust |= Trust(rested.findings)
+        dropped, of_rests = rested.dropped, rest_figures(rested)
     figures = heading("fix", log.name) | trust_figures(trust) | fix_figures(fixes, site)
-    figures |= dropped_figures(dropped if rested is None else rested.dropped)
-    figures |= level_figures(states) | (Figures() if rested is None else rest_figures(rested))
+    figures |= dropped_figures(dropped) | level_figures(states) | of_rests
     figures |= Figures(where_found("gain_spread", found.gain_spread > 0.0, found.gain_spread))
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     with claimed as whole:

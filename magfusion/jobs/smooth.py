@@ -73,16 +73,17 @@ class SmoothSettings(
             raise InputError("--earth needs the phasors themselves; leave --coupling loose out")
         if self.free not in (None, "gain"):
             raise InputError(f"--free {self.free!r}: smooth frees gain alone; write --free gain")
-        if self.at_rest and self.more:
-            raise InputError(
-                "--at-rest integrates one log; make phasors of each with magfusion demodulate"
-                " --at-rest, and smooth these together"
-            )
-        if self.at_rest and (self.earth or self.free):
-            raise InputError(
-                "--at-rest gives phasors of whole rests, which know nothing of the Earth field nor"
-                " of a common gain; leave --earth and --free out"
-            )
+        if self.at_rest:
+            if self.more:
+                raise InputError(
+                    "--at-rest integrates one log; make phasors of each with magfusion demodulate"
+                    " --at-rest, and smooth these together"
+                )
+            if self.earth or self.free:
+                raise InputError(
+                    "--at-rest gives phasors of whole rests, which know nothing of the Earth field"
+                    " nor of a common gain; leave --earth and --free out"
+                )
         if self.resume and self.checkpoint is None:
             raise InputError("--resume goes on from a file; name it with --checkpoint FILE")
         if self.checkpoint is not None and self.more:
@@ -197,7 +198,8 @@ def run_smooth(
     refuse_rate(job.log_path, log, rate)
     if free_gain:
         site = _with_gain(job, log, site, settings)
-    if site.platform.further and any(beacon.unknown is not None for beacon in site.beacons):
+    placing = any(beacon.unknown is not None for beacon in site.beacons)
+    if site.platform.further and placing:
         raise InputError(
             f"{job.declared_path}: beacons that were never surveyed are placed by one magnetometer;"
             " give a site that has one"
@@ -210,7 +212,7 @@ def run_smooth(
             log, site, result, said = _agreed(log, site, settings, result, risk)
     except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
         reason = reason_of(error)
-        if any(beacon.unknown is not None for beacon in site.beacons):
+        if placing:
             raise EstimationError(f"{job.log_path}: {reason}") from error
         with claimed as whole:
             told = _save_fixes_instead(whole, settings, log, site, reason)
@@ -218,14 +220,11 @@ def run_smooth(
             f"{job.log_path}: {told}; the single-epoch fixes were saved in {job.output / FAILED}"
         ) from error
     give_back_memory()
-    if rested is not None:
-        said += beyond(recording, log, site)
+    said += () if rested is None else beyond(recording, log, site)
     done = finished(log, site, settings, result, risk, said=said)
-    elapsed = Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
-    done = replace(done, figures=done.figures | elapsed)
-    if rested is not None:
-        done = replace(done, figures=done.figures | rest_figures(rested))
-    done = with_errors(done, log, placed, (site, settings))
+    figures = done.figures | Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
+    figures |= Figures() if rested is None else rest_figures(rested)
+    done = with_errors(replace(done, figures=figures), log, placed, (site, settings))
     with claimed as whole:
         write_finished(whole, log, done, rate=rate)
     if passes is not None:

@@ -114,15 +114,7 @@ def propagate(
         lambda found: values(predicted(found[0])),
     )
     after = predicted(link.measurement)
-    factor = inertial_factor(0, link.measurement)
-    rows, _ = factor.linearize(values(after)).jacobian()
-    root = np.linalg.inv(rows[:, _AFTER])
-    transition = np.eye(len(state.cov))
-    transition[:MOTION, :MOTION] = -root @ rows[:, _BEFORE]
-    if link.by_calibration is not None:
-        transition[:MOTION, MOTION:] = -root @ link.by_calibration
-    noise = np.zeros_like(state.cov)
-    noise[:MOTION, :MOTION] = root @ root.T
+    transition, noise = _linearized(link, values(after), len(state.cov))
     if process_noise is not None:
         noise[MOTION:, MOTION:] = process_noise.cov(state.calibration, time, time - state.time)
     cov, motion = state.cov.copy(), transition[:MOTION]
@@ -142,3 +134,15 @@ def propagate(
     )
     bridged = bool(own.increments.bridged[0])
     return Propagated(later, altered(link, steps=own), bridged, transition, noise)
+
+
+def _linearized(link: Link, values: gtsam.Values, size: int) -> tuple[Array, Array]:
+    """Return transition and noise of a step of the motion, shape (size, size) each."""
+    rows, _ = inertial_factor(0, link.measurement).linearize(values).jacobian()
+    root = np.linalg.inv(rows[:, _AFTER])
+    transition, noise = np.eye(size), np.zeros((size, size))
+    transition[:MOTION, :MOTION] = -root @ rows[:, _BEFORE]
+    if link.by_calibration is not None:
+        transition[:MOTION, MOTION:] = -root @ link.by_calibration
+    noise[:MOTION, :MOTION] = root @ root.T
+    return transition, noise
