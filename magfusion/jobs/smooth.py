@@ -172,38 +172,22 @@ def run_smooth(
     from magfusion.estimation.data_checks.recording import beyond
     from magfusion.estimation.solve.memory import give_back_memory
     from magfusion.jobs.failure import reason_of
-    from magfusion.jobs.inputs import claim, named, read_job, refuse_failed
+    from magfusion.jobs.inputs import claim, named, refuse_failed
     from magfusion.jobs.rates import refuse_rate
     from magfusion.jobs.smooth_result import finished, with_errors, write_finished
     from magfusion.results.report import FAILED
     from magfusion.results.rest_figures import rest_figures
 
     claimed = claim(job.output, "smooth", "fix")
-    log, site = read_job(
-        job,
-        unknown=True,
-        fewer=rest is None,
-        amplitudes=rest is None,
-        several=True,
-        anew=rest is None,
-        lockin=settings.lockin,
-        reference=rest is not None,
-        heard=rest is None,
-        report=report,
-    )
-    rested, recording = None, log
+    recording, site = _read(job, settings, by_rests=rest is not None, report=report)
+    rested, log = None, recording
     if rest is not None:
         rested = _rested(job, log, site, rest, settings)
         log = rested.log(log)
     refuse_rate(job.log_path, log, rate)
     if free_gain:
         site = _with_gain(job, log, site, settings)
-    placing = any(beacon.unknown is not None for beacon in site.beacons)
-    if site.platform.further and placing:
-        raise InputError(
-            f"{job.declared_path}: beacons that were never surveyed are placed by one magnetometer;"
-            " give a site that has one"
-        )
+    _refuse_placing(job, site)
     passes = None if kept is None else _passes(*kept, log, site, settings)
     began = time.perf_counter()
     try:
@@ -212,7 +196,7 @@ def run_smooth(
             log, site, result, said = _agreed(log, site, settings, result, risk)
     except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
         reason = reason_of(error)
-        if placing:
+        if _has_unknown(site):
             raise EstimationError(f"{job.log_path}: {reason}") from error
         with claimed as whole:
             told = _save_fixes_instead(whole, settings, log, site, reason)
@@ -231,6 +215,40 @@ def run_smooth(
         passes.place.unlink(missing_ok=True)
     refuse_failed(job.log_path, output=job.output, trust=done.trust)
     return done.figures
+
+
+def _has_unknown(site: Site) -> bool:
+    """Tell whether a site has beacons that were never surveyed."""
+    return any(beacon.unknown is not None for beacon in site.beacons)
+
+
+def _refuse_placing(job: Job, site: Site) -> None:
+    """Refuse beacons that were never surveyed where there are several magnetometers."""
+    if site.platform.further and _has_unknown(site):
+        raise InputError(
+            f"{job.declared_path}: beacons that were never surveyed are placed by one magnetometer;"
+            " give a site that has one"
+        )
+
+
+def _read(
+    job: Job, settings: SmootherSettings, *, by_rests: bool, report: Report
+) -> tuple[Log, Site]:
+    """Return log and site, with what smoothing by windows or by whole rests can do with."""
+    from magfusion.jobs.inputs import read_job
+
+    return read_job(
+        job,
+        unknown=True,
+        fewer=not by_rests,
+        amplitudes=not by_rests,
+        several=True,
+        anew=not by_rests,
+        lockin=settings.lockin,
+        reference=by_rests,
+        heard=not by_rests,
+        report=report,
+    )
 
 
 def _passes(

@@ -175,9 +175,9 @@ def changed(case: Case) -> Testimony:
         return NOTHING
     wide = answered(result, wide, case.log.imu)
     freed = [
-        (one, found)
+        (one, cause)
         for one, _ in known
-        if (found := freed_by(case.pose_cov, wide, one.suspect, information, gradient)) is not None
+        if (cause := freed_by(case.pose_cov, wide, one.suspect, information, gradient)) is not None
     ]
     likely = [
         pair
