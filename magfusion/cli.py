@@ -12,7 +12,7 @@ import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import MISSING, Field
 from importlib import import_module
 from pathlib import Path
@@ -24,8 +24,7 @@ from typer.main import get_command
 
 from magfusion.errors import EstimationError, InputError, InputErrors
 from magfusion.files.blas_threads import use_one_thread
-from magfusion.files.standard_streams import binary_output, occupy_closed, quick_exit, until_closed
-from magfusion.files.without_pandas import without_pandas
+from magfusion.files.standard_streams import binary_output, occupy_closed, until_closed
 from magfusion.jobs import GROUPS, JOBS
 from magfusion.jobs.settings import Command, Option, Settings, options
 from magfusion.model.progress import Report, quiet
@@ -51,7 +50,6 @@ def main(arguments: list[str] | None = None) -> None:
     given = [part for part in given if part != DEBUG]
     if arguments is None and not debug:
         warnings.simplefilter("ignore")  # a library's warnings are no sentence of ours
-    ended = quick_exit() if arguments is None and not debug else []
     if arguments is None:
         gc.disable()  # until what the command needs is imported; see `_import_uncollected`
     occupy_closed()
@@ -59,8 +57,7 @@ def main(arguments: list[str] | None = None) -> None:
         if arguments is None:
             os.environ.setdefault(NO_PLUGINS, "__all__")
             use_one_thread()
-        alone = without_pandas() if arguments is None else nullcontext()
-        with _terminated_as_interrupted(), until_closed(), alone:
+        with _terminated_as_interrupted(), until_closed():
             status = application()(
                 args=given or ["--help"], prog_name="magfusion", standalone_mode=False, obj=given
             )
@@ -71,7 +68,6 @@ def main(arguments: list[str] | None = None) -> None:
             traceback.print_exc()
         status, sentence = _said(error)
         _fail(status, sentence, isinstance(error, InputErrors))
-    ended.append(int(status or 0))
     raise SystemExit(status)
 
 

@@ -215,23 +215,6 @@ def test_a_name_that_the_package_does_not_offer_is_told() -> None:
         _ = magfusion.smoothe
 
 
-def test_the_program_does_without_pandas_and_whoever_imports_it_has_it() -> None:
-    pytest.importorskip("pandas")
-    told = """
-import sys
-from magfusion.files.without_pandas import without_pandas
-with without_pandas():
-    import pyarrow
-    assert pyarrow.array([1.0, 2.0]).to_numpy().sum() == 3.0
-    assert pyarrow.chunked_array([[1], [2]]).to_numpy().tolist() == [1, 2]
-    assert not "pandas" in sys.modules
-import pandas
-assert pandas.Series([1]).sum() == 1
-"""
-    done = _child("-c", told)
-    assert done.returncode == 0, done.stderr
-
-
 def test_tools_of_numpy_wait_until_somebody_asks() -> None:
     told = """
 import sys

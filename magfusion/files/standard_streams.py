@@ -1,6 +1,5 @@
 """Standard input and output of the process, which a caller may close or leave at any time."""
 
-import atexit
 import os
 import sys
 from collections.abc import Iterator
@@ -62,32 +61,3 @@ def until_closed() -> Iterator[None]:
         # Python would complain once more when it flushes at its end.
         with suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def quick_exit() -> list[int]:
-    """End the process, once it is done, without freeing its objects one by one (as mypy does).
-
-    Freeing them is a thirtieth of a short run.  Threads are waited for, and functions that are
-    registered with `atexit` after this call run before; those registered earlier do not run.
-
-    Returns
-    -------
-    list of int
-        Into which the exit status is to be put.  As long as it is empty, and where the output
-        cannot be written, the process ends as usual.
-    """
-    status: list[int] = []
-
-    def end() -> None:
-        if not status:
-            return
-        try:
-            for stream in (sys.stdout, sys.stderr):
-                if stream is not None:
-                    stream.flush()
-        except (OSError, ValueError):
-            return
-        os._exit(status[0])
-
-    atexit.register(end)
-    return status

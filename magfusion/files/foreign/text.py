@@ -85,22 +85,43 @@ def _batches(
             counts[TORN] = counts.get(TORN, 0) + 1
         return "skip"
 
+    names = [f"c{k}" for k in range(len(dialect.columns))]
+    parse = pa.csv.ParseOptions(delimiter=dialect.delimiter, invalid_row_handler=torn)
+    convert = pa.csv.ConvertOptions(
+        column_types=types,
+        include_columns=list(types),
+        null_values=list(MISSING),
+        decimal_point=dialect.decimal,
+    )
     with _opened(path, dialect) as stream:
-        yield from pa.csv.open_csv(
-            stream,
-            read_options=pa.csv.ReadOptions(
-                column_names=[f"c{k}" for k in range(len(dialect.columns))], block_size=BLOCK
-            ),
-            parse_options=pa.csv.ParseOptions(
-                delimiter=dialect.delimiter, invalid_row_handler=torn
-            ),
-            convert_options=pa.csv.ConvertOptions(
-                column_types=types,
-                include_columns=list(types),
-                null_values=list(MISSING),
-                decimal_point=dialect.decimal,
-            ),
-        )
+        for lines in _whole_lines(stream):
+            read = pa.csv.ReadOptions(column_names=names, block_size=lines.size, use_threads=False)
+            table = pa.csv.read_csv(pa.BufferReader(lines), read, parse, convert)
+            # Without rows, too: of those that were torn the next part tells.
+            yield from table.to_batches() or [pa.RecordBatch.from_pylist([], table.schema)]
+
+
+def _whole_lines(stream: Any) -> Iterator[pa.Buffer]:
+    """Yield a text, some megabytes of whole lines at a time, in memory of Arrow's own.
+
+    Arrow reads ahead in threads.  One that holds an object of Python when the process ends, as it
+    does where a table is refused, aborts it: Arrow is given nothing of Python's.
+    """
+    rest = b""
+    while block := stream.read(BLOCK):
+        whole = max(block.rfind(b"\n"), block.rfind(b"\r")) + 1
+        if whole:
+            yield _of_arrow(rest + block[:whole])
+            rest = b""
+        rest += block[whole:]
+    if rest:
+        yield _of_arrow(rest)
+
+
+def _of_arrow(content: bytes) -> pa.Buffer:
+    stream = pa.BufferOutputStream()
+    stream.write(content)
+    return stream.getvalue()
 
 
 def _read(
