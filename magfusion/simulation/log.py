@@ -16,7 +16,7 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.disturbance import Ambient, Bending, Spheres, draw_bending, draw_spheres
 from magfusion.simulation.field import Drives, phasors_world, synchronised_drives
-from magfusion.simulation.inertial import BiasInstability, simulate_imu
+from magfusion.simulation.inertial import BiasInstability, SimulatedImu, simulate_imu
 from magfusion.simulation.layers import Layers
 from magfusion.simulation.magnetometers import answered, names_by_channel
 from magfusion.simulation.motion import (
@@ -221,14 +221,6 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         taken_at = waveform.time + true_site.platform.magnetometer.clock_offset
         angles = recorded_angles(turning, taken_at, shaft_rng)
         rotation = replace(angles, time=waveform.time)
-    stamp = imu.samples.time
-    clock = true_site.platform.imu
-    taken = (1.0 + clock.clock_rate) * stamp + clock.time_offset
-    truth = replace(
-        motion.trajectory(stamp),
-        gyro_bias_body=interpolate(stamp, taken, imu.gyro_bias_body),
-        accel_bias_body=interpolate(stamp, taken, imu.accel_bias_body),
-    )
     reference = None
     if config.reference is not None:
         # Spawned later than those of old, whose draws stay as they were.
@@ -241,12 +233,23 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         source="simulation",
         imu=imu.samples,
         waveform=waveform,
-        truth=truth,
+        truth=_truth(motion, imu, true_site),
         reference=reference,
         waveforms=waveforms,
         rotation=rotation,
     )
     return SimulatedLog(log, true_site, drives, motion, ambient)
+
+
+def _truth(motion: Motion, imu: SimulatedImu, site: Site) -> Trajectory:
+    """Return the true states at the stamps of the inertial samples."""
+    stamp, clock = imu.samples.time, site.platform.imu
+    taken = (1.0 + clock.clock_rate) * stamp + clock.time_offset
+    return replace(
+        motion.trajectory(stamp),
+        gyro_bias_body=interpolate(stamp, taken, imu.gyro_bias_body),
+        accel_bias_body=interpolate(stamp, taken, imu.accel_bias_body),
+    )
 
 
 def _of_each(

@@ -229,7 +229,7 @@ def beside_lines(log: Log, site: Site, lockin: LockinSettings | None) -> LockinS
         settings = lockin or usual_lockin(site)
     except InputError:
         return lockin
-    tones = np.array([f for _, f in _tones(site)])
+    _, tones = map(np.array, zip(*_tones(site), strict=True))
     chosen: tuple[float, ...] = ()
     for line in undeclared(found, site):
         if len(chosen) == MOST_FITTED:
@@ -237,7 +237,8 @@ def beside_lines(log: Log, site: Site, lockin: LockinSettings | None) -> LockinS
         if _consequence(found, line, site, settings)[0] <= CONSEQUENCE:
             continue
         others = np.array([*tones, *chosen])
-        trial = _fitting(line.frequency_hz, others, site, settings, chosen, asked=bool(lockin))
+        asked = lockin is not None
+        trial = _fitting(line.frequency_hz, others, site, settings, chosen, asked=asked)
         if trial is not None and separable(1.0 / found.rate_hz, trial, tones):
             settings, chosen = trial, trial.lines_hz
     return settings if chosen else lockin

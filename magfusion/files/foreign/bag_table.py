@@ -147,8 +147,7 @@ def _chosen(
         return None
     if entries:
         return _asked(path, role, entries[0], found, reader, told)
-    fitting = [one for one in found if one[1] in ROW_OF[role]]
-    fitting = [one for one in fitting if one[1] in USUAL] or fitting
+    fitting = _fitting(found, role)
     if len(fitting) == 1:
         return Topic(*fitting[0])
     if fitting:
@@ -160,6 +159,12 @@ def _chosen(
         kinds = " or ".join(ROW_OF[role])
         told.problems.append(f"{path}: no topic is of {kinds}, for {role} (found {names}).")
     return None
+
+
+def _fitting(found: Sequence[tuple[str, str]], role: str) -> list[tuple[str, str]]:
+    """Return the topics of a type for a role: of the usual ones, if there are such."""
+    fitting = [one for one in found if one[1] in ROW_OF[role]]
+    return [one for one in fitting if one[1] in USUAL] or fitting
 
 
 def _asked(
