@@ -25,9 +25,9 @@ ROOMS = {
     wing: rooms.split()
     for wing, rooms in {
         "model": """
-            altered correlation drive field_map fixed_axes groups hall hermite marks numpy_tools
+            altered correlation drive field_map fixed_axes groups hall hermite marks
             perturbation physics platform_motion probe progress quaternion region response rotor
-            scipy_notes temperature time_division trust
+            temperature time_division trust
             magnetometer rotation
             site trajectory
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
@@ -38,7 +38,6 @@ ROOMS = {
         "files": """
             atomic bag_topics blas_threads commit lost_rows messages parquet_bounds plain_data
             plain_table plausible row_table site_draft site_ground site_values standard_streams
-            without_pandas
             bag_rows checkpoint correlation field_map kept probe row_file survey table yaml_files
             attitude_table drive_columns fields hall instruments readings_table site_casing
             site_correlation site_motion site_region site_response site_rotor site_warming

@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
 
 from magfusion.errors import EstimationError
 from magfusion.estimation.graph.measurement import Measurement, measured_rows
@@ -17,7 +17,6 @@ from magfusion.estimation.graph.state import (
     moved,
 )
 from magfusion.estimation.measurements.phasors import leaves_out
-from magfusion.estimation.posterior.without_statistics import without_statistics
 from magfusion.model.altered import altered
 from magfusion.model.parameters import Block
 from magfusion.units import Array
@@ -32,13 +31,6 @@ def telling_rows(
         return error, jacobian
     kept = np.any(jacobian, axis=1)
     return error[kept], jacobian[kept]
-
-
-@cache
-def _filter() -> type:
-    with without_statistics():
-        from filterpy.kalman import ExtendedKalmanFilter
-    return ExtendedKalmanFilter
 
 
 def _step(kalman: Any, cov: Array, error: Array, jacobian: Array) -> tuple[Array, Array]:
@@ -82,7 +74,7 @@ class ErrorStateFilter:
         self.blocks, self.state, self.considered = blocks, state, considered
         self.lagged = state
         # How much is measured, each update says; to make another filter costs a third of one.
-        self._kalman = _filter()(dim_x=len(state.cov), dim_z=1)
+        self._kalman = ExtendedKalmanFilter(dim_x=len(state.cov), dim_z=1)
 
     def absorb(
         self,
