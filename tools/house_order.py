@@ -25,7 +25,7 @@ ROOMS = {
     wing: rooms.split()
     for wing, rooms in {
         "model": """
-            altered correlation drive field_map fixed_axes groups hall hermite marks
+            correlation drive field_map fixed_axes groups hall hermite marks
             perturbation physics platform_motion probe progress quaternion region response rotor
             temperature time_division trust
             magnetometer rotation

@@ -17,7 +17,6 @@ from magfusion.estimation.graph.state import (
     moved,
 )
 from magfusion.estimation.measurements.phasors import leaves_out
-from magfusion.model.altered import altered
 from magfusion.model.parameters import Block
 from magfusion.units import Array
 
@@ -117,7 +116,7 @@ class ErrorStateFilter:
             step, cov = consider_update(*found, prior.cov, self.considered)
             if not np.all(np.isfinite(step)):
                 raise EstimationError("the filter's step is not finite")
-            state = moved(altered(prior, cov=cov), self.blocks, step)
+            state = moved(replace(prior, cov=cov), self.blocks, step)
         self.state = self.lagged = state
 
     def replace_state(self, state: State) -> None:
