@@ -28,7 +28,7 @@ ROOMS = {
             correlation drive field_map fixed_axes groups hall hermite marks
             perturbation physics platform_motion probe progress quaternion region response rotor
             temperature time_division trust
-            magnetometer rotation
+            magnetometer
             site trajectory
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
             audibility field ground moments without_imu
