@@ -16,13 +16,14 @@ from contextlib import contextmanager
 from dataclasses import MISSING, Field
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn, get_args, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, NoReturn, get_args, get_type_hints
 
 import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
 from magfusion.errors import EstimationError, InputError, InputErrors
+from magfusion.estimation.solve.memory import keep_memory
 from magfusion.files.blas_threads import use_one_thread
 from magfusion.files.standard_streams import binary_output, occupy_closed, until_closed
 from magfusion.jobs import GROUPS, JOBS
@@ -32,10 +33,16 @@ from magfusion.results.figures import Figures
 from magfusion.results.provenance import Run, recorded_as
 
 DEBUG = "--debug"
-NO_PLUGINS = "PYDANTIC_DISABLE_PLUGINS"  # otherwise looked for in every package installed
 LONGEST_REASON = 200  # characters, of an error that was not foreseen
 _NAMED_BY_LOG = "; default: the log's name and the job's"
 _NOT_WRITTEN = "; default: nothing is written"
+
+
+class Invocation(NamedTuple):
+    """What was typed, and whether the process is there for it alone."""
+
+    words: list[str]
+    is_process: bool
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -50,16 +57,17 @@ def main(arguments: list[str] | None = None) -> None:
     given = [part for part in given if part != DEBUG]
     if arguments is None and not debug:
         warnings.simplefilter("ignore")  # a library's warnings are no sentence of ours
-    if arguments is None:
-        gc.disable()  # until what the command needs is imported; see `_import_uncollected`
     occupy_closed()
     try:
         if arguments is None:
-            os.environ.setdefault(NO_PLUGINS, "__all__")
             use_one_thread()
+            keep_memory()
         with _terminated_as_interrupted(), until_closed():
             status = application()(
-                args=given or ["--help"], prog_name="magfusion", standalone_mode=False, obj=given
+                args=given or ["--help"],
+                prog_name="magfusion",
+                standalone_mode=False,
+                obj=Invocation(given, is_process=arguments is None),
             )
     except KeyboardInterrupt:
         raise SystemExit(130) from None
@@ -219,7 +227,8 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
         earlier = _stamp(output)
         given = _given(context)
         with _progress() as report, recorded_as(_run(context, settings, given)):
-            _import_uncollected(command.imports)
+            if context.obj.is_process:
+                gc.freeze()  # what was imported is no garbage, and not looked through again
             offered = {"output": output, "report": report, "given": given}
             try:
                 figures = command.run(settings, **{k: v for k, v in offered.items() if k in wanted})
@@ -244,28 +253,6 @@ def _callback(path: str, command: Command) -> Callable[..., None]:
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {p.name: p.annotation for p in parameters}
     return run
-
-
-def _import_uncollected(modules: tuple[str, ...]) -> None:
-    """Import what a command needs, and begin to collect garbage without what is there by then.
-
-    Modules make a hundred thousand objects and no garbage: to look for it took a tenth of every
-    start, and again whenever all that is alive is looked through.  In a program of the user's own,
-    where nothing stopped it, collection stays as it is.
-    """
-    if gc.isenabled():
-        return
-    from magfusion.estimation.solve.memory import keep_memory
-    from magfusion.model.numpy_tools import import_tools_later
-    from magfusion.model.scipy_notes import leave_notes_out
-
-    import_tools_later()
-    leave_notes_out()
-    keep_memory()
-    for module in modules:
-        import_module(f"magfusion.{module}")
-    gc.freeze()
-    gc.enable()
 
 
 def _parameters(command: Command, writes: bool) -> list[inspect.Parameter]:
@@ -332,7 +319,7 @@ def _run(context: typer.Context, settings: Settings, given: set[str]) -> Run:
     values = {field.name: getattr(settings, field.name) for field, _ in options(type(settings))}
     paths = [p for v in values.values() for p in (v if isinstance(v, tuple) else (v,))]
     return Run(
-        shlex.join(["magfusion", *(context.obj or [])]),
+        shlex.join(["magfusion", *context.obj.words]),
         values,
         frozenset(given),
         tuple(path for path in paths if isinstance(path, Path) and path.exists()),

@@ -215,23 +215,6 @@ def test_a_name_that_the_package_does_not_offer_is_told() -> None:
         _ = magfusion.smoothe
 
 
-def test_tools_of_numpy_wait_until_somebody_asks() -> None:
-    told = """
-import sys
-from magfusion.model.numpy_tools import TOOLS, import_tools_later
-import_tools_later()
-import scipy.spatial.transform
-names = ["numpy." + name for name in TOOLS]
-assert not any(name in sys.modules for name in names)
-import numpy as np
-np.testing.assert_array_equal(np.ones(2), np.ones(2))
-assert np.f2py.__name__ == "numpy.f2py" and callable(np.f2py.get_include)
-assert callable(np.ctypeslib.as_array)
-"""
-    done = _child("-c", told)
-    assert done.returncode == 0, done.stderr
-
-
 @pytest.mark.parametrize(
     ("given", "threads"),
     [
@@ -262,52 +245,33 @@ assert os.environ.get("OPENBLAS_NUM_THREADS") == {threads!r}
     assert done.returncode == 0, done.stderr
 
 
-def test_functions_of_scipy_are_as_they_were_written() -> None:
+def test_who_imports_statistics_while_a_filter_is_made_has_all_of_them() -> None:
     told = """
-import numpy as np
-from magfusion.model.scipy_notes import leave_notes_out
-leave_notes_out()
-import scipy.linalg, scipy.special, scipy.stats
-assert "batch" not in scipy.linalg.svd.__doc__ and "Singular Value" in scipy.linalg.svd.__doc__
-assert np.array_equal(scipy.linalg.svdvals(2.0 * np.ones((3, 1, 1))), 2.0 * np.ones((3, 1)))
-assert scipy.stats.norm.cdf(0.0) == 0.5
-from scipy._lib._docscrape import FunctionDoc
-assert FunctionDoc(np.sum)["Parameters"]
-"""
-    done = _child("-c", told)
-    assert done.returncode == 0, done.stderr
-
-
-def test_the_filter_does_without_statistics_and_whoever_asks_for_them_has_them() -> None:
-    told = """
-import sys
-import numpy as np
-from magfusion.estimation.posterior.without_statistics import without_statistics
-with without_statistics():
-    from filterpy.kalman import ExtendedKalmanFilter
-kalman = ExtendedKalmanFilter(dim_x=1, dim_z=1)
-kalman.update(np.array([1.0]), lambda _: np.eye(1), lambda x: x[0])
-assert "scipy.stats" not in sys.modules
-assert abs(kalman.log_likelihood + 0.5 * (np.log(4.0 * np.pi) + 0.5)) < 1e-12
-import filterpy.stats, scipy.stats
-assert filterpy.stats.norm_cdf((0.0, 1.0), 0.0, 1.0) == scipy.stats.norm.cdf(1.0) - 0.5
+import threading
+found = []
+def statistics():
+    import scipy.stats
+    found.append(scipy.stats)
+thread = threading.Thread(target=statistics)
+thread.start()
+import magfusion.estimation.online.ekf
+thread.join()
+import scipy.stats
+assert found == [scipy.stats]
 assert scipy.stats.chi2.cdf(0.0, 1) == 0.0
 """
     done = _child("-c", told)
     assert done.returncode == 0, done.stderr
 
 
-def test_a_command_collects_garbage_but_not_among_what_it_imported(
-    tmp_path: Path,
-) -> None:
+def test_a_command_looks_for_garbage_but_not_among_what_it_imported(tmp_path: Path) -> None:
     told = """
 import gc, sys
 from magfusion.jobs import smooth
 from magfusion.cli import main
 def run(settings):
     assert gc.isenabled() and gc.get_freeze_count() > 10_000, gc.get_freeze_count()
-    assert {f"magfusion.{name}" for name in smooth.COMMAND.imports} <= set(sys.modules)
-smooth.COMMAND = smooth.Command(smooth.SmoothSettings, run, imports=smooth.COMMAND.imports)
+smooth.COMMAND = smooth.Command(smooth.SmoothSettings, run)
 sys.argv = ["magfusion", "smooth", "."]
 main()
 """
@@ -315,35 +279,3 @@ main()
         [sys.executable, "-c", told], check=False, capture_output=True, text=True, cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr
-
-
-def test_what_a_command_says_that_it_imports_is_there() -> None:
-    for module, _ in JOBS.values():
-        for name in importlib.import_module(f"magfusion.jobs.{module}").COMMAND.imports:
-            assert importlib.util.find_spec(f"magfusion.{name}") is not None, name
-
-
-@pytest.mark.parametrize("job", ["smooth", "navigate"])
-def test_a_command_imports_nothing_that_only_other_runs_ask(job: str) -> None:
-    """Of a mistake, bags, slots, the pipe and doubtful starts others know, when they are asked."""
-    others = {
-        "magfusion.estimation.batch.search",
-        "magfusion.estimation.integrity.likely_cause",
-        "magfusion.estimation.online.several_arrivals",
-        "magfusion.files.bag",
-        "magfusion.files.stream",
-        "magfusion.receiver.slot_receiver",
-        "scipy.fft",
-        "scipy.spatial",
-    }
-    told = f"""
-import sys
-from importlib import import_module
-from magfusion.jobs.{job} import COMMAND
-for name in COMMAND.imports:
-    import_module(f"magfusion.{{name}}")
-print(*({others!r} & set(sys.modules)))
-"""
-    done = _child("-c", told)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == []

@@ -25,10 +25,10 @@ ROOMS = {
     wing: rooms.split()
     for wing, rooms in {
         "model": """
-            altered arguments correlation drive field_map fixed_axes groups hall hermite marks
-            numpy_tools perturbation physics platform_motion probe progress quaternion region
-            response rotor scipy_notes short_repr temperature time_division trust
-            magnetometer rotation
+            arguments correlation drive field_map fixed_axes groups hall hermite marks
+            perturbation physics platform_motion probe progress quaternion region response rotor
+            short_repr temperature time_division trust
+            magnetometer
             site trajectory
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
             audibility field ground moments without_imu

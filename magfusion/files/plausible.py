@@ -1,9 +1,9 @@
 """Samples that no instrument gives in SI units: the mistake of unit that explains them."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.model.rotation import rotations_of
 from magfusion.model.samples import ImuSamples
 from magfusion.units import Array
 
@@ -87,7 +87,9 @@ def _keeps_its_direction(imu: ImuSamples) -> bool:
             world_from_body, ahead = np.eye(3), []
         force = imu.accel_body[k]
         ahead.append(world_from_body @ force / max(float(np.linalg.norm(force)), 1e-12))
-        world_from_body = world_from_body @ rotations_of(imu.gyro_body[k] * step[k])
+        world_from_body = (
+            world_from_body @ Rotation.from_rotvec(imu.gyro_body[k] * step[k]).as_matrix()
+        )
     return float(np.median(firm)) > ONE_WAY
 
 

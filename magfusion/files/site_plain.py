@@ -5,10 +5,10 @@ from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.files.site_motion import MILLION
 from magfusion.files.yaml_files import StrictModel
-from magfusion.model.rotation import rotations_of, vectors_of
 from magfusion.units import DEGREE, Array
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ Model = TypeVar("Model", bound="DataclassInstance")
 
 def rotation_of(rpy_deg: Array) -> Array:
     """Return the matrix of roll, pitch and yaw (degrees)."""
-    roll, pitch, yaw = rotations_of(np.diag(rpy_deg) * DEGREE)
+    roll, pitch, yaw = Rotation.from_rotvec(np.diag(rpy_deg) * DEGREE).as_matrix()
     return np.asarray(yaw @ pitch @ roll)
 
 
@@ -61,8 +61,12 @@ def rpy_deg(matrix: Array) -> Any:
     """Return roll, pitch, yaw; Rotation.as_euler loses 1e-7 rad where the pitch is near 90 deg."""
     yaw = np.arctan2(matrix[1, 0], matrix[0, 0])
     pitch = np.arctan2(-matrix[2, 0], np.hypot(matrix[0, 0], matrix[1, 0]))
-    turned, raised = rotations_of(np.array([[0.0, 0.0, yaw], [0.0, pitch, 0.0]]))
-    return degrees(np.array([vectors_of((turned @ raised).T @ matrix)[0], pitch, yaw]))
+    turned, raised = Rotation.from_rotvec(
+        np.array([[0.0, 0.0, yaw], [0.0, pitch, 0.0]])
+    ).as_matrix()
+    return degrees(
+        np.array([Rotation.from_matrix((turned @ raised).T @ matrix).as_rotvec()[0], pitch, yaw])
+    )
 
 
 def sigma_entry(sigma: Array) -> Any:

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+from scipy.spatial.transform import Rotation
 
 from magfusion.files.table import TIME, Layout, Span, Table, read_table, write_table
-from magfusion.model.rotation import of_quaternions, quaternions_of
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import StateTrust
 from magfusion.units import Array, IntArray
@@ -45,7 +45,7 @@ def write_trajectory(
 
 def trajectory_columns(trajectory: Trajectory, epoch_ns: int) -> dict[str, object]:
     """Return the columns of a trajectory's table; parts that it does not have are left out."""
-    quaternion = np.roll(quaternions_of(trajectory.world_from_body), 1, axis=1)
+    quaternion = Rotation.from_matrix(trajectory.world_from_body).as_quat(scalar_first=True)
     parts: list[tuple[tuple[str, ...], Array | None]] = [
         (_POSITION, trajectory.position_world),
         (_QUATERNION, quaternion),
@@ -95,7 +95,7 @@ def read_trajectory(
     table.refuse(off, "qw to qz", length, "the length of a rotation's quaternion is 1: scale it")
     rotation = np.empty((0, 3, 3))
     if len(table):
-        rotation = of_quaternions(np.roll(quaternion, -1, axis=1))
+        rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
     cov = _numbers(table, _COV)
     return Trajectory(
         time=table.time,

@@ -4,12 +4,12 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.atomic import whole_file
 from magfusion.files.table import LARGEST_NUMBER, LARGEST_TIME_NS, Span
 from magfusion.files.trajectory_table import QUATERNION_TOLERANCE
-from magfusion.model.rotation import of_quaternions, quaternions_of
 from magfusion.model.trajectory import Trajectory
 
 _COLUMNS = "time_s x y z qx qy qz qw"
@@ -19,7 +19,7 @@ _NS_PER_S = 1_000_000_000
 def write_tum(trajectory: Trajectory, path: Path, epoch_ns: int) -> None:
     """Write the poses as a TUM file, which evo reads; times are on the log's clock."""
     stamps = Span(epoch_ns).stamps(trajectory.time).tolist()
-    quaternion = quaternions_of(trajectory.world_from_body)
+    quaternion = Rotation.from_matrix(trajectory.world_from_body).as_quat()
     poses = np.hstack([trajectory.position_world, quaternion]).tolist()
     with whole_file(path) as unfinished, unfinished.open("w", encoding="utf-8") as stream:
         stream.write(f"# {_COLUMNS}\n")
@@ -47,7 +47,7 @@ def read_tum(path: Path, epoch_ns: int = 0) -> Trajectory:
     length = np.linalg.norm(values[:, 3:], axis=1)
     for k in np.flatnonzero(np.abs(length - 1.0) > QUATERNION_TOLERANCE)[:1]:
         _refuse(path, lines[k][0], f"a quaternion of length {length[k]:.6g}", "one of length 1")
-    rotation = of_quaternions(values[:, 3:])
+    rotation = Rotation.from_quat(values[:, 3:]).as_matrix()
     return Trajectory(time, rotation, values[:, :3])
 
 

@@ -21,7 +21,6 @@ from magfusion.files.atomic import abandoned_pattern
 from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
 from magfusion.files.row_file import Mark, RowFile, claim_rows
 from magfusion.jobs.checkpoint import begin, save
-from magfusion.model.altered import altered
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import ImuModel, Site
 from magfusion.model.trajectory import Trajectory
@@ -215,7 +214,7 @@ def navigate(navigator: Navigator, world: World, made: Stretch) -> tuple[ErrorSe
             navigator.add_fields(made.fields.rows(slice(k, k + 1)))
         navigator.add_imu(made.imu.time[rows], made.imu.gyro_body[rows], made.imu.accel_body[rows])
         # What the estimator itself claims: a claim widened by its witnesses would hide a drift.
-        new = [altered(s, cov=s.judgement.estimators(s.cov)) for s in navigator.take()]
+        new = [replace(s, cov=s.judgement.estimators(s.cov)) for s in navigator.take()]
         spent = time.process_time() - began
         navigator.take_lagged()
         level = list(navigator.distortion.values())

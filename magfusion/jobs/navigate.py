@@ -326,11 +326,4 @@ COMMAND = Command(
     NavigateSettings,
     run,
     example="magfusion navigate log --estimator ekf -o navigated",
-    imports=(
-        "jobs.without_beacons",
-        "jobs.navigate_results",
-        "jobs.replay",
-        "jobs.state_rows",
-        "results.screen",
-    ),
 )

@@ -153,8 +153,6 @@ class Command(NamedTuple):
         Called with settings and output when the result has been shown.
     example : str
         With which the help ends.
-    imports : tuple of str
-        Modules of magfusion that it will import, which the program then does at once.
     """
 
     settings: type[Settings]
@@ -167,7 +165,6 @@ class Command(NamedTuple):
     fails: bool = True
     after: Callable[[Any, Path], None] | None = None
     example: str = ""
-    imports: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -375,5 +375,4 @@ COMMAND = Command(
     SmoothSettings,
     run,
     example="magfusion smooth log --site site.yaml -o run",
-    imports=("jobs.without_beacons", "jobs.smooth_result", "results.screen"),
 )

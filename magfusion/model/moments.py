@@ -1,16 +1,11 @@
-"""A site whose beacons have larger or smaller moments.
-
-An estimator moves them at every step.  What does not hang on moments is not worked out again.
-"""
+"""A site whose beacons have larger or smaller moments, as an estimator makes it at every step."""
 
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from dataclasses import replace
 
 from magfusion.model.coil_field import keep_sources
-from magfusion.model.site import Beacon, Coil, Site
+from magfusion.model.site import Beacon, Site
 from magfusion.units import Array
-
-Part = TypeVar("Part", Beacon, Coil, Site)
 
 
 def with_moments(site: Site, moments_beacon: Mapping[str, Array]) -> Site:
@@ -25,21 +20,13 @@ def with_moments(site: Site, moments_beacon: Mapping[str, Array]) -> Site:
         _changed(beacon, moments_beacon[beacon.name]) if beacon.name in moments_beacon else beacon
         for beacon in site.beacons
     )
-    other = _keeping_known(site, beacons=beacons)
+    other = replace(site, beacons=beacons)
     keep_sources(site, other)
     return other
 
 
 def _changed(beacon: Beacon, moments_beacon: Array) -> Beacon:
     pairs = zip(beacon.coils, moments_beacon, strict=True)
-    coils = tuple(_keeping_known(coil, moment_beacon=moment) for coil, moment in pairs)
-    other = _keeping_known(beacon, coils=coils, moments_beacon=moments_beacon)
-    vars(other).pop("tone_moments", None)
-    return other
-
-
-def _keeping_known(part: Part, **changes: Any) -> Part:
-    """Return a part of the site with other values, and with all that it has worked out."""
-    other = object.__new__(type(part))  # a third of what `copy.copy` takes
-    vars(other).update(vars(part), **changes)
-    return other
+    return replace(
+        beacon, coils=tuple(replace(coil, moment_beacon=moment) for coil, moment in pairs)
+    )

@@ -6,9 +6,9 @@ opened: the roll may be any, and with it the place of the body on its circle abo
 """
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.model.platform_motion import NO_IMU
-from magfusion.model.rotation import rotations_of
 from magfusion.model.site import Magnetometer, Site
 from magfusion.units import Array
 
@@ -40,7 +40,7 @@ def least_turn(from_vector: Array, to_vector: Array) -> Array:
     other = np.cross(start, smallest)  # any axis across, for the opposite direction
     other = other / np.linalg.norm(other, axis=-1, keepdims=True)
     about = np.where(sine > 1e-12, across / np.maximum(sine, 1e-300), other)
-    return rotations_of(about * angle)
+    return Rotation.from_rotvec(about * angle).as_matrix()
 
 
 def roll_is_open(site: Site) -> bool:

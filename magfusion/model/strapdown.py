@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 CHUNK = 65_536  # samples at a time: what is computed of them stays in the cache
-FEW = 256  # rotations
 LONG = 1 << 18  # samples whose turns are multiplied at once
 
 
@@ -48,17 +47,12 @@ def _increments(time: Array, gyro_body: Array) -> Array:
 def _prefix_products(quaternion: Array) -> Array:
     """Products of the first 1, 2, ... rotations: those of neighbouring pairs, then the odd ones.
 
-    Of few rotations it is the number of operations that costs: of 1, 2, 4, ... before each at once.
     Of and to shape (4, n), scalar first.
     """
     n = quaternion.shape[1]
-    if n <= FEW:
-        out, reach = quaternion.copy(), 1
-        while reach < n:
-            out[:, reach:] = product(out[:, :-reach], out[:, reach:])
-            reach *= 2
-        return out
     out = quaternion.copy()
+    if n == 1:
+        return out
     out[:, 1::2] = _prefix_products(product(quaternion[:, : n - 1 : 2], quaternion[:, 1::2]))
     if n > 2:
         out[:, 2::2] = product(out[:, 1 : n - 1 : 2], quaternion[:, 2::2])
@@ -278,8 +272,6 @@ def resting(
         Where rate and specific force scatter less about their means over the stretch than they may.
     """
     span = motion.rest_span if span is None else span
-    if at is not None and len(at) == 1:  # as online, where it is the calls that take the time
-        return np.array([_rests(time, gyro_body, accel_body, float(time[at[0]]), span, motion)])
     centre = np.concatenate([gyro_body.mean(axis=0), accel_body.mean(axis=0)])
     asked = time if at is None else time[at]
     quiet = np.empty(len(asked), dtype=bool)
@@ -297,23 +289,6 @@ def resting(
         quiet[own] = (gyro < motion.rest_gyro**2) & (accel < motion.rest_accel**2)
     inside = (asked - span / 2 >= time[0]) & (asked + span / 2 <= time[-1])
     return quiet & inside
-
-
-def _rests(
-    time: Array,
-    gyro_body: Array,
-    accel_body: Array,
-    asked: float,
-    span: float,
-    motion: MotionModel,
-) -> bool:
-    """Return `resting` of one time (s)."""
-    begin, end = asked - span / 2, asked + span / 2
-    if begin < time[0] or end > time[-1]:
-        return False
-    rows = slice(time.searchsorted(begin), time.searchsorted(end, side="right"))
-    gyro, accel = (stream[rows].var(axis=0).sum() for stream in (gyro_body, accel_body))
-    return bool(gyro < motion.rest_gyro**2 and accel < motion.rest_accel**2)
 
 
 def _variance(centred: Array, lo: IntArray, hi: IntArray) -> Array:

@@ -1,16 +1,12 @@
 """A trajectory: poses over time."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
-from magfusion.model.rotation import slerp
 from magfusion.model.short_repr import one_line
 from magfusion.units import Array, BoolArray
-
-if TYPE_CHECKING:
-    from scipy.spatial.transform import Rotation
 
 # Of one pose, by the name of each part.
 _SHAPES: tuple[tuple[str, tuple[int, ...]], ...] = (
@@ -22,7 +18,6 @@ _SHAPES: tuple[tuple[str, tuple[int, ...]], ...] = (
     ("accel_bias_body", (3,)),
     ("pose_cov", (6, 6)),
 )
-FEW = 1024  # times at which columns are interpolated at once
 
 
 class PoseAccess:
@@ -37,10 +32,8 @@ class PoseAccess:
         return self.position_world
 
     @property
-    def rotation(self) -> "Rotation":
+    def rotation(self) -> Rotation:
         """Attitude, which takes vectors from body to world axes, as SciPy's `Rotation`."""
-        from scipy.spatial.transform import Rotation  # a twentieth of every start
-
         return Rotation.from_matrix(self.world_from_body)
 
     @property
@@ -149,15 +142,7 @@ def interpolated(wanted: Array, time: Array, values: Array) -> Array:
 
     Before the first time and after the last one the values there.
     """
-    if len(wanted) > FEW or len(time) == 1:
-        return np.stack([np.interp(wanted, time, column) for column in values.T], axis=1)
-    before = np.minimum(time.searchsorted(wanted, side="right") - 1, len(time) - 2)
-    before = np.maximum(before, 0)
-    after, begin = before + 1, time[before]
-    share = (wanted - begin) / (time[after] - begin)
-    share = np.minimum(np.maximum(share, 0.0), 1.0)[:, None]
-    first = values[before]
-    return np.asarray(first + share * (values[after] - first))
+    return np.stack([np.interp(wanted, time, column) for column in values.T], axis=1)
 
 
 def _slerp(known: Array, world_from_body: Array, wanted: Array) -> Array:
@@ -165,4 +150,4 @@ def _slerp(known: Array, world_from_body: Array, wanted: Array) -> Array:
         return np.empty((0, 3, 3))
     if len(known) == 1:
         return world_from_body.copy()
-    return slerp(known, world_from_body, wanted)
+    return Slerp(known, Rotation.from_matrix(world_from_body))(wanted).as_matrix()

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.model.arguments import check_arguments
-from magfusion.model.rotation import angles_of, mean_rotation
 from magfusion.model.short_repr import one_line, short_repr
 from magfusion.model.trajectory import Trajectory, interpolate
 from magfusion.units import Array, BoolArray, IntArray
@@ -236,7 +236,7 @@ def relative_errors(
     return RelativeErrors(
         pairs=pairs,
         translation=np.linalg.norm(shift - true_shift, axis=1),
-        rotation=angles_of(np.swapaxes(true_step, 1, 2) @ step),
+        rotation=Rotation.from_matrix(np.swapaxes(true_step, 1, 2) @ step).magnitude(),
     )
 
 
@@ -261,8 +261,8 @@ def _align(position: Array, target: Array) -> Array:
 
 
 def _aligned_attitude(estimated: Array, true: Array) -> Array:
-    offset = estimated @ np.swapaxes(true, 1, 2)
-    return angles_of(mean_rotation(offset).T @ offset)
+    offset = Rotation.from_matrix(estimated @ np.swapaxes(true, 1, 2))
+    return np.asarray((offset.mean().inv() * offset).magnitude())
 
 
 def _nees(error: Array, cov: Array) -> Array:

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.files.atomic import real
-from magfusion.model.rotation import quaternions_of
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import StateTrust, Trust
@@ -171,7 +171,7 @@ def log_beacons(recording: rr.RecordingStream, site: Site, scale: Scale) -> None
     for index, beacon in enumerate(site.beacons):
         colour = beacon_colour(index)
         place = _beacon_place(beacon.name)
-        turn = rr.Quaternion(xyzw=quaternions_of(beacon.world_from_beacon))
+        turn = rr.Quaternion(xyzw=Rotation.from_matrix(beacon.world_from_beacon).as_quat())
         pose = rr.Transform3D(translation=beacon.position_world, rotation=turn)
         recording.log(place, pose, rr.TransformAxes3D(0.05 * scale.size), static=True)
         centre = rr.Points3D(
@@ -223,7 +223,7 @@ def _log_beads(recording: rr.RecordingStream, truth: Trajectory, scale: Scale) -
 
 def _log_body(recording: rr.RecordingStream, trajectory: Trajectory, scale: Scale) -> None:
     rows = rows_of(len(trajectory), MOST_POSES)
-    turn = quaternions_of(trajectory.world_from_body[rows])
+    turn = Rotation.from_matrix(trajectory.world_from_body[rows]).as_quat()
     recording.send_columns(
         "world/estimate/body",
         [rr.TimeColumn(TIMELINE, duration=trajectory.time[rows])],
@@ -244,7 +244,7 @@ def _log_sigmas(recording: rr.RecordingStream, trajectory: Trajectory, scale: Sc
     drawn = rr.Ellipsoids3D(
         half_sizes=3.0 * scale.sigma * half_sizes,
         centers=trajectory.position_world[rows],
-        quaternions=quaternions_of(axes),
+        quaternions=Rotation.from_matrix(axes).as_quat(),
         colors=(*_ESTIMATE, 110),
         line_radii=rr.Radius.ui_points(0.5),
     )

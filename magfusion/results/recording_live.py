@@ -3,10 +3,10 @@
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.estimation.graph.state import POSITION, State
-from magfusion.model.rotation import quaternions_of
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.results.recording import log_beacons
@@ -51,7 +51,7 @@ class LiveView:
         """Draw a state, and how well each beacon's field is explained."""
         recording = self.recording
         recording.set_time(TIMELINE, duration=state.time)
-        turn = quaternions_of(state.world_from_body)
+        turn = Rotation.from_matrix(state.world_from_body).as_quat()
         place = state.position_world
         pose = rr.Transform3D(translation=place, quaternion=rr.Quaternion(xyzw=turn))
         recording.log("world/estimate/body", pose)
@@ -62,7 +62,7 @@ class LiveView:
         sigma = rr.Ellipsoids3D(
             half_sizes=3.0 * half_sizes,
             centers=[place],
-            quaternions=quaternions_of(axes),
+            quaternions=Rotation.from_matrix(axes).as_quat(),
             colors=(*_PATH, 110),
         )
         recording.log("world/estimate/three_sigma", sigma)

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from magfusion.estimation.batch.log_graph import PreparedLog, graph_of
 from magfusion.estimation.data_checks.detection import drowned, only, without_silence
@@ -19,7 +20,6 @@ from magfusion.estimation.graph.graph import initial_estimate, read_states
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.solve.bordered import optimise
 from magfusion.model.parameters import Calibration
-from magfusion.model.rotation import slerp
 from magfusion.model.samples import FieldSamples, ImuSamples
 from magfusion.model.trajectory import Trajectory
 from magfusion.receiver.admission import INERTIAL_GAP, Windows, longest_step, silences, usual_step
@@ -191,7 +191,8 @@ def _with_paths(states: Trajectory, motions: list[FieldMotion], time: Array) -> 
     for path in (motion.path for motion in motions):
         assert path.velocity_world is not None
         rows = np.flatnonzero((time >= path.time[0]) & (time <= path.time[-1]))
-        turn[rows] = slerp(path.time, path.world_from_body, time[rows])
+        attitude = Slerp(path.time, Rotation.from_matrix(path.world_from_body))
+        turn[rows] = attitude(time[rows]).as_matrix()
         for out, known in ((place, path.position_world), (speed, path.velocity_world)):
             out[rows] = np.stack([np.interp(time[rows], path.time, k) for k in known.T], axis=1)
     assert states.velocity_world is not None

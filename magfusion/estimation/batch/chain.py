@@ -3,12 +3,12 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.channel_effects import of_all_sensors
 from magfusion.model.parameters import Calibration
 from magfusion.model.quaternion import inverse, matrices, product
-from magfusion.model.rotation import angles_of
 from magfusion.model.samples import ImuSamples
 from magfusion.model.short_repr import short_repr
 from magfusion.model.site import Site
@@ -125,7 +125,8 @@ def _link_cost(fixes: Fixes, turn: Array, site: Site) -> Array:
     step = matrices(product(inverse(turn[:, :-1]), turn[:, 1:]))
     expected = fixes.world_from_body[:-1] @ step[:, None]
     between = np.swapaxes(expected[:, :, None], -1, -2) @ fixes.world_from_body[1:, None]
-    angle = angles_of(between)
+    angle = Rotation.from_matrix(between.reshape(-1, 3, 3)).magnitude()
+    angle = angle.reshape(between.shape[:-2])
     jump = fixes.position_world[1:, None] - fixes.position_world[:-1, :, None]
     spread = (site.platform.motion.speed_sigma * dt) ** 2 + POSITION_SIGMA**2
     turned = (site.platform.imu.gyro_bias_sigma * dt) ** 2 + ROTATION_SIGMA**2

@@ -15,7 +15,6 @@ from magfusion.estimation.graph.inertial import (
 from magfusion.estimation.graph.preintegration import cut_at_epochs
 from magfusion.estimation.graph.process_noise import ProcessNoise
 from magfusion.estimation.graph.state import MOTION, State, values_from
-from magfusion.model.altered import altered
 from magfusion.model.parameters import Block, Calibration, corrected_imu
 from magfusion.model.samples import ImuSamples
 from magfusion.model.site import Site
@@ -115,17 +114,16 @@ def propagate(
         noise[MOTION:, MOTION:] = process_noise.cov(state.calibration, time, time - state.time)
     cov = _moved_cov(state.cov, transition[:MOTION]) + noise
     pose = after.pose()
-    later = altered(
+    later = replace(
         state,
         time=time,
-        pose=pose,
         world_from_body=pose.rotation().matrix(),
         position_world=np.asarray(pose.translation()),
         velocity_world=np.asarray(after.velocity()),
         cov=cov,
     )
     bridged = bool(own.increments.bridged[0])
-    return Propagated(later, altered(link, steps=own), bridged, transition, noise)
+    return Propagated(later, replace(link, steps=own), bridged, transition, noise)
 
 
 def _linearized(link: Link, values: gtsam.Values, size: int) -> tuple[Array, Array]:

@@ -5,14 +5,13 @@ Tangent: rotation and position (body axes, right perturbation of the pose, GTSAM
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
-from magfusion.model.altered import altered
 from magfusion.model.parameters import Block, Calibration, difference, retract
 from magfusion.model.short_repr import short_repr
 from magfusion.model.trajectory import PoseAccess, Trajectory
@@ -112,9 +111,8 @@ def moved(state: State, blocks: tuple[Block, ...], step: Array) -> State:
 def moved_to(state: State, calibration: Calibration, step: Array) -> State:
     """Return the state with its motion moved by a tangent vector (15,), and another calibration."""
     pose = state.pose.retract(step[:6])
-    return altered(
+    return replace(
         state,
-        pose=pose,
         world_from_body=pose.rotation().matrix(),
         position_world=np.asarray(pose.translation()),
         velocity_world=state.velocity_world + step[VELOCITY],

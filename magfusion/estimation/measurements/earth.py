@@ -12,6 +12,7 @@ the online estimators the same weight at the prediction.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.estimation.graph.measurement import (
@@ -29,7 +30,6 @@ from magfusion.model.field import observe_earth
 from magfusion.model.noise import whitening
 from magfusion.model.parameters import Block, Calibration, SteadyView
 from magfusion.model.physics.earth import AMBIENT_SHARE
-from magfusion.model.rotation import rotations_of
 from magfusion.model.samples import SteadyFields
 from magfusion.model.site import MotionModel, Site
 from magfusion.model.trajectory import Trajectory
@@ -90,7 +90,7 @@ class EarthField(Measurement):
         site = calibration.site
         assert site.earth_field_world is not None
         lag = calibration.imu_offset(self.time) - self.applied_offset
-        turn = rotations_of(-lag[:, None] * self.rate_body)
+        turn = Rotation.from_rotvec(-lag[:, None] * self.rate_body).as_matrix()
         seen = observe_earth(
             site.platform.magnetometer, states.world_from_body @ turn, site.earth_field_world
         )

@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.graph.measurement import Measurement, Rows
 from magfusion.estimation.graph.state import States
 from magfusion.model.one_axis import axis_of, coil_lever, least_turn
 from magfusion.model.parameters import Block, Calibration
 from magfusion.model.quaternion import matrices, of_matrices
-from magfusion.model.rotation import vectors_of
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
@@ -35,7 +35,7 @@ class HeldRoll(Measurement):
     ) -> Rows:
         """Return the rows at an estimate, one group of one."""
         turn = np.swapaxes(self.world_from_body, 1, 2) @ states.world_from_body
-        about = np.sum(vectors_of(turn) * self.axis_body, axis=1)
+        about = np.sum(Rotation.from_matrix(turn).as_rotvec() * self.axis_body, axis=1)
         by_pose = np.zeros((len(turn), 1, 1, 6))
         # At a turn of which the rest is small.
         by_pose[..., :3] = self.axis_body[:, None, None] / SIGMA

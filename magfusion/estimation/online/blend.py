@@ -3,9 +3,9 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.graph.state import POSITION, ROTATION, VELOCITY, State
-from magfusion.model.rotation import rotations_of, vectors_of
 from magfusion.units import Array
 
 
@@ -43,7 +43,7 @@ class Blend:
         turn = told.world_from_body @ corrected.world_from_body.T
         step = np.concatenate(
             [
-                vectors_of(turn),
+                Rotation.from_matrix(turn).as_rotvec(),
                 told.position_world - corrected.position_world,
                 told.velocity_world - corrected.velocity_world,
             ]
@@ -65,7 +65,7 @@ class Blend:
         step = self.remaining(state.time)
         if not np.any(step):
             return state, step
-        world_from_body = rotations_of(step[:3]) @ state.world_from_body
+        world_from_body = Rotation.from_rotvec(step[:3]).as_matrix() @ state.world_from_body
         body = step.copy()
         body[ROTATION], body[POSITION] = world_from_body.T @ step[:3], world_from_body.T @ step[3:6]
         cov = state.cov.copy()

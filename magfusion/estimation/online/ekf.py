@@ -1,6 +1,7 @@
 """The light estimator: an error-state Kalman filter, with filterpy as its arithmetic."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,7 +11,6 @@ from magfusion.estimation.graph.measurement import Measurement, measured_rows
 from magfusion.estimation.graph.propagation import Propagated
 from magfusion.estimation.graph.state import State, between, moved
 from magfusion.estimation.measurements.phasors import leaves_out
-from magfusion.model.altered import altered
 from magfusion.model.parameters import Block
 from magfusion.units import Array
 
@@ -90,13 +90,13 @@ class ErrorStateFilter(PartialUpdateFilter):
         except EstimationError:
             self.replace_state(self.state)
             raise
-        self.replace_state(altered(state, cov=0.5 * (self.P + self.P.T)))
+        self.replace_state(replace(state, cov=0.5 * (self.P + self.P.T)))
 
     def _update_nominal(
         self, prior: State, measurements: Sequence[Measurement], point: State | None
     ) -> State:
         """Return the state moved by the update, its covariance aside."""
-        state, cov = prior if point is None else altered(point, cov=prior.cov), self.P
+        state, cov = prior if point is None else replace(point, cov=prior.cov), self.P
         for _ in range((1 if point is None else FAR_ITERATIONS) if measurements else 0):
             self.x, self.P = np.zeros(len(cov)), cov
             error, jacobian = telling_rows(measurements, state, self.blocks)

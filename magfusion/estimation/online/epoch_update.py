@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import EstimationError
 from magfusion.estimation.graph.measurement import Measurement
@@ -39,7 +40,6 @@ from magfusion.estimation.online_integrity.recovery import (
 )
 from magfusion.estimation.online_integrity.score_online import OnlineScore
 from magfusion.model.parameters import Block
-from magfusion.model.rotation import vectors_of
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding
@@ -403,7 +403,7 @@ def _apart(state: State, fix: AgreedFix) -> tuple[float, float]:
     fixes, body_from_world = fix.fixes, state.world_from_body.T
     best = (np.inf, np.inf)
     for k in np.flatnonzero(fixes.cost[0] < fixes.cost[0, 0] + AS_LIKELY):
-        turn = vectors_of(body_from_world @ fixes.world_from_body[0, k])
+        turn = Rotation.from_matrix(body_from_world @ fixes.world_from_body[0, k]).as_rotvec()
         shift = body_from_world @ (fixes.position_world[0, k] - state.position_world)
         offset = np.concatenate([turn, shift])
         cov = fix.excess * fixes.pose_cov[0, k] + state.cov[:6, :6]

@@ -29,14 +29,14 @@ def left_over(graph: Graph, estimate: Estimate, beside: Columns, native: NativeR
         the residual.
     """
     count, carried = 1 + beside.number, None
-    states, whole = states_in(estimate.values), Normal(0, _size(graph), beside.number)
+    states, whole = states_in(estimate.values), Normal.zeros(0, _size(graph), beside.number)
     add_prior(whole, graph, estimate)
     size = len(whole.corner)
     gram = np.zeros((count + size, count + size))  # of right sides, then of the border
     gram[:count, count:], gram[count:, count:] = whole.right_border.T, whole.corner
     for begin in range(0, graph.epochs, STRETCH):
         end = min(begin + STRETCH, graph.epochs)
-        normal = Normal(min(end + 1, graph.epochs) - begin, size, beside.number)
+        normal = Normal.zeros(min(end + 1, graph.epochs) - begin, size, beside.number)
         if carried is not None:
             normal.diagonal[0], normal.sides[0] = carried
         for epoch, own, after, border, right in native.of(beside, begin, end):

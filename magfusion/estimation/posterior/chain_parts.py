@@ -110,7 +110,7 @@ def parts_of(rest: Normal, rows: FieldRows, pieces: Iterable[Piece], kept: BoolA
     patterns = np.unique(kept[:, np.any(kept, axis=0)], axis=1).T
     groups = [np.all(pattern == kept.T, axis=1) for pattern in patterns]
     columns = [_felt(rows, channels) for channels in groups]
-    sums = [Normal(states, size, len(own) - 1) for own in columns]
+    sums = [Normal.zeros(states, size, len(own) - 1) for own in columns]
     for piece in pieces:
         for normal, channels, own in zip(sums, groups, columns, strict=True):
             piece._replace(right=piece.right[..., own]).added_to(normal, channels)

@@ -24,18 +24,39 @@ AT_ONCE = 2e8  # bytes; variants are solved in groups of so much
 SIDES = 6e7  # bytes of right sides at once; what is considered is taken in groups
 
 
+@dataclass(eq=False)
 class Normal:
     """Normal equations of a chain that grow by rows.
 
     The right sides are the step, then what one sigma of each considered parameter does.
+
+    Parameters
+    ----------
+    diagonal : ndarray, shape (states, 15, 15)
+    following : ndarray, shape (states - 1, 15, 15)
+        Of each state with the next.
+    sides : ndarray, shape (states, 15, 1 + considered + calibration)
+        Right sides, then the border.
+    corner : ndarray, shape (calibration, calibration)
+    right_border : ndarray, shape (calibration, 1 + considered)
     """
 
-    def __init__(self, states: int, calibration: int, considered: int) -> None:
-        self.diagonal = np.zeros((states, MOTION, MOTION))
-        self.following = np.zeros((max(states - 1, 0), MOTION, MOTION))
-        self.sides = np.zeros((states, MOTION, 1 + considered + calibration))
-        self.corner = np.zeros((calibration, calibration))
-        self.right_border = np.zeros((calibration, 1 + considered))
+    diagonal: Array
+    following: Array
+    sides: Array
+    corner: Array
+    right_border: Array
+
+    @classmethod
+    def zeros(cls, states: int, calibration: int, considered: int) -> "Normal":
+        """Return equations without any rows."""
+        return cls(
+            np.zeros((states, MOTION, MOTION)),
+            np.zeros((max(states - 1, 0), MOTION, MOTION)),
+            np.zeros((states, MOTION, 1 + considered + calibration)),
+            np.zeros((calibration, calibration)),
+            np.zeros((calibration, 1 + considered)),
+        )
 
     @property
     def right(self) -> Array:
@@ -70,12 +91,10 @@ class Normal:
             "corner": np.zeros((count, calibration, calibration)),
             "right_border": np.zeros((count, calibration, right)),
         }
-        own = []
-        for k in range(count):
-            one = object.__new__(Normal)
-            vars(one).update({name: value[k] for name, value in made.items()})
-            one.following = following
-            own.append(one)
+        own = [
+            Normal(following=following, **{name: value[k] for name, value in made.items()})
+            for k in range(count)
+        ]
         return Chain.of_sides(following=following[None], **made), own
 
     def add(
@@ -235,7 +254,7 @@ def system_beside(
         Of what else other logs say of the calibration.
     """
     size = dimension(graph.blocks)
-    normal = Normal(graph.epochs, size, beside.number)
+    normal = Normal.zeros(graph.epochs, size, beside.number)
     add_prior(normal, graph, estimate)
     if size and graph.shift is not None:
         assert graph.declared is not None

@@ -2,12 +2,12 @@
 
 import numpy as np
 from gtsam.symbol_shorthand import X
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import EstimationError
 from magfusion.estimation.graph.graph import Estimate, Graph
 from magfusion.estimation.solve.bordered import eliminate
 from magfusion.model.parameters import Calibration
-from magfusion.model.rotation import vectors_of
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
@@ -46,7 +46,7 @@ def last_move(
 def pose_steps(before: Trajectory, after: Trajectory) -> Array:
     """Return what takes poses to others, shape (n, 6): rotation, then translation, body axes."""
     back = np.swapaxes(before.world_from_body, 1, 2)
-    turn = vectors_of(back @ after.world_from_body)
+    turn = Rotation.from_matrix(back @ after.world_from_body).as_rotvec()
     moved = back @ (after.position_world - before.position_world)[..., None]
     return np.concatenate([turn, moved[..., 0]], axis=1)
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.posterior.convergence import (
     OFFSET_CONVERGED,
@@ -10,7 +11,6 @@ from magfusion.estimation.posterior.convergence import (
     pose_steps,
 )
 from magfusion.model.parameters import Block, Calibration, difference, retract
-from magfusion.model.rotation import rotations_of
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
@@ -68,7 +68,7 @@ def part_of_the_way(
     if share == 1.0:
         return after, new
     step = share * pose_steps(before, after)
-    turn = rotations_of(step[:, :3])
+    turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
     moved = before.world_from_body @ step[:, 3:, None]
 
     def mixed(a: Array | None, b: Array | None) -> Array | None:

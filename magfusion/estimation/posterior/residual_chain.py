@@ -112,7 +112,7 @@ def _beside(graph: Graph, considered: tuple[Block, ...]) -> Columns:
 def _with_priors(graph: Graph, estimate: Estimate, considered: int, errors: int) -> Normal:
     """Return the equations with the priors of the calibration and of what is considered."""
     size = dimension(graph.blocks)
-    normal, prior = Normal(graph.epochs, size + considered, errors), Normal(0, size, 0)
+    normal, prior = Normal.zeros(graph.epochs, size + considered, errors), Normal.zeros(0, size, 0)
     add_prior(prior, graph, estimate)
     normal.corner[:size, :size] = prior.corner
     normal.right_border[:size, :1] = prior.right_border

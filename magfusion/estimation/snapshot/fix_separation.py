@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from magfusion.estimation.posterior.separation import (
@@ -19,7 +20,6 @@ from magfusion.estimation.snapshot.problem import GAIN_SIGMA, State, epochs_of
 from magfusion.estimation.snapshot.refine import joined, rows_at
 from magfusion.model.audibility import are_many
 from magfusion.model.parameters import Calibration, channels_of
-from magfusion.model.rotation import angles_of
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trust import Finding, Risk, StateTrust, Trust, Verdict
 from magfusion.units import DEGREE, Array, BoolArray, IntArray
@@ -276,10 +276,10 @@ def _levels(found: Separation, fixes: Fixes, risk: Risk, prior: Array) -> _Level
     weight = fixes.probability[:, 1:]
     way = np.linalg.norm(fixes.position_world[:, 1:] - fixes.position_world[:, :1], axis=2)
     turn = np.swapaxes(fixes.world_from_body[:, :1], 2, 3) @ fixes.world_from_body[:, 1:]
-    angle = angles_of(turn) / DEGREE
+    angle = Rotation.from_matrix(turn.reshape(-1, 3, 3)).magnitude() / DEGREE
     share = risk.mirrors * risk.total
     position = with_rivals(position, way, weight, share)
-    degrees = with_rivals(degrees, angle, weight, share)
+    degrees = with_rivals(degrees, angle.reshape(way.shape), weight, share)
     open_pose = ~fixes.determined[:, 0]
     position[open_pose] = degrees[open_pose] = np.nan
     return _Levels(position, np.minimum(degrees, 180.0), open_pose)

@@ -7,6 +7,7 @@ all epochs and hypotheses at once.
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.snapshot.candidates import attitudes, positions
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
@@ -20,7 +21,6 @@ from magfusion.model.audibility import are_many
 from magfusion.model.channel_effects import of_all_sensors
 from magfusion.model.coil_field import is_sized
 from magfusion.model.parameters import Calibration, seen_by, without_response
-from magfusion.model.rotation import angles_of
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
@@ -275,6 +275,6 @@ def _repeated(rotation: Array, position: Array) -> BoolArray:
         for i in range(j):
             near = np.linalg.norm(position[:, i] - position[:, j], axis=1) < SAME_POSITION
             turn = np.swapaxes(rotation[:, i], 1, 2) @ rotation[:, j]
-            angle = angles_of(turn)
+            angle = Rotation.from_matrix(turn).magnitude()
             repeated[:, j] |= near & (angle < SAME_ROTATION)
     return repeated

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.estimation.snapshot.apart import by_motion, linearized, predicted
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
@@ -19,7 +20,6 @@ from magfusion.model.parameters import (
     Parameter,
     dimension,
 )
-from magfusion.model.rotation import rotations_of, vectors_of
 from magfusion.model.samples import FieldSamples
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
@@ -177,7 +177,7 @@ def _known(problem: Problem, state: State) -> Iterator[Columns]:
 def _pose_difference(rotation0: Array, position0: Array, rotation: Array, position: Array) -> Array:
     """Perturbation from the first pose to the second, small-angle in its translation."""
     inverse = np.swapaxes(rotation0, -1, -2)
-    turn = vectors_of(inverse @ rotation)
+    turn = Rotation.from_matrix(inverse @ rotation).as_rotvec()
     shift = (inverse @ (position - position0)[..., None])[..., 0]
     return np.concatenate([turn, shift], axis=-1)
 
@@ -274,7 +274,7 @@ def _moved(state: State, step: Array, by_phase: Array, by_gain: Array) -> State:
     angle = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
     step = step * np.minimum(1.0, 1.0 / np.maximum(angle, 1e-12))
     return State(
-        rotation=state.rotation @ rotations_of(step[:, :3]),
+        rotation=state.rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix(),
         position=state.position + (state.rotation @ step[:, 3:6, None])[..., 0],
         phase=state.phase + step[:, 6:] @ by_phase,
         log_gain=state.log_gain + step[:, 6:] @ by_gain,

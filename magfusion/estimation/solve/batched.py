@@ -8,8 +8,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from magfusion.model.rotation import rotations_of
 from magfusion.units import Array, BoolArray, IntArray
 
 PASSES = 100  # a bound; the few that creep along a valley need more than 25
@@ -140,7 +140,7 @@ def _scale(size: Array) -> Array:
 def moved_poses(pose: Array, step: Array) -> Array:
     """Return poses (k, 12), rotation then position, moved by steps (k, 6) in their own axes."""
     rotation = pose[:, :9].reshape(-1, 3, 3)
-    turned = rotation @ rotations_of(step[:, :3])
+    turned = rotation @ Rotation.from_rotvec(step[:, :3]).as_matrix()
     position = pose[:, 9:] + (rotation @ step[:, 3:, None])[..., 0]
     return np.concatenate([turned.reshape(-1, 9), position], axis=1)
 

@@ -7,7 +7,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from magfusion.model.altered import altered
 from magfusion.model.moments import with_moments
 from magfusion.model.parameters.parameter import (
     AXES,
@@ -90,7 +89,7 @@ class _LogMoment(BeaconParameter, SiteParameter):
             for beacon in site.beacons
             if beacon.name in steps
         }
-        return altered(calibration, site=with_moments(site, moments))
+        return replace(calibration, site=with_moments(site, moments))
 
     def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
         (step,) = self.all_differences(old, new, [owner])
@@ -139,7 +138,7 @@ class _OfDrive(BeaconParameter):
         for owner, step in steps.items():
             mine = _named(names, owner)
             value[mine] += step if len(step) == 1 else np.resize(step, np.count_nonzero(mine))
-        return altered(calibration, **{self.attribute: value})
+        return replace(calibration, **{self.attribute: value})
 
     def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
         (step,) = self.all_differences(old, new, [owner])

@@ -6,6 +6,7 @@ from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.model.channel_effects import (
     driven,
@@ -15,7 +16,6 @@ from magfusion.model.channel_effects import (
 )
 from magfusion.model.field import EarthObservation
 from magfusion.model.receive_coils import Observation
-from magfusion.model.rotation import rotations_of, vectors_of
 from magfusion.model.samples import ImuSamples
 from magfusion.model.short_repr import short_repr
 from magfusion.model.site import Beacon, Site
@@ -288,7 +288,7 @@ class SiteParameter(Parameter):
         part = self.part(calibration.site, owner)
         value = getattr(part, self.attribute)
         if self.is_rotation:
-            value = value @ rotations_of(step)
+            value = value @ Rotation.from_rotvec(step).as_matrix()
         else:
             value = value + self.si * step.reshape(value.shape)
         part = replace(part, **{self.attribute: value})
@@ -300,7 +300,7 @@ class SiteParameter(Parameter):
         if a is b:
             return np.zeros(1 if np.ndim(a) == 0 else 3 if self.is_rotation else np.size(a))
         if self.is_rotation:
-            return vectors_of(a.T @ b)
+            return Rotation.from_matrix(a.T @ b).as_rotvec()
         return ((b - a) / self.si).ravel()
 
     def value(self, calibration: Calibration, owner: str) -> Array | None:

@@ -5,7 +5,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from magfusion.model.altered import altered
 from magfusion.model.parameters.parameter import (
     AXES,
     CENTIMETRE,
@@ -199,7 +198,7 @@ class _TimeOffset(Parameter):
         return np.array([calibration.time_offset])
 
     def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
-        return altered(calibration, time_offset=calibration.time_offset + float(step[0]))
+        return replace(calibration, time_offset=calibration.time_offset + float(step[0]))
 
     def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
         return np.array([new.time_offset - old.time_offset])
@@ -233,7 +232,7 @@ class _ClockRate(Parameter):
         return np.array([imu.clock_rate_sigma if imu.time_offset_sigma else 0.0])
 
     def moved(self, calibration: Calibration, owner: str, step: Array) -> Calibration:
-        return altered(calibration, clock_rate=calibration.clock_rate + float(step[0]))
+        return replace(calibration, clock_rate=calibration.clock_rate + float(step[0]))
 
     def difference(self, old: Calibration, new: Calibration, owner: str) -> Array:
         return np.array([new.clock_rate - old.clock_rate])
