@@ -1,4 +1,4 @@
-"""What the tree alone cannot give a wheel and an sdist: its commit, and a README whose links hold."""
+"""Give a wheel and an sdist what the tree cannot: the commit, a README with absolute links."""
 
 import re
 import subprocess
