@@ -28,50 +28,83 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from magfusion.errors import EstimationError as EstimationError
     from magfusion.errors import InputError as InputError
-    from magfusion.estimation.batch.batch import SmootherSettings as SmootherSettings
-    from magfusion.estimation.batch.batch import smooth as smooth
+    from magfusion.estimation.batch.settings import SmootherSettings as SmootherSettings
     from magfusion.estimation.integrity.judge import judged as judged
     from magfusion.estimation.online.navigator import Navigator as Navigator
-    from magfusion.estimation.online.navigator import NavigatorSettings as NavigatorSettings
+    from magfusion.estimation.online.navigator_settings import (
+        NavigatorSettings as NavigatorSettings,
+    )
     from magfusion.estimation.snapshot.likelihood import fix_epochs as fix_epochs
     from magfusion.files.open import open_log as open_log
     from magfusion.files.site import load_site as load_site
     from magfusion.files.site import save_site as save_site
+    from magfusion.model.field import observe as observe
+    from magfusion.model.parameters import initial_calibration as initial_calibration
+    from magfusion.model.parameters.parameter import Calibration as Calibration
+    from magfusion.model.physics.dipole import dipole_field as dipole_field
+    from magfusion.model.samples import FieldSamples as FieldSamples
     from magfusion.model.samples import Log as Log
     from magfusion.model.site import Site as Site
     from magfusion.model.trajectory import Trajectory as Trajectory
+    from magfusion.model.trust import Finding as Finding
+    from magfusion.model.trust import Trust as Trust
+    from magfusion.model.trust import Verdict as Verdict
     from magfusion.results.errors import trajectory_errors as trajectory_errors
+    from magfusion.results.smoothed import SmoothedLog as SmoothedLog
+    from magfusion.results.smoothed import smooth as smooth
+    from magfusion.results.trajectory import ResultTrajectory as ResultTrajectory
+    from magfusion.results.trajectory import collect_states as collect_states
+    from magfusion.simulation.log import SimulationConfig as SimulationConfig
     from magfusion.simulation.log import simulate_log as simulate_log
+
+    __version__: str
 
 # What most users need, and where it is; the file is read when the name is first asked for.
 _HOMES = {
+    "Calibration": "model.parameters.parameter",
     "EstimationError": "errors",
+    "FieldSamples": "model.samples",
+    "Finding": "model.trust",
     "InputError": "errors",
     "Log": "model.samples",
     "Navigator": "estimation.online.navigator",
-    "NavigatorSettings": "estimation.online.navigator",
+    "NavigatorSettings": "estimation.online.navigator_settings",
+    "ResultTrajectory": "results.trajectory",
+    "SimulationConfig": "simulation.log",
     "Site": "model.site",
-    "SmootherSettings": "estimation.batch.batch",
+    "SmoothedLog": "results.smoothed",
+    "SmootherSettings": "estimation.batch.settings",
     "Trajectory": "model.trajectory",
+    "Trust": "model.trust",
+    "Verdict": "model.trust",
+    "collect_states": "results.trajectory",
+    "dipole_field": "model.physics.dipole",
     "fix_epochs": "estimation.snapshot.likelihood",
+    "initial_calibration": "model.parameters",
     "judged": "estimation.integrity.judge",
     "load_site": "files.site",
+    "observe": "model.field",
     "open_log": "files.open",
     "save_site": "files.site",
     "simulate_log": "simulation.log",
-    "smooth": "estimation.batch.batch",
+    "smooth": "results.smoothed",
     "trajectory_errors": "results.errors",
 }
 __all__ = list(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        found = version("magfusion")
+    elif name in _HOMES:
+        found = getattr(import_module(f"magfusion.{_HOMES[name]}"), name)
+    else:
         raise AttributeError(f"module 'magfusion' has no attribute {name!r}")
-    found = getattr(import_module(f"magfusion.{_HOMES[name]}"), name)
     globals()[name] = found
     return found
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOMES})
+    return sorted({*globals(), *_HOMES, "__version__"})

@@ -205,7 +205,7 @@ def test_the_package_offers_its_names_and_loads_nothing_before_they_are_asked_fo
     )
     done = _child("-c", "\n".join(lines))
     assert done.stdout.split() == [
-        "magfusion.estimation.batch.batch",
+        "magfusion.results.smoothed",
         "magfusion.estimation.online.navigator",
     ]
 

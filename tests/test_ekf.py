@@ -6,10 +6,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.graph.inertial import inertial_factor
 from magfusion.estimation.graph.measurement import joined, measured_rows
 from magfusion.estimation.graph.process_noise import ProcessNoise, calibration_process_noise
 from magfusion.estimation.graph.propagation import propagate
-from magfusion.estimation.graph.state import MOTION, State, between, moved, states_of
+from magfusion.estimation.graph.state import (
+    MOTION,
+    State,
+    between,
+    moved,
+    states_of,
+    values_of,
+)
 from magfusion.estimation.measurements.earth import earth_measurement
 from magfusion.estimation.measurements.phasors import field_phasors
 from magfusion.estimation.measurements.zero_velocity import ZeroVelocity
@@ -26,6 +34,7 @@ from magfusion.model.parameters import (
     prior_sigma,
 )
 from magfusion.model.samples import ImuSamples, SteadyFields
+from magfusion.model.site import ClockModel
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.log import simulate_fields
@@ -237,3 +246,104 @@ def test_epochs_of_a_kind_are_linearised_in_one_call_with_the_rows_of_each():
             one = measurement.linearize(states_of(states[k : k + 1]), start.calibration, blocks)
             np.testing.assert_allclose(both.error[k], one.error[0], rtol=1e-9, atol=1e-9)
             np.testing.assert_allclose(both.by_pose[k], one.by_pose[0], rtol=1e-9, atol=1e-6)
+
+
+def as_a_graph(start, blocks, predicted, epoch, walked):
+    """Return mean and covariance after an epoch, by least squares over start, walk and end.
+
+    Parameters
+    ----------
+    walked : ndarray, shape (dimension, k)
+        What the calibration gains between the two, by unit steps that are independent.
+    """
+    end, size, extra = predicted.state, len(start.cov), walked.shape[1]
+    factor = inertial_factor(0, predicted.link.measurement)
+    rows, right = factor.linearize(values_of([start, end])).jacobian()
+    own = np.concatenate([np.r_[0:9, 18:24], np.r_[9:18, 24:30]])  # x0 v0 b0, x1 v1 b1
+    error, jacobian = measured_rows(epoch, end, blocks)
+    # Unknowns: motion and calibration at the start, motion at the end, steps of the walk.
+    prior = np.linalg.inv(np.linalg.cholesky(start.cov))
+    inertial = np.zeros((15, size + MOTION + extra))
+    inertial[:, np.r_[0:MOTION, size : size + MOTION]] = rows[:, own]
+    last = np.zeros((size, size + MOTION + extra))
+    last[:MOTION, size : size + MOTION] = np.eye(MOTION)
+    last[MOTION:, MOTION:size] = np.eye(size - MOTION)
+    last[MOTION:, size + MOTION :] = walked
+    whole = np.vstack(
+        [
+            np.pad(prior, ((0, 0), (0, MOTION + extra))),
+            inertial,
+            np.pad(np.eye(extra), ((0, 0), (size + MOTION, 0))),
+            jacobian @ last,
+        ]
+    )
+    known = np.concatenate([np.zeros(size), right, np.zeros(extra), -error])
+    scale = 1.0 / np.linalg.norm(whole, axis=0)
+    q, r = np.linalg.qr(whole * scale)
+    root = last * scale @ np.linalg.inv(r)
+    return root @ (q.T @ known), root @ root.T
+
+
+def test_an_update_is_that_of_a_graph_in_which_the_clocks_walk():
+    """Of crystals that wander as declared, and drives that warm up: variance goes with time."""
+    rng = np.random.default_rng(SEED)
+    phase, drift, moment = 3.0, 2e-5, 0.5  # rad, 1, 1; standard deviations gained in an hour
+    site = replace(a_site(synchronised=False), clock=ClockModel(2e-5, 1e-4, phase, drift, moment))
+    blocks = choose_blocks(site, ("moments", "phase"), parameters=PHASOR_PARAMETERS)
+    start = a_state(site, blocks, rng)
+    # Known well enough that what an interval adds counts.
+    sharp = np.concatenate([np.ones(MOTION), np.full(dimension(blocks), 0.02)])
+    start = replace(start, cov=sharp[:, None] * start.cov * sharp)
+    walk, later = calibration_process_noise(site, blocks), start.time + 0.4
+    imu = an_imu(start.time, later, rng)
+    offset = site.platform.imu.time_offset
+    predicted = propagate(start, imu, later, site, offset, walk, blocks=blocks)
+    light = ErrorStateFilter(start, blocks)
+    epoch = an_epoch(site, predicted.state, blocks, rng)
+    light.absorb(predicted, epoch)
+    gained = np.sqrt(0.4 / 3600.0) * np.array([phase, drift, moment])
+    walked = np.zeros((dimension(blocks), dimension(blocks)))
+    at = {(block.kind, block.owner): block.columns for block in blocks}
+    for beacon in site.beacons:
+        own = [at[kind, beacon.name] for kind in ("phase", "drift", "log_moment")]
+        for columns, sigma in zip(own, gained, strict=True):
+            np.fill_diagonal(walked[columns, columns], sigma)
+        # The phase does not jump as the frequency steps.
+        since = (
+            2.0 * np.pi * beacon.tone_frequencies_hz * (later - start.calibration.reference_time)
+        )
+        walked[own[0], own[1]] = -since * gained[1]
+    mean, cov = as_a_graph(start, blocks, predicted, epoch, walked)
+    sigma = np.sqrt(np.diag(cov))
+    went = between(predicted.state, light.state, blocks)
+    assert np.max(np.abs(went / sigma)) > 1.0
+    assert np.max(np.abs(went - mean) / sigma) < 1e-6 * np.max(np.abs(went / sigma))
+    assert np.max(np.abs(light.state.cov - cov) / np.outer(sigma, sigma)) < 1e-6
+    # Without the walk the graph would claim a good deal more.
+    _, steady = as_a_graph(start, blocks, predicted, epoch, np.zeros((dimension(blocks), 0)))
+    kept = np.sqrt(np.diag(steady)) / sigma
+    assert np.min(kept[MOTION:]) < 0.8
+
+
+@pytest.mark.parametrize("lag", [None, 1.0])
+def test_moments_that_nothing_measures_walk_as_declared(lag):
+    """In the filter from epoch to epoch; in the window as epochs leave it."""
+    rng = np.random.default_rng(SEED)
+    site = replace(a_site(), clock=ClockModel(log_moment_walk=0.5))  # in an hour
+    blocks = choose_blocks(site, ("moments",), parameters=PHASOR_PARAMETERS)
+    state = a_state(site, blocks, rng)
+    walk, offset = calibration_process_noise(site, blocks), site.platform.imu.time_offset
+    imu = an_imu(state.time, state.time + 8.0, rng)
+    light = (
+        ErrorStateFilter(state, blocks) if lag is None else SlidingWindow(state, blocks, lag, walk)
+    )
+    for epoch in range(1, 21):
+        later = state.time + 0.4 * epoch
+        added = walk if lag is None else None
+        light.absorb(propagate(light.state, imu, later, site, offset, added, blocks=blocks), [])
+    gained = np.diag(light.state.cov)[MOTION:] - np.diag(state.cov)[MOTION:]
+    passed = gained * 3600.0 / 0.5**2  # s
+    # What is within the window has not walked yet.
+    inside = 0.0 if lag is None else lag + 0.4
+    assert np.all((passed > 7.999 - inside) & (passed < 8.001))
+    assert lag is None or np.all(passed < 8.001 - lag + 0.4)

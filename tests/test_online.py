@@ -342,7 +342,7 @@ def test_a_singular_update_of_the_filter_is_an_estimation_error(
     def singular(*_: object) -> None:
         raise np.linalg.LinAlgError("singular matrix")
 
-    monkeypatch.setattr("magfusion.estimation.online.ekf._step", singular)
+    monkeypatch.setattr("magfusion.estimation.online.ekf.ErrorStateFilter.update_linear", singular)
     short = replace(walk, imu=without_imu(walk.imu, 9.0, 1e9))
     navigator, _ = navigate(short, NavigatorSettings("ekf"))
     assert navigator.counts["update failed"] > 0

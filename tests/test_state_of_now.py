@@ -22,11 +22,12 @@ from magfusion.estimation.online.state_of_now import CarriedState
 from magfusion.estimation.posterior.separation import radii
 from magfusion.files.site import save_site
 from magfusion.jobs.replay import run_replay
-from magfusion.model.parameters import initial_calibration
+from magfusion.model.parameters import choose_blocks, dimension, initial_calibration
 from magfusion.model.samples import ImuSamples, Log
-from magfusion.model.site import ImuModel
+from magfusion.model.site import ClockModel, ImuModel
 from magfusion.model.strapdown_steps import steps_of
 from magfusion.model.trust import Risk
+from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.inertial import simulate_imu
 
 IMU = NavigatorSettings("ekf", rate="imu")
@@ -114,6 +115,25 @@ def test_carried_by_single_steps_is_integrated_directly(
         assert apart(state, direct, navigator) < 1e-3
         scale = np.sqrt(np.diagonal(direct.cov))
         assert np.max(np.abs(state.cov - direct.cov) / scale / scale[:, None]) < 5e-3
+
+
+def test_moments_walk_as_declared_while_the_state_is_carried(
+    departed: tuple[Navigator, Departure, ImuSamples],
+) -> None:
+    """A supply that warms up changes its moments by 0.5 in an hour: by 0.7 % in a second."""
+    _, departure, imu = departed
+    site = replace(demo_site(), clock=ClockModel(log_moment_walk=0.5))
+    blocks, known = choose_blocks(site, ("moments",)), 1e-3
+    cov = known**2 * np.eye(MOTION + dimension(blocks))
+    calibration = initial_calibration(site, departure.state.time)
+    state = replace(departure.state, cov=cov, calibration=calibration)
+    walk = calibration_process_noise(site, blocks)
+    own = replace(departure, site=site, state=state, blocks=blocks, process_noise=walk)
+    found = carried_in_chunks(own, imu, 9)[-1]
+    gained = np.diagonal(found.cov)[MOTION:] - known**2
+    assert gained[0] > known**2
+    expected = 0.5**2 * (found.time - state.time) / 3600.0
+    np.testing.assert_allclose(gained, expected, rtol=1e-6)
 
 
 def test_a_parameter_of_the_imu_has_its_share_in_the_covariance(

@@ -232,5 +232,25 @@ def test_the_effective_number_counts_what_is_independent() -> None:
     assert effective_number(slow) == pytest.approx(len(slow) / 13.4, rel=0.25)
 
 
+@pytest.mark.parametrize(("rows", "lasting"), [(30, 0.85), (60, 0.9), (80, 0.5)])
+def test_the_effective_number_is_what_the_mean_square_of_short_series_scatters_by(
+    rows: int, lasting: float
+) -> None:
+    """Of n independent numbers the mean square has a variance of 2 / n; few rows have fewer lags.
+
+    Parameters
+    ----------
+    lasting : float
+        Correlation of a row with the next.
+    """
+    rng, series = np.random.default_rng(10), 20_000
+    noise = rng.standard_normal((rows, series))
+    for k in range(1, rows):
+        noise[k] = lasting * noise[k - 1] + np.sqrt(1.0 - lasting**2) * noise[k]
+    scatter = np.var(np.mean(noise**2, axis=0))
+    # A variance of squares from so many: 2 %, as long as their distribution has no long tail.
+    assert effective_number(noise) == pytest.approx(2.0 / scatter, rel=0.06)
+
+
 def test_every_code_of_a_held_parameter_is_documented() -> None:
     assert set(CODE.values()) <= set(CODES)

@@ -10,7 +10,7 @@ Imports inside functions and under ``TYPE_CHECKING`` count.
 import ast
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from itertools import chain
 from pathlib import Path
@@ -41,20 +41,23 @@ def parsed(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
-def imports_in(tree: ast.AST) -> Iterator[str]:
-    """Yield the dotted names that a file imports, wherever the import stands."""
-    for node in ast.walk(tree):
+@cache
+def imports_of(path: Path) -> tuple[str, ...]:
+    """Return the dotted names that a file imports, wherever the import stands."""
+    found: list[str] = []
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "relative imports hide the floor"
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            found += [f"{node.module}.{alias.name}" for alias in node.names]
+    return tuple(found)
 
 
 def own_imports(path: Path) -> set[str]:
     """Return the modules of the package that a file imports."""
     known, found = modules(), set()
-    for name in imports_in(parsed(path)):
+    for name in imports_of(path):
         while name and name not in known:
             name = name.rpartition(".")[0]
         if name:

@@ -25,9 +25,9 @@ ROOMS = {
     wing: rooms.split()
     for wing, rooms in {
         "model": """
-            correlation drive field_map fixed_axes groups hall hermite marks
-            perturbation physics platform_motion probe progress quaternion region response rotor
-            temperature time_division trust
+            arguments correlation drive field_map fixed_axes groups hall hermite marks
+            perturbation physics platform_motion probe progress quaternion region
+            response rotor short_repr temperature time_division trust
             magnetometer
             site trajectory
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown
@@ -45,6 +45,7 @@ ROOMS = {
             bag depth_table fix_table marks_table result_states rotor_columns site_plain site_text
             temperature_table tum
             inertial_tables odometry_bag site_magnetometer stream
+            trajectory_formats
             euroc named_records named_samples site_schema stream_contents
             log site
             foreign open
@@ -94,8 +95,9 @@ ROOMS = {
             coverage_colours design motion_coverage recording_layout recording_trust screen
             plots recording recording_drift
             page_motion recording_coverage recording_design recording_live
-            page
+            page trajectory
             report
+            smoothed
         """,
         "jobs": """
             antenna_inputs fix_coil joint_kept receiver_axes region_option rotor_inputs state_rows

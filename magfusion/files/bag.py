@@ -76,18 +76,7 @@ def read_bag(
         Where the bag cannot be read, has no topic of a sensor or several of one kind of which
         none was named, or holds messages that no instrument gives.
     """
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
-
-    chosen = topics or Topics()
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            found = _read(reader, path, chosen, report)
-    except InputError:
-        raise
-    except Exception as error:  # a damaged bag makes the library fail in any way whatever
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path}: cannot be read ({reason}); record the bag again.") from error
+    found = _opened(path, topics or Topics(), report)
     imu, field, truth = (found.get(role) for role in ("imu", "magnetometer", "truth"))
     first = field if imu is None else imu
     if first is None:
@@ -110,6 +99,21 @@ def read_bag(
         truth=None if truth is None else _trajectory(truth, span),
         noticed=tuple(told),
     )
+
+
+def _opened(path: Path, topics: Topics, report: Report) -> dict[str, _Stream]:
+    """Return the streams of a bag by their roles; refuse one that cannot be read."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
+            return _read(reader, path, topics, report)
+    except InputError:
+        raise
+    except Exception as error:  # a damaged bag makes the library fail in any way whatever
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{path}: cannot be read ({reason}); record the bag again.") from error
 
 
 def _read(reader: AnyReader, path: Path, topics: Topics, report: Report) -> dict[str, _Stream]:
@@ -136,25 +140,31 @@ def _chosen(
     reader: AnyReader, path: Path, topic: str | None, role: str, msgtypes: tuple[str, ...]
 ) -> list[Connection]:
     """Return the connections of the one topic that plays a role."""
-    fitting = [c for c in reader.connections if c.msgtype in msgtypes]
+    connections = [c for c in reader.connections if c.msgtype in msgtypes]
     if topic is None:
-        fitting = [c for c in fitting if c.msgtype in USUAL] or fitting
-    names = sorted({c.topic for c in fitting})
-    if topic is None and len(names) > 1:
+        connections = [c for c in connections if c.msgtype in USUAL] or connections
+    names = sorted({c.topic for c in connections})
+    if topic is not None:
+        if topic not in names:
+            found = ", ".join(names) or "none"
+            raise InputError(
+                f"{path}: has no topic {topic} of {' or '.join(msgtypes)} for {role} (found"
+                f" {found}); name another."
+            )
+        connections = [c for c in connections if c.topic == topic]
+    elif len(names) > 1:
         raise InputError(
             f"{path}: has several topics for {role}: {', '.join(names)};"
             f" name one by --topics {role}=... (in Python, by Topics), or keep one in the bag."
         )
-    if topic is not None and topic not in names:
-        found = ", ".join(names) or "none"
-        raise InputError(
-            f"{path}: has no topic {topic} of {' or '.join(msgtypes)} for {role} (found {found});"
-            " name another."
-        )
-    connections = [c for c in fitting if topic in (None, c.topic)]
-    if len({c.msgtype for c in connections}) > 1:
-        raise InputError(f"{path}: topic {names[0]} has several types; record it with one.")
+    _refuse_several_types(connections, path)
     return connections
+
+
+def _refuse_several_types(connections: list[Connection], path: Path) -> None:
+    if len({c.msgtype for c in connections}) > 1:
+        topic = connections[0].topic
+        raise InputError(f"{path}: topic {topic} has several types; record it with one.")
 
 
 def _sorted(place: str, msgtype: str, stamps: IntArray, values: Array) -> _Stream:

@@ -6,6 +6,8 @@ asks its environment when it is imported.
 """
 
 import os
+import warnings
+from functools import cache
 
 THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 OF_ALL = "OMP_NUM_THREADS"  # for others, too: Arrow reads by so many
@@ -17,3 +19,26 @@ def use_one_thread() -> None:
         return
     for name in THREADS:
         os.environ.setdefault(name, "1")
+
+
+@cache
+def warn_about_threads() -> None:
+    """Warn once that BLAS has several threads, where its environment does not say how many.
+
+    To be called by a function that a user calls: the warning names the line that called it.
+    """
+    if any(name in os.environ for name in (*THREADS, OF_ALL)):
+        return
+    from threadpoolctl import threadpool_info
+
+    libraries = [one for one in threadpool_info() if one["user_api"] == "blas"]
+    most = max((one["num_threads"] for one in libraries), default=1)
+    if most > 1:
+        warnings.warn(
+            f"BLAS uses {most} threads, which costs up to twice the processor time and saves none:"
+            f" the matrices of magfusion are small. Set {THREADS[0]}=1 before NumPy is imported,"
+            " or call threadpoolctl.threadpool_limits(1, user_api='blas'). Any value of"
+            f" {THREADS[0]} silences this warning.",
+            RuntimeWarning,
+            stacklevel=3,
+        )

@@ -37,14 +37,8 @@ def _columns(name: str, found: FieldMap) -> dict[str, Array]:
     return columns | {k: np.full(count, getattr(found, k)) for k in _PROCESS}
 
 
-def read_field_maps(path: Path) -> dict[str, FieldMap]:
-    """Read the maps of beacons by name.
-
-    Raises
-    ------
-    InputError
-        Where the file is missing or unreadable, lacks a column, or holds what no map holds.
-    """
+def _table(path: Path) -> pa.Table:
+    """Return the table of a file that has the columns of field maps."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such field map; learn it by calibrate fieldmap.")
     try:
@@ -55,6 +49,18 @@ def read_field_maps(path: Path) -> dict[str, FieldMap]:
     missing = [k for k in ("beacon", *_NUMBERS) if k not in table.column_names]
     if missing:
         raise InputError(f"{path}: column {missing[0]} is missing; learn the field map again.")
+    return table
+
+
+def read_field_maps(path: Path) -> dict[str, FieldMap]:
+    """Read the maps of beacons by name.
+
+    Raises
+    ------
+    InputError
+        Where the file is missing or unreadable, lacks a column, or holds what no map holds.
+    """
+    table = _table(path)
     try:
         number = {k: np.asarray(table[k].to_numpy(), dtype=np.float64) for k in _NUMBERS}
     except (TypeError, ValueError) as error:

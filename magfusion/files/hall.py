@@ -157,22 +157,9 @@ def load_hall(path: Path) -> Hall:
     """
     entry = read_yaml(path, HallEntry)
     room = Prism(entry.hall.polygon_m, entry.hall.height_m)
-    corners = len(room.polygon)
-    walls = tuple(range(corners)) if entry.mount.walls is None else tuple(entry.mount.walls)
-    for i, wall in enumerate(walls):
-        if wall >= corners:
-            raise InputError(
-                f"{path}: mount.walls[{i}]: found {wall}; the hall has walls 0 to {corners - 1},"
-                " wall 0 from its first corner to its second."
-            )
-    use = entry.use
-    mount = entry.mount.height_m
-    for key, given in (("mount.height_m", mount), ("use.height_m", use.height_m)):
-        if given is not None and (given[0] < room.heights[0] or given[1] > room.heights[1]):
-            raise InputError(
-                f"{path}: {key}: found {given.tolist()}; give heights between those of the hall,"
-                f" {room.heights[0]:g} m and {room.heights[1]:g} m."
-            )
+    use, mount = entry.use, entry.mount.height_m
+    walls = tuple(range(len(room.polygon)) if entry.mount.walls is None else entry.mount.walls)
+    _check_inside(entry, room, walls, path)
     forbidden = tuple(
         Prism(one.polygon_m, np.array([-math.inf, math.inf]) if h is None else h)
         for one in entry.forbidden
@@ -193,3 +180,23 @@ def load_hall(path: Path) -> Hall:
         ),
         margin=use.margin_m,
     )
+
+
+def _check_inside(entry: HallEntry, room: Prism, walls: tuple[int, ...], path: Path) -> None:
+    """Refuse walls that the hall has not, and heights beyond its own."""
+    corners = len(room.polygon)
+    for i, wall in enumerate(walls):
+        if wall >= corners:
+            raise InputError(
+                f"{path}: mount.walls[{i}]: found {wall}; the hall has walls 0 to {corners - 1},"
+                " wall 0 from its first corner to its second."
+            )
+    for key, given in (
+        ("mount.height_m", entry.mount.height_m),
+        ("use.height_m", entry.use.height_m),
+    ):
+        if given is not None and (given[0] < room.heights[0] or given[1] > room.heights[1]):
+            raise InputError(
+                f"{path}: {key}: found {given.tolist()}; give heights between those of the hall,"
+                f" {room.heights[0]:g} m and {room.heights[1]:g} m."
+            )

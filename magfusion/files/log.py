@@ -50,6 +50,16 @@ def is_log(path: Path) -> bool:
     return (path / HEADER).is_file()
 
 
+def _tables(path: Path) -> dict[str, Path | None]:
+    """Return the table of each stream; refuse a log without any of the field."""
+    tables = {stem: find_table(path, stem) for stem in STREAMS}
+    if tables["magnetometer"] is None and tables["fields"] is None:
+        raise InputError(
+            f"{path}: holds no magnetometer.parquet and no fields.parquet (nor .csv); add one."
+        )
+    return tables
+
+
 def read_log(path: Path, start: float | None = None, end: float | None = None) -> Log:
     """Read and check a log, or the part of it with start <= time < end.
 
@@ -78,12 +88,8 @@ def read_log(path: Path, start: float | None = None, end: float | None = None) -
     if not is_log(path):
         raise InputError(f"{path}: holds no {HEADER}; give the path of a log's directory.")
     header = read_yaml(path / HEADER, LogHeader)
+    tables = _tables(path)
     span = Span(header.epoch_ns, start, end)
-    tables = {stem: find_table(path, stem) for stem in STREAMS}
-    if tables["magnetometer"] is None and tables["fields"] is None:
-        raise InputError(
-            f"{path}: holds no magnetometer.parquet and no fields.parquet (nor .csv); add one."
-        )
     imu, of_imu = ImuSamples.empty(), _NOTHING
     if tables["imu"] is not None:
         imu, of_imu = read_imu(tables["imu"], span)

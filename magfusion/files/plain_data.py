@@ -35,15 +35,19 @@ class Rules:
     readers: Mapping[type, Callable[[Any], Any]] = field(default_factory=dict)
     checks: Mapping[type, Callable[[Any], None]] = field(default_factory=dict)
 
+    def writer(self, kind: type) -> Callable[[Any], Any] | None:
+        """Return how a type is written, or the nearest that it is derived of."""
+        return next((self.writers[own] for own in kind.__mro__ if own in self.writers), None)
+
 
 def to_plain(value: object, rules: Rules | None = None) -> Any:
     """Return plain data of dataclasses, running parts, arrays, numbers and collections of them.
 
     Of a running part, any other object, the attributes are its state that its class annotates.
     """
-    own = [kind for kind in type(value).__mro__ if rules is not None and kind in rules.writers]
-    if rules is not None and own:
-        return rules.writers[own[0]](value)
+    writer = None if rules is None else rules.writer(type(value))
+    if writer is not None:
+        return writer(value)
     if value is None or isinstance(value, bool | int | float | str | np.ndarray):
         return value
     if isinstance(value, np.generic):
@@ -95,6 +99,25 @@ def _refusal(place: str, what: object) -> InputError:
     return InputError(f"{place} {what}; run without --resume")
 
 
+_SCALARS = (float, int, str, bool, type(None))
+
+
+def _as_it_is(kind: Any, data: Any) -> Any:
+    """Return plain data of a type that needs no reader: an array, a choice, a scalar."""
+    if get_origin(kind) is np.ndarray:
+        dtype = np.dtype(get_args(get_args(kind)[1])[0])
+        if not isinstance(data, np.ndarray) or data.dtype != dtype:
+            raise ValueError(f"is no array of {dtype}")
+        return data
+    if get_origin(kind) is Literal:
+        if type(data) not in (str, int) or data not in get_args(kind):
+            raise ValueError(f"is none of {get_args(kind)}")
+        return data
+    if type(data) is not kind and not (kind is float and type(data) is int):
+        raise ValueError(f"is no {kind.__name__}")
+    return None if data is None else kind(data)
+
+
 class _Reader:
     def __init__(self, rules: Rules) -> None:
         self._rules = rules
@@ -128,19 +151,8 @@ class _Reader:
             return self._rules.readers[kind](data)
         if isinstance(kind, type) and is_dataclass(kind):
             return kind(**self._attributes(kind, data, place, None))
-        if get_origin(kind) is np.ndarray:
-            dtype = np.dtype(get_args(get_args(kind)[1])[0])
-            if not isinstance(data, np.ndarray) or data.dtype != dtype:
-                raise ValueError(f"is no array of {dtype}")
-            return data
-        if get_origin(kind) is Literal:
-            if type(data) not in (str, int) or data not in get_args(kind):
-                raise ValueError(f"is none of {get_args(kind)}")
-            return data
-        if kind in (float, int, str, bool, type(None)):
-            if type(data) is not kind and not (kind is float and type(data) is int):
-                raise ValueError(f"is no {kind.__name__}")
-            return None if data is None else kind(data)
+        if get_origin(kind) in (np.ndarray, Literal) or kind in _SCALARS:
+            return _as_it_is(kind, data)
         if not isinstance(like, kind):
             raise ValueError("is there, but not in a run of these settings")
         return self.resumed(like, data, place)

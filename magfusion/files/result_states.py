@@ -10,7 +10,7 @@ import pyarrow.parquet
 
 from magfusion.errors import InputError
 from magfusion.files.table import Layout, Span, read_table
-from magfusion.files.trajectory_table import read_trajectory
+from magfusion.files.trajectory_table import read_trajectory, trajectory_columns
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Verdict
 from magfusion.units import IntArray
@@ -65,6 +65,14 @@ def read_result_states(path: Path) -> ResultStates:
     return ResultStates(
         stamps[kept], replace(trajectory, **own), columns.filter(kept), int(np.sum(~kept))
     )
+
+
+def states_of(trajectory: Trajectory, epoch_ns: int) -> ResultStates:
+    """Return the states of a trajectory, as a file of it has them."""
+    stamps = Span(epoch_ns).stamps(trajectory.time)
+    columns = pa.table(trajectory_columns(trajectory, epoch_ns))
+    shifted = replace(trajectory, time=Span(int(stamps[0])).seconds(stamps))
+    return ResultStates(stamps, shifted, columns, left_out=0)
 
 
 def write_csv(states: ResultStates, path: Path) -> None:

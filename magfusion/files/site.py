@@ -34,6 +34,7 @@ from magfusion.files.site_schema import (
 )
 from magfusion.files.site_warming import warming_entry
 from magfusion.files.yaml_files import StrictModel, read_yaml, write_yaml
+from magfusion.model.arguments import check_arguments
 from magfusion.model.field_map import FieldMap
 from magfusion.model.physics.earth import earth_field_world
 from magfusion.model.platform_motion import NO_IMU
@@ -99,13 +100,7 @@ def load_site(
             f"{path}: platform.magnetometers: this job takes one magnetometer; give a site that has"
             f" but one of {', '.join(str(m.name) for m in entry.platform.every)}."
         )
-    location, field_world = None, entry.world.earth_field_t
-    if entry.world.location is not None:
-        location = model_of(Location, entry.world.location)
-        try:
-            field_world = _reference_field(location)
-        except InputError as error:
-            raise InputError(f"{path}: world.{error}") from error
+    location, field_world = _location_and_field(entry, path)
     maps, ground = _field_maps(entry, path), entry.world.conductivity_s_m
     sensors = tuple(map(magnetometer_of, entry.platform.every))
     site = Site(
@@ -137,6 +132,17 @@ def load_site(
     return replace(site, correlation=load_correlation(site, path.parent / entry.correlation))
 
 
+def _location_and_field(entry: SiteEntry, path: Path) -> tuple[Location | None, Array | None]:
+    """Return the place, if the file gives it, and the Earth's field there, or that of the file."""
+    if entry.world.location is None:
+        return None, entry.world.earth_field_t
+    location = model_of(Location, entry.world.location)
+    try:
+        return location, _reference_field(location)
+    except InputError as error:
+        raise InputError(f"{path}: world.{error}") from error
+
+
 def _refuse_unknown(entry: SiteEntry, path: Path) -> None:
     for i, beacon in enumerate(entry.beacons):
         if beacon.unknown == "pose" and beacon.rotor is not None and len(entry.beacons) == 1:
@@ -160,7 +166,13 @@ def save_site(site: Site, path: Path | str) -> None:
     path : Path
         Replaced as a whole, or left as it was if anything fails.  Field maps are written beside
         it, as ``<stem>_field_map.parquet``, a correlation as ``<stem>_correlation.parquet``.
+
+    Raises
+    ------
+    TypeError
+        Where the first argument is no site.
     """
+    check_arguments("save_site", site=(site, Site))
     path, site = Path(path), as_declared(site)
     maps = {b.name: b.field_map for b in site.every_beacon if b.field_map is not None}
     beside = path.with_name(f"{path.stem}_field_map.parquet")

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from itertools import permutations
 
 from magfusion.errors import InputError
 
@@ -16,6 +17,8 @@ KEYS = (
 )
 EXAMPLE = "'A position_m=0,0,1 rpy_deg=0,0,90 frequency_hz=25 moment_a_m2=220 axes=xy'"
 _TRUTHS = {"yes": True, "true": True, "no": False, "false": False}
+# Of one coil, two or three, each with an axis of its own.
+_COILS = {"".join(axes) for n in (1, 2, 3) for axes in permutations("xyz", n)}
 UNKNOWN = "unknown"
 
 Numbers = tuple[float, ...]
@@ -104,7 +107,7 @@ def beacon_draft(text: str, place: str = "--beacon") -> BeaconDraft:
 
 def _check_coils(where: str, draft: BeaconDraft) -> None:
     axes = draft.axes
-    if axes is not None and (not axes or set(axes) - set("xyz") or len(set(axes)) < len(axes)):
+    if axes is not None and axes not in _COILS:
         raise InputError(
             f"{where}: axes={axes}: write the beacon axis of each coil once: x for a single coil,"
             " xy for two that rotate the field, xyz for three"

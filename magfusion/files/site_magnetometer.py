@@ -101,12 +101,7 @@ def check_magnetometers(
 ) -> None:
     """Refuse none, both forms, and magnetometers that names do not tell apart."""
     if several is None:
-        if one is None:
-            detail = InitErrorDetails(type="missing", loc=("magnetometer",), input=None)
-            raise ValidationError.from_exception_data("site", [detail])
-        if one.clock_offset_s or one.sigma.clock_offset_s:
-            remedy = "remove it: the clock of a single magnetometer is that of the log"
-            raise refusal_at(("magnetometer", "clock_offset_s"), one.clock_offset_s, remedy)
+        _check_single(one)
         return
     if one is not None:
         remedy = "remove it, or magnetometers: a platform has one or a list"
@@ -126,6 +121,15 @@ def check_magnetometers(
     if several[0].clock_offset_s or several[0].sigma.clock_offset_s:
         remedy = "give it to the others: the clock of the first magnetometer is that of the log"
         raise refusal_at(("magnetometers", 0, "clock_offset_s"), several[0].clock_offset_s, remedy)
+
+
+def _check_single(one: MagnetometerEntry | None) -> None:
+    if one is None:
+        detail = InitErrorDetails(type="missing", loc=("magnetometer",), input=None)
+        raise ValidationError.from_exception_data("site", [detail])
+    if one.clock_offset_s or one.sigma.clock_offset_s:
+        remedy = "remove it: the clock of a single magnetometer is that of the log"
+        raise refusal_at(("magnetometer", "clock_offset_s"), one.clock_offset_s, remedy)
 
 
 def check_tones(sensor: MagnetometerEntry, tones_hz: Array, at: tuple[str | int, ...]) -> None:

@@ -1,6 +1,7 @@
 """One table of a log, Parquet or CSV: the columns asked for, checked, within a span of time."""
 
 import csv
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,12 +99,16 @@ class Layout(NamedTuple):
     some: tuple[str, ...] = ()
     optional_texts: tuple[str, ...] = ()
 
+    def _wanted(self, found: Sequence[str]) -> list[str]:
+        """Return the columns to read, where the optional ones are as found."""
+        groups = [g for g in self.optional if set(g) & set(found)]
+        texts = [*self.texts, *filter(found.__contains__, self.optional_texts)]
+        some = [*filter(found.__contains__, self.some)] or self.some
+        return [*self.integers, *texts, *self.numbers, *itertools.chain(*groups), *some]
+
     def chosen(self, found: Sequence[str], path: Path) -> list[str]:
         """Return the columns to read of those found; refuse a table that lacks one."""
-        groups = [g for g in self.optional if set(g) & set(found)]
-        texts = [*self.texts, *(name for name in self.optional_texts if name in found)]
-        wanted = [*self.integers, *texts, *self.numbers, *(name for g in groups for name in g)]
-        wanted += [name for name in self.some if name in found] or self.some
+        wanted = self._wanted(found)
         missing = [name for name in wanted if name not in found]
         if missing:
             raise InputError(

@@ -37,6 +37,14 @@ def write_trajectory(
         Of each state: ``verdict``, ``protection_level_m`` and ``protection_level_deg`` (null where
         there is none), and ``excluded`` (names of beacons).
     """
+    columns = trajectory_columns(trajectory, epoch_ns)
+    if trust is not None:
+        columns |= trust_columns(trust, np.arange(len(trust.verdict)))
+    write_table(columns, path)
+
+
+def trajectory_columns(trajectory: Trajectory, epoch_ns: int) -> dict[str, object]:
+    """Return the columns of a trajectory's table; parts that it does not have are left out."""
     quaternion = Rotation.from_matrix(trajectory.world_from_body).as_quat(scalar_first=True)
     parts: list[tuple[tuple[str, ...], Array | None]] = [
         (_POSITION, trajectory.position_world),
@@ -50,9 +58,7 @@ def write_trajectory(
     for names, values in parts:
         if values is not None:
             columns |= dict(zip(names, values.T, strict=True))
-    if trust is not None:
-        columns |= trust_columns(trust, np.arange(len(trust.verdict)))
-    write_table(columns, path)
+    return columns
 
 
 def trust_columns(trust: StateTrust, rows: IntArray) -> dict[str, object]:

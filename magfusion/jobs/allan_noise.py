@@ -137,16 +137,8 @@ def measured(job: Job, site: Site | None, report: Report) -> Measured:
     duration = 0.0
     for k, (stream, parts) in enumerate(_STREAMS.items()):
         report(f"reading {stream}", k, 3)
-        rest, said = RestStream(3 * len(parts)), _Said()
-        for piece in _pieces(job, stream):
-            rest.add(piece.time, piece.values)
-            said.add(_of_piece(stream, piece))
-        if len(rest) < LEAST_SAMPLES:
-            if said.pieces:
-                raise InputError(
-                    f"{job.log_path}: {stream} has {len(rest)} samples in the part to use; record"
-                    " at rest for some minutes at least, better for hours"
-                )
+        rest, said = _gathered(job, stream, 3 * len(parts))
+        if not said.pieces:
             continue
         samples[stream] = len(rest)
         duration = max(duration, rest.duration)
@@ -165,6 +157,26 @@ def measured(job: Job, site: Site | None, report: Report) -> Measured:
     held = tuple(_held(keys)) if "accel_bias_sigma" in keys else ()
     trust = Trust(tuple(findings), held)
     return Measured(trust, duration, samples, tuple(instruments), keys, intervals, units)
+
+
+def _gathered(job: Job, stream: str, width: int) -> tuple[RestStream, _Said]:
+    """Return the samples of a stream at rest, and what its pieces said.
+
+    Raises
+    ------
+    InputError
+        Where there are too few.
+    """
+    rest, said = RestStream(width), _Said()
+    for piece in _pieces(job, stream):
+        rest.add(piece.time, piece.values)
+        said.add(_of_piece(stream, piece))
+    if said.pieces and len(rest) < LEAST_SAMPLES:
+        raise InputError(
+            f"{job.log_path}: {stream} has {len(rest)} samples in the part to use; record"
+            " at rest for some minutes at least, better for hours"
+        )
+    return rest, said
 
 
 def _pieces(job: Job, stream: str) -> Iterator[Piece]:

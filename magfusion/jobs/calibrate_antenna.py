@@ -12,6 +12,9 @@ from magfusion.jobs.antenna_settings import AntennaSettings
 from magfusion.jobs.settings import Command
 
 if TYPE_CHECKING:
+    from magfusion.calibration.antenna_site import BodySurvey
+    from magfusion.model.antenna import Antenna
+    from magfusion.model.site import Beacon
     from magfusion.results.figures import Figures
 
 
@@ -32,14 +35,11 @@ def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
     from magfusion.calibration.antenna_site import into_mounting, with_fit
     from magfusion.calibration.antenna_tracking import PoseErrors
     from magfusion.files.site import load_site, save_site
-    from magfusion.files.survey import read_survey
     from magfusion.jobs import antenna_report as told
     from magfusion.jobs.antenna_fit import Bench, left_out, solved
     from magfusion.jobs.antenna_inputs import (
-        couplings,
         mounted_by_fixes,
         probed,
-        refuse_swapped,
         tracker,
     )
     from magfusion.jobs.antenna_trust import judged
@@ -64,14 +64,9 @@ def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
         start = antenna_of(beacon, site.platform.magnetometer)
     if settings.sizes and start.kappa_beacon is None:
         start = antenna_from_vector(np.concatenate([start.vector(), np.zeros(4)]))
-    survey, dropped = None, 0
-    if settings.survey is not None:
-        listed = read_survey(settings.survey, settings.poses)
-        with named(settings.survey):
-            survey, dropped = couplings(listed, beacon)
-            refuse_swapped(survey, start)
-        if settings.boresight:
-            site = mounted_by_fixes(survey, site, beacon)
+    survey, dropped = _survey(settings, beacon, start)
+    if survey is not None and settings.boresight:
+        site = mounted_by_fixes(survey, site, beacon)
     bench = Bench(site, beacon, start, survey, probed(settings.probe))
     found = solved(bench, settings)
     errors: tuple[PoseErrors, PoseErrors] | None = None
@@ -105,6 +100,23 @@ def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
         write_report(whole, figures)
     refuse_failed(settings.survey or settings.probe[0], output, trust)
     return figures
+
+
+def _survey(
+    settings: AntennaSettings, beacon: Beacon, start: Antenna
+) -> tuple[BodySurvey | None, int]:
+    """Return what was read at known poses, if anything was, and how many poses are left out."""
+    from magfusion.files.survey import read_survey
+    from magfusion.jobs.antenna_inputs import couplings, refuse_swapped
+    from magfusion.jobs.inputs import named
+
+    if settings.survey is None:
+        return None, 0
+    listed = read_survey(settings.survey, settings.poses)
+    with named(settings.survey):
+        survey, dropped = couplings(listed, beacon)
+        refuse_swapped(survey, start)
+    return survey, dropped
 
 
 COMMAND = Command(

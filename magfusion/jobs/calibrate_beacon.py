@@ -112,14 +112,17 @@ def _chosen(site: Site, survey: Survey, names: tuple[str, ...], path: Path) -> l
             f"{path}: beacon {strange[0]} is unknown to the site (it has {', '.join(known)}); give"
             " the site that was surveyed, or choose with --beacon"
         )
-    chosen = [known[name] for name in dict.fromkeys(names or detected)]
+    _check_tones(survey, known, path)
+    return [known[name] for name in dict.fromkeys(names or detected)]
+
+
+def _check_tones(survey: Survey, known: dict[str, Beacon], path: Path) -> None:
     for name, tone in survey.channels:
         if name in known and tone >= len(known[name].tones):
             raise InputError(
                 f"{path}: beacon {name} has no tone {tone} in the site (it has"
                 f" {len(known[name].tones)}); give the site that was surveyed"
             )
-    return chosen
 
 
 def _calibrated(site: Site, beacon: Beacon, survey: Survey) -> _Calibrated:

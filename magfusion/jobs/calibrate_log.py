@@ -94,7 +94,6 @@ def run_calibrate_log(
     from magfusion.estimation.integrity.judge import judged
     from magfusion.files.site import save_site
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
-    from magfusion.model.trust import Trust
     from magfusion.results.figures import Figure, Figures, Section, heading
     from magfusion.results.motion_coverage import missing_motion, motion_coverage
     from magfusion.results.observability import observability
@@ -128,12 +127,10 @@ def run_calibrate_log(
         )
     honest, trust = judged(result, log)
     result, moved = against_site(honest, grown(result, honest))
-    moved = Trust(tuple(f for f in moved.findings if f.code not in _said(trust, f.verdict)))
-    trust = Trust(
-        tuple(f for f in trust.findings if f.code not in _said(moved, f.verdict)), trust.unverified
-    )
     compared = None if cuts is None else _transfer(job, site, smoother, cuts, report)
-    trust |= moved if compared is None else moved | transferred(compared)
+    trust = _told_once(trust, moved)
+    if compared is not None:
+        trust |= transferred(compared)
     parts_of = result.calibration, result.blocks, result.calibration_cov
     found = observability(*parts_of)
     covered = motion_coverage(result.states, result.calibration, log.imu)
@@ -160,6 +157,15 @@ def run_calibrate_log(
         write_report(whole, figures)
     refuse_failed(job.log_path, output, trust)
     return figures
+
+
+def _told_once(trust: Trust, moved: Trust) -> Trust:
+    """Return both together, what both say in the words of the first."""
+    from magfusion.model.trust import Trust
+
+    moved = Trust(tuple(f for f in moved.findings if f.code not in _said(trust, f.verdict)))
+    kept = tuple(f for f in trust.findings if f.code not in _said(moved, f.verdict))
+    return Trust(kept, trust.unverified) | moved
 
 
 def _said(trust: Trust, verdict: Verdict) -> set[str]:

@@ -30,8 +30,6 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     InputError
         Where the log has no waveform, or no window of it is usable.
     """
-    import numpy as np
-
     from magfusion.estimation.data_checks.recording import passed_on
     from magfusion.estimation.demodulation.demodulated_apart import demodulated_apart
     from magfusion.estimation.demodulation.demodulation import phasors
@@ -85,27 +83,9 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     trust = passed_on(log, site)
     if rested is not None:
         trust |= Trust(rested.findings)
-    sigma = np.sqrt(np.trace(samples.phasor_cov, axis1=2, axis2=3) / 3.0)
-    figures = (
-        heading("demodulate", log.name)
-        | trust_figures(trust)
-        | Figures(
-            Figure("epochs", len(samples)),
-            Figure("window_s", float(np.median(samples.window)), "s"),
-            *(
-                Figure(
-                    f"sigma_{_of(samples, c, '_')}{{beacon}}_{tone}_t",
-                    float(np.median(sigma[samples.valid[:, c], c])),
-                    "T",
-                    beacon,
-                    label=f"sigma of a phasor of tone {tone}{_of(samples, c, ' by ')}",
-                )
-                for c, (beacon, tone) in enumerate(samples.channels)
-                if np.any(samples.valid[:, c])
-                or (not samples.magnetometers and len(site.every_beacon) <= MANY)
-            ),
-        )
-    )
+    every = not samples.magnetometers and len(site.every_beacon) <= MANY
+    figures = heading("demodulate", log.name) | trust_figures(trust)
+    figures |= _phasor_figures(samples, every)
     figures |= dropped_figures(dropped)
     if rested is not None:
         figures |= rest_figures(rested)
@@ -118,6 +98,34 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
         write_report(whole, figures)
     refuse_failed(job.log_path, job.output, trust)
     return figures
+
+
+def _phasor_figures(samples: FieldSamples, every: bool) -> Figures:
+    """Return how many phasors there are, and how sure.
+
+    Parameters
+    ----------
+    every : bool
+        Whether a tone is told of that no window has.
+    """
+    import numpy as np
+
+    sigma = np.sqrt(np.trace(samples.phasor_cov, axis1=2, axis2=3) / 3.0)
+    return Figures(
+        Figure("epochs", len(samples)),
+        Figure("window_s", float(np.median(samples.window)), "s"),
+        *(
+            Figure(
+                f"sigma_{_of(samples, c, '_')}{{beacon}}_{tone}_t",
+                float(np.median(sigma[samples.valid[:, c], c])),
+                "T",
+                beacon,
+                label=f"sigma of a phasor of tone {tone}{_of(samples, c, ' by ')}",
+            )
+            for c, (beacon, tone) in enumerate(samples.channels)
+            if every or np.any(samples.valid[:, c])
+        ),
+    )
 
 
 def _of(samples: FieldSamples, channel: int, joint: str) -> str:

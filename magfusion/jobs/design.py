@@ -183,7 +183,7 @@ def _kept(site: Site, keep: str | None) -> Site:
     names = [beacon.name for beacon in site.beacons]
     if keep == ALL and ALL not in names:
         return site
-    wanted = [] if keep is None else [name.strip() for name in keep.split(",")]
+    wanted = list(map(str.strip, keep.split(","))) if keep is not None else []
     unknown = [name for name in wanted if name not in names]
     if unknown:
         raise InputError(

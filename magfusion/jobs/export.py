@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
 
 from magfusion.errors import InputError
+from magfusion.files.trajectory_formats import (
+    BAGS,
+    FORMATS,
+    Format,
+    format_of,
+    refuse_place,
+    write_states,
+)
 from magfusion.jobs.settings import Command, FrameSettings, argument, option
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figure, Figures, Section
 
-if TYPE_CHECKING:
-    from magfusion.files.result_states import ResultStates
-
-Format = Literal["mcap", "db3", "tum", "kitti", "csv"]
-FORMATS: tuple[Format, ...] = ("mcap", "db3", "tum", "kitti", "csv")
 _NAMESPACE = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 
 
@@ -46,9 +47,9 @@ class ExportSettings(FrameSettings):
         """
         if self.format is not None:
             return self.format
-        for form in FORMATS:
-            if output.suffix.lower() == f".{form}":
-                return form
+        form = format_of(output)
+        if form is not None:
+            return form
         raise InputError(
             f"{output}: the name does not say what to write; end it with one of"
             f" {', '.join('.' + one for one in FORMATS)}, or give --format"
@@ -63,22 +64,23 @@ def run_export(settings: ExportSettings, output: Path, report: Report = quiet) -
     InputError
         Where there is no result, none of its states has a pose, or a directory is in the way.
     """
-    from magfusion.files.atomic import whole_file
     from magfusion.files.result_states import read_result_states
     from magfusion.jobs.inputs import named
 
     form = settings.format_of(output)
     path, told = _source(settings.result)
-    if output.is_dir():
-        raise InputError(f"{output}: is a directory; give the path of a file to write")
-    if not output.absolute().parent.is_dir():
-        raise InputError(f"{output.parent}: there is no such directory; make it first")
+    refuse_place(output)
     states = read_result_states(path)
     if output.exists() and output.samefile(path):
         raise InputError(f"{output}: is what is to be exported; give another path")
     total = len(states.stamp_ns)
-    with whole_file(output) as unfinished, named(path):
-        _write(settings, form, states, unfinished, lambda k: report("writing", k, total))
+    frames = None
+    if form in BAGS:
+        from magfusion.files.odometry_bag import Frames
+
+        frames = Frames(settings.frame, settings.child, settings.namespace)
+    with named(path):
+        write_states(states, output, form, frames, lambda k: report("writing", k, total))
     figures = [
         Figure("job", "export", section=Section.TITLE),
         Figure("result", settings.result.name or str(settings.result), section=Section.TITLE),
@@ -122,32 +124,6 @@ def _source(result: Path) -> tuple[Path, dict[str, object]]:
             f"{result}: holds no trajectory.parquet; give the result of smooth, fix or navigate"
         )
     return table, told
-
-
-def _write(
-    settings: ExportSettings,
-    form: Format,
-    states: ResultStates,
-    path: Path,
-    report: Callable[[int], None],
-) -> None:
-    if form == "csv":
-        from magfusion.files.result_states import write_csv
-
-        write_csv(states, path)
-    elif form == "kitti":
-        from magfusion.files.result_states import write_kitti
-
-        write_kitti(states, path)
-    elif form == "tum":
-        from magfusion.files.tum import write_tum
-
-        write_tum(states.trajectory, path, int(states.stamp_ns[0]))
-    else:
-        from magfusion.files.odometry_bag import Frames, write_bag
-
-        frames = Frames(settings.frame, settings.child, settings.namespace)
-        write_bag(states, path, form, frames, report)
 
 
 COMMAND = Command(

@@ -21,12 +21,14 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from magfusion.estimation.snapshot.explained_fixes import ExplainedFixes
     from magfusion.estimation.snapshot.fix import Fixes
     from magfusion.jobs.inputs import Job
-    from magfusion.model.samples import Log
+    from magfusion.model.parameters import Calibration
+    from magfusion.model.samples import FieldSamples, Log
     from magfusion.model.site import Site
     from magfusion.model.trajectory import Trajectory
-    from magfusion.model.trust import Risk, StateTrust, Trust
+    from magfusion.model.trust import Finding, Risk, StateTrust, Trust
     from magfusion.receiver.windows import LockinSettings
     from magfusion.units import Array
 
@@ -131,10 +133,8 @@ def run_fix(
 
     from magfusion.estimation.data_checks.recording import BRIDGED, recorded
     from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
-    from magfusion.estimation.integrity.place_witness import of_place
     from magfusion.estimation.snapshot.explained_fixes import explained_fixes
-    from magfusion.estimation.snapshot.fix_magnetometers import contradicting_magnetometers
-    from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
+    from magfusion.jobs.inputs import claim, found_in, named, refuse_failed
     from magfusion.model.parameters import initial_calibration
     from magfusion.model.trust import Trust
     from magfusion.results.report import dropped_figures, fix_figures, where_found
@@ -143,23 +143,9 @@ def run_fix(
 
     claimed = claim(job.output, "smooth", "fix")
     used = rest is not None and rest.at_rest
-    log, site = read_job(
-        job,
-        fewer=True,
-        apart=True,
-        amplitudes=True,
-        several=True,
-        lockin=lockin,
-        reference=used,
-        heard=not used,
-        report=report,
-    )
+    log, site = _read(job, lockin, by_rests=used, report=report)
     began = time.perf_counter()
     report("demodulating", 0, 3)
-    if used and site.platform.magnetometer.lacking:
-        raise InputError(
-            "--at-rest integrates samples of three axes; leave it out for a receiver of fewer"
-        )
     if len(site.platform.magnetometer.axes) == 1:
         return _run_coil(claimed, job, log, site, lockin, free, report)
     with named(job.log_path):
@@ -177,14 +163,14 @@ def run_fix(
     )
     report("done", 3, 3)
     fixes, states = found.fixes, found.states
-    first = (fixes.world_from_body, fixes.position_world, fixes.pose_cov)
-    trust = found.trust | Trust(of_place(site, fixes.time, *(part[:, 0] for part in first)))
-    trust |= Trust(recorded(recording, site, BRIDGED, beacons=True, hearing=hearing))
-    trust |= Trust(contradicting_magnetometers(samples, calibration))
-    trust |= Trust(() if rested is None else rested.findings)
+    of_log = recorded(recording, site, BRIDGED, beacons=True, hearing=hearing)
+    trust = _trust(found, samples, calibration, of_log)
+    of_rests = Figures()
+    if rested is not None:
+        trust |= Trust(rested.findings)
+        dropped, of_rests = rested.dropped, rest_figures(rested)
     figures = heading("fix", log.name) | trust_figures(trust) | fix_figures(fixes, site)
-    figures |= dropped_figures(dropped if rested is None else rested.dropped)
-    figures |= level_figures(states) | (Figures() if rested is None else rest_figures(rested))
+    figures |= dropped_figures(dropped) | level_figures(states) | of_rests
     figures |= Figures(where_found("gain_spread", found.gain_spread > 0.0, found.gain_spread))
     figures |= Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
     with claimed as whole:
@@ -194,6 +180,48 @@ def run_fix(
             (directory / "report.json").rename(whole / "report.json")
     refuse_failed(job.log_path, job.output, trust)
     return figures
+
+
+def _read(
+    job: Job, lockin: LockinSettings | None, *, by_rests: bool, report: Report
+) -> tuple[Log, Site]:
+    """Return log and site, with what fixes of windows or of whole rests can do with."""
+    from magfusion.jobs.inputs import read_job
+
+    log, site = read_job(
+        job,
+        fewer=True,
+        apart=True,
+        amplitudes=True,
+        several=True,
+        lockin=lockin,
+        reference=by_rests,
+        heard=not by_rests,
+        report=report,
+    )
+    if by_rests and site.platform.magnetometer.lacking:
+        raise InputError(
+            "--at-rest integrates samples of three axes; leave it out for a receiver of fewer"
+        )
+    return log, site
+
+
+def _trust(
+    found: ExplainedFixes,
+    samples: FieldSamples,
+    calibration: Calibration,
+    of_log: tuple[Finding, ...],
+) -> Trust:
+    """Return what fixes say, of the place and of several magnetometers too, and the recording."""
+    from magfusion.estimation.integrity.place_witness import of_place
+    from magfusion.estimation.snapshot.fix_magnetometers import contradicting_magnetometers
+    from magfusion.model.trust import Trust
+
+    fixes = found.fixes
+    best = (fixes.world_from_body, fixes.position_world, fixes.pose_cov)
+    place = of_place(calibration.site, fixes.time, *(part[:, 0] for part in best))
+    several = contradicting_magnetometers(samples, calibration)
+    return found.trust | Trust((*place, *of_log, *several))
 
 
 def _run_coil(

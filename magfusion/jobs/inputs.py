@@ -279,15 +279,8 @@ def read_job(
     if not rotor:
         check_rotors(job.declared_path, job.log_path, log, site, apart=apart)
     log, site = logged(log, site)
-    if log.inertial and site.platform.imu == NO_IMU:
-        raise InputError(
-            f"{job.declared_path}: platform.imu: is missing, and {job.log_path} holds inertial"
-            " samples; describe the sensor, or remove its samples to do without"
-        )
+    _require_described(job, log, site)
     if log.waveform is not None:
-        if site.beacons:
-            with named(job.declared_path):
-                receiver_of(site).check()
         log = mended(log, site)
     if log.waveforms and not raw:
         with named(job.log_path):
@@ -309,6 +302,18 @@ def read_job(
         return log, site
     with named(job.log_path):
         return heard_site(log, site)
+
+
+def _require_described(job: Job, log: Log, site: Site) -> None:
+    """Refuse inertial samples of a site without an IMU, and tones that no receiver can part."""
+    if log.inertial and site.platform.imu == NO_IMU:
+        raise InputError(
+            f"{job.declared_path}: platform.imu: is missing, and {job.log_path} holds inertial"
+            " samples; describe the sensor, or remove its samples to do without"
+        )
+    if log.waveform is not None and site.beacons:
+        with named(job.declared_path):
+            receiver_of(site).check()
 
 
 def _as_known(job: Job, log: Log, site: Site) -> Log:

@@ -25,6 +25,7 @@ from magfusion.estimation.batch.joint import (
 from magfusion.estimation.batch.joint_log import OfLog
 from magfusion.estimation.integrity.logs_agree import Agreement, agreement
 from magfusion.files.atomic import real
+from magfusion.files.checkpoint import run_key
 from magfusion.files.kept import digest_of_files
 from magfusion.jobs.inputs import KEPT, Job, read_job, read_site
 from magfusion.jobs.joint_kept import Alone
@@ -98,18 +99,12 @@ def tasks_of(jobs: Sequence[Job], smoother: SmootherSettings, output: Path) -> l
                 " each log once"
             )
         seen[content] = job.log_path
-        made_by = repr((content, site, job.start, job.end, job.topics, smoother, versions()))
-        key = _digest(made_by)
+        made_by = content, site, job.start, job.end, job.topics, smoother, versions()
+        key = run_key("smooth", *made_by)
         place = real(output) / KEPT
         own = replace(job, output=place / name)
         tasks.append(LogTask(name, own, smoother, place / f"{name}.npz", key))
     return tasks
-
-
-def _digest(text: str) -> str:
-    import hashlib
-
-    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _one_site(jobs: Sequence[Job], smoother: SmootherSettings) -> str:

@@ -137,18 +137,7 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
     with named(job.log_path):
         require_motion_prior(site)
     navigator = replace(navigator, lockin=beside_lines(log, site, navigator.lockin))
-    if settings.earth and log.waveform is None:
-        raise InputError(
-            f"{job.log_path}: holds only phasors, which know nothing of the Earth field; give the"
-            " log with magnetometer.parquet, or leave --earth out"
-        )
-    if log.waveform is None and log.fields is not None:
-        longest = float(max(log.fields.window))
-        if longest > LONGEST_EPOCH:
-            raise InputError(
-                f"{job.log_path}: holds whole rests, of up to {longest:.3g} s, which are known when"
-                " they are over; run magfusion fix or smooth, or navigate the raw log"
-            )
+    _refuse_phasors(job.log_path, log, settings)
     with state_sinks(settings, site, log.epoch_ns, sys.stderr) as sinks:
         made = _make_parent(place)
         run = _open_run(settings, navigator, log, site, place, sinks)
@@ -170,6 +159,22 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
         _clear(run, place, made)
     refuse_failed(job.log_path, job.output, trust)
     return figures
+
+
+def _refuse_phasors(path: Path, log: Log, settings: NavigateSettings) -> None:
+    """Refuse phasors where they cannot do what is asked, and those of whole rests."""
+    if settings.earth and log.waveform is None:
+        raise InputError(
+            f"{path}: holds only phasors, which know nothing of the Earth field; give the"
+            " log with magnetometer.parquet, or leave --earth out"
+        )
+    if log.waveform is None and log.fields is not None:
+        longest = float(max(log.fields.window))
+        if longest > LONGEST_EPOCH:
+            raise InputError(
+                f"{path}: holds whole rests, of up to {longest:.3g} s, which are known when"
+                " they are over; run magfusion fix or smooth, or navigate the raw log"
+            )
 
 
 def _results(run: NavigateRun) -> tuple[Figures, Trust, NavigateResults | None]:

@@ -73,16 +73,17 @@ class SmoothSettings(
             raise InputError("--earth needs the phasors themselves; leave --coupling loose out")
         if self.free not in (None, "gain"):
             raise InputError(f"--free {self.free!r}: smooth frees gain alone; write --free gain")
-        if self.at_rest and self.more:
-            raise InputError(
-                "--at-rest integrates one log; make phasors of each with magfusion demodulate"
-                " --at-rest, and smooth these together"
-            )
-        if self.at_rest and (self.earth or self.free):
-            raise InputError(
-                "--at-rest gives phasors of whole rests, which know nothing of the Earth field nor"
-                " of a common gain; leave --earth and --free out"
-            )
+        if self.at_rest:
+            if self.more:
+                raise InputError(
+                    "--at-rest integrates one log; make phasors of each with magfusion demodulate"
+                    " --at-rest, and smooth these together"
+                )
+            if self.earth or self.free:
+                raise InputError(
+                    "--at-rest gives phasors of whole rests, which know nothing of the Earth field"
+                    " nor of a common gain; leave --earth and --free out"
+                )
         if self.resume and self.checkpoint is None:
             raise InputError("--resume goes on from a file; name it with --checkpoint FILE")
         if self.checkpoint is not None and self.more:
@@ -171,37 +172,22 @@ def run_smooth(
     from magfusion.estimation.data_checks.recording import beyond
     from magfusion.estimation.solve.memory import give_back_memory
     from magfusion.jobs.failure import reason_of
-    from magfusion.jobs.inputs import claim, named, read_job, refuse_failed
+    from magfusion.jobs.inputs import claim, named, refuse_failed
     from magfusion.jobs.rates import refuse_rate
     from magfusion.jobs.smooth_result import finished, with_errors, write_finished
     from magfusion.results.report import FAILED
     from magfusion.results.rest_figures import rest_figures
 
     claimed = claim(job.output, "smooth", "fix")
-    log, site = read_job(
-        job,
-        unknown=True,
-        fewer=rest is None,
-        amplitudes=rest is None,
-        several=True,
-        anew=rest is None,
-        lockin=settings.lockin,
-        reference=rest is not None,
-        heard=rest is None,
-        report=report,
-    )
-    rested, recording = None, log
+    recording, site = _read(job, settings, by_rests=rest is not None, report=report)
+    rested, log = None, recording
     if rest is not None:
         rested = _rested(job, log, site, rest, settings)
         log = rested.log(log)
     refuse_rate(job.log_path, log, rate)
     if free_gain:
         site = _with_gain(job, log, site, settings)
-    if site.platform.further and any(beacon.unknown is not None for beacon in site.beacons):
-        raise InputError(
-            f"{job.declared_path}: beacons that were never surveyed are placed by one magnetometer;"
-            " give a site that has one"
-        )
+    _refuse_placing(job, site)
     passes = None if kept is None else _passes(*kept, log, site, settings)
     began = time.perf_counter()
     try:
@@ -210,7 +196,7 @@ def run_smooth(
             log, site, result, said = _agreed(log, site, settings, result, risk)
     except RuntimeError as error:  # GTSAM's own, of a singular system, or an EstimationError
         reason = reason_of(error)
-        if any(beacon.unknown is not None for beacon in site.beacons):
+        if _has_unknown(site):
             raise EstimationError(f"{job.log_path}: {reason}") from error
         with claimed as whole:
             told = _save_fixes_instead(whole, settings, log, site, reason)
@@ -218,20 +204,51 @@ def run_smooth(
             f"{job.log_path}: {told}; the single-epoch fixes were saved in {job.output / FAILED}"
         ) from error
     give_back_memory()
-    if rested is not None:
-        said += beyond(recording, log, site)
+    said += () if rested is None else beyond(recording, log, site)
     done = finished(log, site, settings, result, risk, said=said)
-    elapsed = Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
-    done = replace(done, figures=done.figures | elapsed)
-    if rested is not None:
-        done = replace(done, figures=done.figures | rest_figures(rested))
-    done = with_errors(done, log, placed, (site, settings))
+    figures = done.figures | Figures(Figure("elapsed_s", time.perf_counter() - began, "s"))
+    figures |= Figures() if rested is None else rest_figures(rested)
+    done = with_errors(replace(done, figures=figures), log, placed, (site, settings))
     with claimed as whole:
         write_finished(whole, log, done, rate=rate)
     if passes is not None:
         passes.place.unlink(missing_ok=True)
     refuse_failed(job.log_path, output=job.output, trust=done.trust)
     return done.figures
+
+
+def _has_unknown(site: Site) -> bool:
+    """Tell whether a site has beacons that were never surveyed."""
+    return any(beacon.unknown is not None for beacon in site.beacons)
+
+
+def _refuse_placing(job: Job, site: Site) -> None:
+    """Refuse beacons that were never surveyed where there are several magnetometers."""
+    if site.platform.further and _has_unknown(site):
+        raise InputError(
+            f"{job.declared_path}: beacons that were never surveyed are placed by one magnetometer;"
+            " give a site that has one"
+        )
+
+
+def _read(
+    job: Job, settings: SmootherSettings, *, by_rests: bool, report: Report
+) -> tuple[Log, Site]:
+    """Return log and site, with what smoothing by windows or by whole rests can do with."""
+    from magfusion.jobs.inputs import read_job
+
+    return read_job(
+        job,
+        unknown=True,
+        fewer=not by_rests,
+        amplitudes=not by_rests,
+        several=True,
+        anew=not by_rests,
+        lockin=settings.lockin,
+        reference=by_rests,
+        heard=not by_rests,
+        report=report,
+    )
 
 
 def _passes(

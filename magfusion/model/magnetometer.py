@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from magfusion.model.physics.casing import Casing
 from magfusion.model.response import AxisResponses, FrequencyResponse
+from magfusion.model.short_repr import short_repr
 from magfusion.model.temperature import SensorWarming
 from magfusion.units import Array
 
@@ -67,6 +68,8 @@ class Magnetometer:
     clock_offset : float
         What it stamps t was taken at t + clock_offset on the log's clock (s).
     """
+
+    __repr__ = short_repr
 
     position_body: Array
     body_from_sensor: Array

@@ -132,12 +132,18 @@ def joined(apart: list[Observation], magnetometer: Magnetometer) -> Observation:
             own = {name: own.get(name, 0.0) + weight * part for name, part in parts.items()}
         for name, part in own.items():
             blocks[name].append(part)
-    offsets = [o.time_offset for o in apart if o.time_offset is not None]
-    grounds = [o.log_conductivity for o in apart if o.log_conductivity is not None]
     return Observation(
         **{name: np.stack(rows, axis=-2) for name, rows in blocks.items()},
         phasor_sensor=joined_phasors([o.phasor_sensor for o in apart], magnetometer),
         phase=joined_phasors([o.phase for o in apart], magnetometer),
-        time_offset=joined_phasors(offsets, magnetometer) if offsets else None,
-        log_conductivity=joined_phasors(grounds, magnetometer) if grounds else None,
+        time_offset=_joined_if_there([o.time_offset for o in apart], magnetometer),
+        log_conductivity=_joined_if_there([o.log_conductivity for o in apart], magnetometer),
     )
+
+
+def _joined_if_there(
+    parts: list[ComplexArray | None], magnetometer: Magnetometer
+) -> ComplexArray | None:
+    """Return the derivatives of the coils, of those at `points_apart` that have them."""
+    there = [part for part in parts if part is not None]
+    return joined_phasors(there, magnetometer) if there else None

@@ -9,6 +9,7 @@ from magfusion.model.drive import DriveSamples
 from magfusion.model.marks import Marks
 from magfusion.model.rotor import Depths as Depths
 from magfusion.model.rotor import RotorAngles as RotorAngles
+from magfusion.model.short_repr import short_repr
 from magfusion.model.temperature import Temperatures
 from magfusion.model.trajectory import Trajectory
 from magfusion.model.trust import Finding
@@ -30,6 +31,8 @@ class ImuSamples:
     accel_body : ndarray, shape (n, 3)
         Specific force (m/s^2): +g on z at rest, level.
     """
+
+    __repr__ = short_repr
 
     time: Array
     gyro_body: Array
@@ -59,6 +62,8 @@ class Waveform:
     axes : str
         Those that the receiver has: the other columns say nothing.
     """
+
+    __repr__ = short_repr
 
     time: Array
     measured_sensor: Array
@@ -103,6 +108,8 @@ class FieldSamples:
         From the body's axes when each phasor was measured to those of ``time``, where phasors are
         in the axes of then: of coils driven in turn, by a receiver that lacks axes.
     """
+
+    __repr__ = short_repr
 
     time: Array
     window: Array
@@ -262,6 +269,8 @@ class SteadyFields:
         Of the instrument's noise alone (T^2).
     """
 
+    __repr__ = short_repr
+
     time: Array
     measured_sensor: Array
     cov: Array
@@ -311,6 +320,8 @@ class Log:
     ``waveforms`` are the samples of several magnetometers, by name and each by its own stamps; then
     ``waveform`` is None.
     """
+
+    __repr__ = short_repr
 
     name: str
     epoch_ns: int

@@ -17,6 +17,7 @@ from magfusion.model.platform_motion import ImuModel as ImuModel
 from magfusion.model.platform_motion import MotionModel as MotionModel
 from magfusion.model.region import Bounds, Region, bounds_of
 from magfusion.model.rotor import Rotor as Rotor
+from magfusion.model.short_repr import short_repr
 from magfusion.model.temperature import Temperatures, Warming
 from magfusion.model.time_division import MarkedSlots as MarkedSlots
 from magfusion.model.time_division import Slots as Slots
@@ -124,6 +125,8 @@ class Beacon:
     planned : bool
         Whether its frequency is yet to be chosen, so that it shares it with no other.
     """
+
+    __repr__ = short_repr
 
     name: str
     position_world: Array
@@ -246,6 +249,8 @@ class Platform:
         measures.
     """
 
+    __repr__ = short_repr
+
     imu: ImuModel
     magnetometer: Magnetometer
     motion: MotionModel = A_HAND
@@ -311,6 +316,8 @@ class Site:
     unheard : tuple of (int, Beacon)
         Beacons that a log does not hear, with their places among all; they stay as declared.
     """
+
+    __repr__ = short_repr
 
     gravity: float
     model_error: float

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from magfusion.model.short_repr import one_line
 from magfusion.units import Array, BoolArray
 
 # Of one pose, by the name of each part.
@@ -19,8 +20,33 @@ _SHAPES: tuple[tuple[str, tuple[int, ...]], ...] = (
 )
 
 
+class PoseAccess:
+    """Position and attitude under short names, of what has one pose or a pose a row."""
+
+    world_from_body: Array
+    position_world: Array
+
+    @property
+    def position(self) -> Array:
+        """Position of the body in the world, shape (..., 3) (m): ``position_world``."""
+        return self.position_world
+
+    @property
+    def rotation(self) -> Rotation:
+        """Attitude, which takes vectors from body to world axes, as SciPy's `Rotation`."""
+        return Rotation.from_matrix(self.world_from_body)
+
+    @property
+    def euler(self) -> Array:
+        """Roll, pitch, yaw, shape (..., 3) (rad): turned by yaw, then pitch, then roll.
+
+        As ``rpy_deg`` of a site, and as ``rotation.as_euler("xyz")``.
+        """
+        return np.asarray(self.rotation.as_euler("xyz"))
+
+
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(PoseAccess):
     """Poses of the body over time; optional parts are None where they are not known.
 
     Parameters
@@ -60,6 +86,16 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def __repr__(self) -> str:
+        spans = [f"{self.time[0]:g} to {self.time[-1]:g} s"] if len(self) else []
+        known = [n for n, _ in _SHAPES[3:] if getattr(self, n) is not None]
+        return one_line(type(self).__name__, [f"{len(self)} poses", *spans, *known])
+
+    @property
+    def cov(self) -> Array | None:
+        """Covariance of rotation, then position, shape (n, 6, 6): ``pose_cov`` (rad, m)."""
+        return self.pose_cov
 
 
 def interpolate(

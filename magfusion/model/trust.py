@@ -10,6 +10,7 @@ from enum import StrEnum
 
 import numpy as np
 
+from magfusion.model.short_repr import one_line
 from magfusion.units import Array, IntArray
 
 # What a finding is about, by its code: the documentation of ``reasons`` in report.json.
@@ -241,6 +242,11 @@ class Trust:
     def ordered(self) -> tuple[Finding, ...]:
         """The findings, the most important first; what is only a symptom waits for a cause."""
         return tuple(sorted(self.findings, key=_importance))
+
+    def __repr__(self) -> str:
+        names = "reasons", "remarks", "unverified"
+        counts = [f"{name}: {len(getattr(self, name))}" for name in names]
+        return one_line("Trust", [str(self.verdict), *counts])
 
     def __or__(self, other: "Trust") -> "Trust":
         return Trust(self.findings + other.findings, self.unverified + other.unverified)

@@ -3,7 +3,7 @@
 No sample and no motion is in it, so that it is made once of a log, and kept while it fits memory.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -119,11 +119,10 @@ class Designs:
             one = self.even[spacings[0]] = self.even.pop(spacings[0])
             return one._replace(sample=index), False
         distinct = dict.fromkeys(own for own in spacings if own is not None)
-        known = {own: self.even.pop(own) for own in distinct if own in self.even}
-        self.even.update(known)  # the newest are the last
-        uneven = [k for k, own in enumerate(spacings) if own is None]
+        known = self._known(distinct)
         new = [own for own in distinct if own not in known]
-        rows = [*(spacings.index(own) for own in new), *uneven]
+        uneven = [k for k, own in enumerate(spacings) if own is None]
+        rows = [*map(spacings.index, new), *uneven]
         for k, own in zip(rows, new, strict=False):
             elapsed[k, : own.number] = own.times()
         parts: list[Maps] = []
@@ -131,16 +130,25 @@ class Designs:
             made = self._made(index[rows], weight[rows], elapsed[rows])
             if rows == list(range(len(windows))) and (uneven or len(windows) > 1):
                 return made, True  # no two are alike, nor was any known
-            for k, own in enumerate(new):
-                known[own] = self.even[own] = _rows(made, slice(k, k + 1), own.number)
+            known |= self._kept(made, new)
             parts = [_rows(made, slice(len(new), None), None)]
+        parts = [*map(known.__getitem__, distinct), *parts]
+        which = _places(spacings, list(distinct))
+        return _chosen(index, weight, parts, which), FEWEST_ALIKE * len(rows) > len(windows)
+
+    def _known(self, spacings: Iterable[Spacing]) -> dict[Spacing, Maps]:
+        """Return the maps of spacings that were met before, which are the newest from now on."""
+        known = {own: self.even.pop(own) for own in spacings if own in self.even}
+        self.even.update(known)
+        return known
+
+    def _kept(self, made: Maps, spacings: Sequence[Spacing]) -> dict[Spacing, Maps]:
+        """Keep the maps of spacings, one a row, and drop those that were met longest ago."""
+        new = {own: _rows(made, slice(k, k + 1), own.number) for k, own in enumerate(spacings)}
+        self.even.update(new)
         while len(self.even) > EVEN_KEPT:
             del self.even[next(iter(self.even))]
-        at = {own: k for k, own in enumerate(distinct)}
-        which = np.array([len(at) if own is None else at[own] for own in spacings])
-        which[uneven] += np.arange(len(uneven))
-        parts = [known[own] for own in distinct] + parts
-        return _chosen(index, weight, parts, which), FEWEST_ALIKE * len(rows) > len(windows)
+        return new
 
     def _made(self, index: IntArray, weight: BoolArray, elapsed: Array) -> Maps:
         design, n = self.design(elapsed, weight), len(self.frequencies_hz)
@@ -178,6 +186,15 @@ def _rows(maps: Maps, rows: slice, count: int | None) -> Maps:
         probes=maps.probes[rows, ..., :count].copy(),
         told=maps.told[rows].copy(),
     )
+
+
+def _places(spacings: Sequence[Spacing | None], distinct: Sequence[Spacing]) -> IntArray:
+    """Return which part each window's maps are: of its spacing, or its own behind all of them."""
+    at: dict[Spacing | None, int] = {own: k for k, own in enumerate(distinct)}
+    which = np.array([at.get(own, -1) for own in spacings])
+    uneven = which < 0
+    which[uneven] = len(at) + np.arange(np.sum(uneven))
+    return which
 
 
 def _chosen(index: IntArray, weight: BoolArray, parts: list[Maps], which: IntArray) -> Maps:

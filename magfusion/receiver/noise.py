@@ -82,9 +82,9 @@ def noise_beside_tones(seen: Array, told: IntArray) -> Array:
     ndarray, shape (n, tones, 3, 3)
         (T^2)
     """
-    degrees = np.maximum(told, 1)[..., None, None]
-    own = np.swapaxes(seen, -1, -2) @ seen / degrees
-    unseen = (1.0 - degrees / seen.shape[-2]) * np.trace(own, axis1=-2, axis2=-1)[..., None, None]
+    share = np.maximum(told, 1)[..., None, None] / seen.shape[-2]
+    own = np.swapaxes(seen, -1, -2) @ seen / seen.shape[-2]
+    unseen = (1.0 / share - 1.0) * np.trace(own, axis1=-2, axis2=-1)[..., None, None]
     return own + unseen / 3.0 * np.eye(3)
 
 

@@ -8,6 +8,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.model.arguments import check_arguments
+from magfusion.model.short_repr import one_line, short_repr
 from magfusion.model.trajectory import Trajectory, interpolate
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -28,6 +30,9 @@ class RelativeErrors(NamedTuple):
     pairs: IntArray
     translation: Array
     rotation: Array
+
+    def __repr__(self) -> str:
+        return one_line("RelativeErrors", [f"{len(self.pairs)} pairs"])
 
     @property
     def translation_rmse(self) -> float:
@@ -69,6 +74,8 @@ class TrajectoryErrors:
     nees : ndarray, shape (n,), optional
         Normalised estimation error squared, six degrees of freedom, where there is a covariance.
     """
+
+    __repr__ = short_repr
 
     time: Array
     compared: BoolArray
@@ -150,9 +157,12 @@ def trajectory_errors(
 
     Raises
     ------
+    TypeError
+        Where one of them is no trajectory.
     InputError
         Where fewer than three epochs of the estimate have a truth.
     """
+    check_arguments("trajectory_errors", estimate=(estimate, Trajectory), truth=(truth, Trajectory))
     true, compared = interpolate(truth, estimate.time, max_gap)
     if len(true) < 3:
         raise InputError(

@@ -40,6 +40,7 @@ _MEANING = {
     " been widened to cover them.",
     "failed": "It must not be used: what is shown below is kept for diagnosis only.",
 }
+NO_JUDGE = "This job judges nothing."
 _CAPTIONS = {
     "antenna": "Antennas: residuals, and what was found",
     "attitude": "Angles found over time, and their errors where there is a truth",
@@ -67,14 +68,7 @@ def write_page(directory: Path, figures: Figures, motion: Motion | None = None) 
     motion : Motion, optional
         Where the job found one.
     """
-    name = " of ".join(str(figure.value) for figure in figures.of(Section.TITLE))
-    blocks = [
-        f"<h1>magfusion {escape(name)}</h1>",
-        _verdict(figures),
-        _section("Held, and not checked by these data", _unverified(figures)),
-        _section("Logs", "".join(_table(log_rows(f)) for f in figures.of(Section.LOGS))),
-        _section("Main figures", _main(figures)),
-    ]
+    blocks = _head(figures)
     if motion is not None:
         blocks += [
             _section("Path", path_section(motion)),
@@ -95,14 +89,43 @@ def write_page(directory: Path, figures: Figures, motion: Motion | None = None) 
         '<meta http-equiv="Content-Security-Policy" content="default-src \'none\';'
         " img-src data:; style-src 'unsafe-inline'\">"
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(_title(figures, name))}</title><style>{STYLE}</style></head>\n<body>\n"
-        + "\n".join(filter(None, [*blocks, *after]))
-        + "\n</body></html>\n"
+        f"<title>{escape(_title(figures))}</title><style>{STYLE}</style></head>\n"
+        '<body class="page">\n' + "\n".join(filter(None, [*blocks, *after])) + "\n</body></html>\n"
     )
     (directory / PAGE).write_text(text, encoding="utf-8", errors="replace")
 
 
-def _title(figures: Figures, name: str) -> str:
+def head_in_notebook(figures: Figures, unjudged: str = NO_JUDGE) -> str:
+    """Return the head of the page as a part of another one, whose own style it leaves alone.
+
+    Parameters
+    ----------
+    unjudged : str
+        Shown where there is no verdict.
+    """
+    parts = "\n".join(filter(None, _head(figures, unjudged)))
+    # The rules of a style sheet within those of a class are of what lies in elements of it.
+    style = f"<style>.magfusion{{{STYLE}}}</style>"
+    return f'<div class="magfusion">{style}<div class="page">\n{parts}\n</div></div>'
+
+
+def _head(figures: Figures, unjudged: str = NO_JUDGE) -> list[str]:
+    """Return title, verdict and main figures; what is empty has no place."""
+    return [
+        f"<h1>magfusion {escape(_name(figures))}</h1>",
+        _verdict(figures, unjudged),
+        _section("Held, and not checked by these data", _unverified(figures)),
+        _section("Logs", "".join(_table(log_rows(f)) for f in figures.of(Section.LOGS))),
+        _section("Main figures", _main(figures)),
+    ]
+
+
+def _name(figures: Figures) -> str:
+    return " of ".join(str(figure.value) for figure in figures.of(Section.TITLE))
+
+
+def _title(figures: Figures) -> str:
+    name = _name(figures)
     return f"{figures['verdict']}: {name}" if "verdict" in figures else name
 
 
@@ -110,9 +133,9 @@ def _section(heading: str, content: str) -> str:
     return f"<section><h2>{escape(heading)}</h2>\n{content}</section>" if content else ""
 
 
-def _verdict(figures: Figures) -> str:
+def _verdict(figures: Figures, unjudged: str) -> str:
     if "verdict" not in figures:
-        said = "<strong>NO VERDICT</strong><p>This job judges nothing.</p>"
+        said = f"<strong>NO VERDICT</strong><p>{escape(unjudged)}</p>"
         return f'<div class="verdict none">{said}</div>'
     verdict = str(figures["verdict"])
     reasons = [_finding(one) for one in findings(figures, "reasons")]

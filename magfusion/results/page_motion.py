@@ -40,6 +40,13 @@ class Motion:
 
 def path_section(motion: Motion) -> str:
     """Return plan and height."""
+    _, away = _beacons_near(motion)
+    note = f"<p>Outside the plan: {escape(', '.join(away))}.</p>" if away else ""
+    return f"{_charts(path_charts(motion))}{note}"
+
+
+def path_charts(motion: Motion) -> list[Chart]:
+    """Return plan and height, with the truth where there is one."""
     time, position = motion.states.time, _interrupted(motion.states)
     lines = [Line(position[:, 0], position[:, 1], "estimate")]
     upright = [Line(time, position[:, 2], "estimate")]
@@ -48,7 +55,7 @@ def path_section(motion: Motion) -> str:
         path = truth.position_world
         lines.append(Line(path[:, 0], path[:, 1], "truth", "truth"))
         upright.append(Line(truth.time, path[:, 2], "truth", "truth"))
-    beacons, away = _beacons_near(motion)
+    beacons, _ = _beacons_near(motion)
     first = motion.states.position_world[0]
     start = Mark(float(first[0]), float(first[1]), "start", "start")
     plan = Chart("Plan", "x (m)", "y (m)", tuple(lines), marks=(*beacons, start), equal=True)
@@ -60,15 +67,14 @@ def path_section(motion: Motion) -> str:
         room = 0.05 * float(np.ptp(high)) + 3.3 * _most(sigma[:, 2], 95.0) + 1e-3
         limits = (float(high.min()) - room, float(high.max()) + room)
     height = Chart("Height", TIME, "z (m)", tuple(upright), bands, y_limits=limits)
-    note = f"<p>Outside the plan: {escape(', '.join(away))}.</p>" if away else ""
-    return f'<div class="charts">{svg(plan)}{svg(height)}</div>{note}'
+    return [plan, height]
 
 
 def error_section(motion: Motion) -> tuple[str, str]:
     """Return heading and charts of the errors, or of the sigmas where there is no truth."""
     if motion.errors is not None:
-        return "Errors against the truth", _charts([*_of_axes(motion.errors), *_sizes(motion)])
-    charts = _sizes(motion)
+        return "Errors against the truth", _charts([*_of_axes(motion.errors), *size_charts(motion)])
+    charts = size_charts(motion)
     return (
         ("Claimed accuracy (there is no truth to compare with)", _charts(charts))
         if charts
@@ -150,8 +156,8 @@ def _error(title: str, unit: str, time: Array, value: Array, sigma: Array | None
     return Chart(title, TIME, label, (line,), bands, y_limits=limits, width=330, height=200)
 
 
-def _sizes(motion: Motion) -> list[Chart]:
-    """Return size of the error, largest three sigma and protection level on one axis."""
+def size_charts(motion: Motion) -> list[Chart]:
+    """Return a chart each of position and attitude: error, three sigma and protection level."""
     states, errors, trust = motion.states, motion.errors, motion.trust
     if states.pose_cov is None:
         return []

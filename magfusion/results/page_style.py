@@ -1,7 +1,7 @@
 """What pages look like: one style sheet, for screen and paper."""
 
 STYLE = """
-body{margin:0 auto;max-width:1080px;padding:0 20px 40px;background:#fff;color:#1d2530;
+.page{margin:0 auto;max-width:1080px;padding:0 20px 40px;background:#fff;color:#1d2530;
  font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,"DejaVu Sans",sans-serif}
 h1{font-size:22px;margin:24px 0 12px;overflow-wrap:anywhere}
 h2{font-size:17px;margin:34px 0 8px;padding-bottom:4px;border-bottom:1px solid #d7dce3}
@@ -42,5 +42,5 @@ svg .name{fill:#1d2530;font-weight:600;paint-order:stroke;stroke:#fff;stroke-wid
 .expected{stroke:#1a7f37;stroke-dasharray:4 3}
 .beacon{fill:#7b3fb0;stroke:#fff}.start{fill:#1a7f37;stroke:#fff}
 details summary{cursor:pointer;color:#1f5fbf}
-@media print{body{max-width:none}figure,table{break-inside:avoid}}
+@media print{.page{max-width:none}figure,table{break-inside:avoid}}
 """

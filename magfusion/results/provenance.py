@@ -96,12 +96,8 @@ def _sha256(path: Path) -> str:
 
 
 def _version(name: str) -> str:
-    import sys
     from importlib.metadata import PackageNotFoundError, version
 
-    loaded = getattr(sys.modules.get(name), "__version__", None)
-    if isinstance(loaded, str):  # which says the same; what is installed is parsed line by line
-        return loaded
     try:
         return version(name)
     except PackageNotFoundError:

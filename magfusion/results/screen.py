@@ -1,5 +1,6 @@
 """What a user sees of a job's figures: the errors first, then what was found, then warnings."""
 
+from itertools import chain
 from pathlib import Path
 
 from rich.console import Console
@@ -45,9 +46,8 @@ def show(figures: Figures, output: Path | None, console: Console | None = None) 
     for table in tables:
         if table.row_count:
             console.print(table, markup=False)
-    for figure in figures.of(Section.DIRECTIONS):
-        for sentence in sentences(figure):
-            console.print(sentence, soft_wrap=True, markup=False)
+    for sentence in chain.from_iterable(map(sentences, figures.of(Section.DIRECTIONS))):
+        console.print(sentence, soft_wrap=True, markup=False)
     for sentence in notes(figures):
         console.print(f"note: {sentence}", style="yellow", soft_wrap=True, markup=False)
     for figure in figures.all:

@@ -8,13 +8,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.model.arguments import check_arguments
 from magfusion.model.marks import Marks
 from magfusion.model.samples import FieldSamples, Log, Waveform
+from magfusion.model.short_repr import short_repr
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.simulation.disturbance import Ambient, Bending, Spheres, draw_bending, draw_spheres
 from magfusion.simulation.field import Drives, phasors_world, synchronised_drives
-from magfusion.simulation.inertial import BiasInstability, simulate_imu
+from magfusion.simulation.inertial import BiasInstability, SimulatedImu, simulate_imu
 from magfusion.simulation.layers import Layers
 from magfusion.simulation.magnetometers import answered, names_by_channel
 from magfusion.simulation.motion import (
@@ -99,6 +101,8 @@ class SimulationConfig:
         How beacons turn that are magnets on shafts.
     """
 
+    __repr__ = short_repr
+
     box_world: Array
     duration: float = 60.0
     motion: MotionKind = "walk"
@@ -139,6 +143,8 @@ class SimulatedLog:
         With the iron that was drawn.
     """
 
+    __repr__ = short_repr
+
     log: Log
     true_site: Site
     drives: Drives
@@ -159,9 +165,17 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
 
     Raises
     ------
+    TypeError
+        Where the arguments are not a site, a configuration and a generator, in this order.
     InputError
         If the configuration or the site cannot be simulated.
     """
+    check_arguments(
+        "simulate_log",
+        site=(site, Site),
+        config=(config, SimulationConfig),
+        rng=(rng, np.random.Generator),
+    )
     calibration_rng, motion_rng, imu_rng, magnetometer_rng, iron_rng, field_rng = rng.spawn(6)
     declared = with_earth_field(site)
     true_site = perturb_site(declared, calibration_rng) if config.perturb else declared
@@ -207,14 +221,6 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         taken_at = waveform.time + true_site.platform.magnetometer.clock_offset
         angles = recorded_angles(turning, taken_at, shaft_rng)
         rotation = replace(angles, time=waveform.time)
-    stamp = imu.samples.time
-    clock = true_site.platform.imu
-    taken = (1.0 + clock.clock_rate) * stamp + clock.time_offset
-    truth = replace(
-        motion.trajectory(stamp),
-        gyro_bias_body=interpolate(stamp, taken, imu.gyro_bias_body),
-        accel_bias_body=interpolate(stamp, taken, imu.accel_bias_body),
-    )
     reference = None
     if config.reference is not None:
         # Spawned later than those of old, whose draws stay as they were.
@@ -227,12 +233,23 @@ def simulate_log(site: Site, config: SimulationConfig, rng: np.random.Generator)
         source="simulation",
         imu=imu.samples,
         waveform=waveform,
-        truth=truth,
+        truth=_truth(motion, imu, true_site),
         reference=reference,
         waveforms=waveforms,
         rotation=rotation,
     )
     return SimulatedLog(log, true_site, drives, motion, ambient)
+
+
+def _truth(motion: Motion, imu: SimulatedImu, site: Site) -> Trajectory:
+    """Return the true states at the stamps of the inertial samples."""
+    stamp, clock = imu.samples.time, site.platform.imu
+    taken = (1.0 + clock.clock_rate) * stamp + clock.time_offset
+    return replace(
+        motion.trajectory(stamp),
+        gyro_bias_body=interpolate(stamp, taken, imu.gyro_bias_body),
+        accel_bias_body=interpolate(stamp, taken, imu.accel_bias_body),
+    )
 
 
 def _of_each(

@@ -1,15 +1,16 @@
 """The raw magnetometer stream along a true motion."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
 from magfusion.model.marks import Marks
 from magfusion.model.physics.dipole import dipole_field
 from magfusion.model.samples import Waveform
-from magfusion.model.site import Site, Slots
+from magfusion.model.site import Magnetometer, Site, Slots
 from magfusion.simulation.disturbance import Ambient
 from magfusion.simulation.field import Drives, phasors_world
 from magfusion.simulation.magnetometers import answered
@@ -131,15 +132,8 @@ def simulate_waveform(
     field_sensor = world_from_body.inv().apply(field_world) @ magnetometer.body_from_sensor
     measured = field_sensor @ magnetometer.matrix.T + magnetometer.offset
     if magnetometer.response:
-        measured_from_world = (
-            magnetometer.matrix
-            @ magnetometer.body_from_sensor.T
-            @ world_from_body.inv().as_matrix()
-        )
-        for frequency_hz, tone_world in _tones_world(*here):
-            tone = np.einsum("nij,nj->ni", measured_from_world, tone_world)
-            heard = answered(tone[:, None], magnetometer.response, np.array([frequency_hz]))
-            measured += np.real(heard[:, 0])
+        for tone in _answered_tones(magnetometer, world_from_body, _tones_world(*here)):
+            measured += tone
     instrument = rng if own is None else own
     measured += instrument.normal(
         0.0, magnetometer.noise_density * np.sqrt(rate_hz / 2.0), (count, 3)
@@ -148,6 +142,21 @@ def simulate_waveform(
         measured = quantisation * np.round(measured / quantisation)
     measured[:, magnetometer.lacking] = 0.0
     return Waveform(stamps, measured, marks, magnetometer.axes)
+
+
+def _answered_tones(
+    magnetometer: Magnetometer,
+    world_from_body: Rotation,
+    tones: Iterable[tuple[float, ComplexArray]],
+) -> Iterator[Array]:
+    """Yield what a magnetometer with a response shows of tones, each with its frequency (Hz)."""
+    measured_from_world = (
+        magnetometer.matrix @ magnetometer.body_from_sensor.T @ world_from_body.inv().as_matrix()
+    )
+    for frequency_hz, tone_world in tones:
+        tone = np.einsum("nij,nj->ni", measured_from_world, tone_world)
+        heard = answered(tone[:, None], magnetometer.response, np.array([frequency_hz]))
+        yield np.real(heard[:, 0])
 
 
 def _check_tones(site: Site, rate_hz: float, marks: Marks | None, drives: Drives) -> None:

@@ -38,11 +38,14 @@ from magfusion.estimation.posterior.noise_tuning import (
 from magfusion.estimation.snapshot.survey_error import survey_response
 from magfusion.estimation.solve.bordered import Optimised, optimise
 from magfusion.estimation.solve.memory import give_back_memory
+from magfusion.model.arguments import check_arguments
 from magfusion.model.parameters import Block, Calibration, placed
 from magfusion.model.progress import Report, quiet
 from magfusion.model.samples import FieldSamples, Log
+from magfusion.model.short_repr import one_line
 from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Trust
 from magfusion.model.without_imu import logged, require_motion_prior
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -106,6 +109,12 @@ class Smoothed:
         Amplitudes that the last pass left out, since their sign was open.
     standing : bool ndarray, shape (states,)
         Where the platform stands.
+    log_name : str
+        Of the log.
+    epoch_ns : int
+        Zero of the log's clock.
+    trust : Trust, optional
+        Once `magfusion.estimation.integrity.judge.judged` has judged it.
     """
 
     states: Trajectory
@@ -137,6 +146,16 @@ class Smoothed:
     field_errors: tuple[Block, ...] = ()
     calibration_response: Array = field(default_factory=lambda: np.zeros((0, 0)))
     standing: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    log_name: str = ""
+    epoch_ns: int = 0
+    trust: Trust | None = None
+
+    def __repr__(self) -> str:
+        time, beacons = self.states.time, len(self.calibration.site.beacons)
+        span = f"{time[0]:g} to {time[-1]:g} s" if len(time) else "no time"
+        parts = [f"log {self.log_name!r}", f"{len(time)} states", span, f"{beacons} beacons"]
+        parts.append("not judged" if self.trust is None else str(self.trust.verdict))
+        return one_line(type(self).__name__, parts)
 
     @property
     def uncertain(self) -> tuple[Block, ...]:
@@ -164,11 +183,14 @@ def smooth(
 
     Raises
     ------
+    TypeError
+        Where the arguments are not a log and a site, in this order.
     InputError
         Where the log holds nothing usable.
     EstimationError
         Where the graph cannot be solved.
     """
+    check_arguments("smooth", log=(log, Log), site=(site, Site))
     settings = SmootherSettings() if settings is None else settings
     log, site = logged(log, site)
     require_motion_prior(site)
@@ -182,7 +204,8 @@ def smooth(
         check_earth(site)
     log, site = heard_site(log, site, settings.lockin)
     known = mended(log, site)
-    return _solved(prepared(known, site, settings, report), settings, report, passes)
+    found = _solved(prepared(known, site, settings, report), settings, report, passes)
+    return replace(found, log_name=log.name, epoch_ns=log.epoch_ns)
 
 
 def _solved(

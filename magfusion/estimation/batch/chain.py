@@ -10,6 +10,7 @@ from magfusion.model.channel_effects import of_all_sensors
 from magfusion.model.parameters import Calibration
 from magfusion.model.quaternion import inverse, matrices, product
 from magfusion.model.samples import ImuSamples
+from magfusion.model.short_repr import short_repr
 from magfusion.model.site import Site
 from magfusion.model.strapdown import mean_about, turn_from_gyro_at
 from magfusion.model.trajectory import Trajectory
@@ -40,6 +41,8 @@ class Start:
     leaps : int
         Steps between hypotheses that no motion joins.
     """
+
+    __repr__ = short_repr
 
     states: Trajectory
     phase: Array

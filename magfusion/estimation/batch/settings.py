@@ -11,6 +11,7 @@ from magfusion.model.parameters import (
     considered_blocks,
     of_phasors,
 )
+from magfusion.model.short_repr import short_repr
 from magfusion.model.site import Site
 from magfusion.receiver.windows import LockinSettings
 from magfusion.units import Array
@@ -64,6 +65,8 @@ class SmootherSettings(EstimatorSettings):
     measurements : tuple of (ndarray, Measurement)
         Anything else that was measured, with the times of its rows (s), at which states are made.
     """
+
+    __repr__ = short_repr
 
     coupling: str = "tight"
     loss: str | None = "cauchy"

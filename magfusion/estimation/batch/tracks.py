@@ -2,6 +2,7 @@
 
 Tangent of a track: rotation (body axes, right perturbation), position and velocity (world),
 accelerometer and gyro bias, then phase and rate of phase of every tone whose drive is not known.
+All are updated in the same calls: a `PartialUpdateFilter` each takes 2.6 times as long (12 tracks).
 """
 
 from dataclasses import dataclass, replace

@@ -60,12 +60,9 @@ def without_silent(log: Log, site: Site) -> tuple[Log, Site]:
     """
     if not site.platform.further or log.fields is None:
         return log, site
-    heard = above_noise(log.fields, DETECTION_CHI_SQUARE_ONLINE)
     sensors = site.platform.magnetometers
-    mine = [site.of_sensor(k) for k in range(len(sensors))]
-    there = [int(np.sum(np.any(log.fields.valid[:, own], axis=1))) for own in mine]
-    share = [float(np.mean(np.any(heard[:, own], axis=1))) for own in mine]
-    silent = [k for k, n in enumerate(there) if share[k] == 0.0 and (n == 0 or n >= FEWEST)]
+    there = _silent_epochs(log.fields, site)
+    silent = [k for k, n in there.items() if n == 0 or n >= FEWEST]
     if not silent or len(silent) == len(sensors):
         return log, site
     noticed = [
@@ -79,3 +76,14 @@ def without_silent(log: Log, site: Site) -> tuple[Log, Site]:
     kept = [k for k in range(len(sensors)) if k not in silent]
     log, site = _only(log, site, kept)
     return replace(log, noticed=(*log.noticed, *noticed)), site
+
+
+def _silent_epochs(fields: FieldSamples, site: Site) -> dict[int, int]:
+    """Return the magnetometers that detect nothing at all, with how many epochs each has."""
+    heard = above_noise(fields, DETECTION_CHI_SQUARE_ONLINE)
+    mine = {k: site.of_sensor(k) for k in range(len(site.platform.magnetometers))}
+    return {
+        k: int(np.sum(np.any(fields.valid[:, own], axis=1)))
+        for k, own in mine.items()
+        if not np.any(heard[:, own])
+    }

@@ -1,6 +1,6 @@
 """What the raw streams of a log say against it, whatever is made of them."""
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -90,13 +90,25 @@ def recorded(
         if site is not None and log.vectors is not None:
             found += iron_on_body(still_means(log, site, IRON_SPAN), site)
     if beacons and site is not None and site.beacons:
-        found += [f for f in undeclared_lines(log, site, lockin) if _matters(f)]
-        found += long_windows(site, lockin) if log.waveform is not None or log.waveforms else ()
-        hearing = heard_in(log, site) if hearing is None else hearing
-        if hearing is not None and freed is not None:
-            hearing = heard_with_motion(hearing, freed)
-        found += [] if hearing is None else unheard(hearing, site)
+        found += _of_beacons(log, site, hearing, lockin, freed)
     return tuple(replace(f, verdict=Verdict.TRUSTWORTHY) if f.code in bridged else f for f in found)
+
+
+def _of_beacons(
+    log: Log,
+    site: Site,
+    hearing: Heard | None,
+    lockin: LockinSettings | None,
+    freed: Detected | None,
+) -> Iterator[Finding]:
+    """Yield how each beacon is heard, and what else transmits; parameters as of `recorded`."""
+    yield from filter(_matters, undeclared_lines(log, site, lockin))
+    if log.waveform is not None or log.waveforms:
+        yield from long_windows(site, lockin)
+    hearing = heard_in(log, site) if hearing is None else hearing
+    if hearing is None:
+        return
+    yield from unheard(hearing if freed is None else heard_with_motion(hearing, freed), site)
 
 
 def _matters(line: Finding) -> bool:

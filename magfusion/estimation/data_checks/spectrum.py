@@ -15,7 +15,7 @@ from scipy.ndimage import median_filter
 from magfusion.errors import InputError
 from magfusion.estimation.data_checks.turning import field_body
 from magfusion.model.quaternion import turned
-from magfusion.model.samples import ImuSamples, Log
+from magfusion.model.samples import ImuSamples, Log, Waveform
 from magfusion.model.site import Site
 from magfusion.model.strapdown import turn_at, turn_from_gyro
 from magfusion.model.trust import Finding, Verdict
@@ -222,32 +222,60 @@ def beside_lines(log: Log, site: Site, lockin: LockinSettings | None) -> LockinS
     wave = log.waveform
     if wave is None or len(wave) < 2 or has_schedule(site) or not site.beacons:
         return lockin
-    end = float(wave.time[0]) + BEGINNING
-    few, first = wave.time < end, log.imu.time < end
-    imu = ImuSamples(log.imu.time[first], log.imu.gyro_body[first], log.imu.accel_body[first])
-    wave = wave.rows(few)
-    found = spectrum(replace(log, waveform=wave, imu=imu), site)
-    try:
-        settings = usual_lockin(site) if lockin is None else lockin
-    except InputError:
-        return lockin
+    found = spectrum(_until(log, wave, float(wave.time[0]) + BEGINNING), site)
     if found is None:
         return lockin
-    tones = np.array([f for _, f in _tones(site)])
-    chosen: list[float] = []
+    try:
+        settings = lockin or usual_lockin(site)
+    except InputError:
+        return lockin
+    _, tones = map(np.array, zip(*_tones(site), strict=True))
+    chosen: tuple[float, ...] = ()
     for line in undeclared(found, site):
-        apart = float(np.min(np.abs(line.frequency_hz - np.array([*tones, *chosen]))))
-        needed = SEPARATED / apart if lockin else 2.0 / apart
-        most = settings.window if lockin else LONGER * usual_lockin(site).window
-        if _consequence(found, line, site, settings)[0] <= CONSEQUENCE or needed > most:
+        if len(chosen) == MOST_FITTED:
+            break
+        if _consequence(found, line, site, settings)[0] <= CONSEQUENCE:
             continue
-        longer = max(settings.window, needed)
-        step = settings.step if lockin else longer / 2.0
-        lines_hz = (*chosen, line.frequency_hz)
-        trial = replace(settings, window=longer, step=step, lines_hz=lines_hz)
-        if len(chosen) < MOST_FITTED and separable(1.0 / found.rate_hz, trial, tones):
-            settings, chosen = trial, [*lines_hz]
+        others = np.array([*tones, *chosen])
+        asked = lockin is not None
+        trial = _fitting(line.frequency_hz, others, site, settings, chosen, asked=asked)
+        if trial is not None and separable(1.0 / found.rate_hz, trial, tones):
+            settings, chosen = trial, trial.lines_hz
     return settings if chosen else lockin
+
+
+def _until(log: Log, wave: Waveform, end: float) -> Log:
+    """Return the waveform and the inertial samples of a log up to a time."""
+    first = log.imu.time < end
+    imu = ImuSamples(log.imu.time[first], log.imu.gyro_body[first], log.imu.accel_body[first])
+    return replace(log, waveform=wave.rows(wave.time < end), imu=imu)
+
+
+def _fitting(
+    line_hz: float,
+    others_hz: Array,
+    site: Site,
+    settings: LockinSettings,
+    chosen: tuple[float, ...],
+    *,
+    asked: bool,
+) -> LockinSettings | None:
+    """Return settings that fit one more line, where a window can be long enough to part it.
+
+    Parameters
+    ----------
+    others_hz : ndarray
+        Tones, and lines that are fitted already.
+    asked : bool
+        Whether the window was asked for, and stays.
+    """
+    apart = float(np.min(np.abs(line_hz - others_hz)))
+    needed = (SEPARATED if asked else 2.0) / apart
+    if needed > (settings.window if asked else LONGER * usual_lockin(site).window):
+        return None
+    longer = max(settings.window, needed)
+    step = settings.step if asked else longer / 2.0
+    return replace(settings, window=longer, step=step, lines_hz=(*chosen, line_hz))
 
 
 def undeclared_lines(
@@ -289,11 +317,10 @@ def judged_lines(found: Spectrum, site: Site, settings: LockinSettings) -> Itera
     for group, verdict in ((doubtful, Verdict.DOUBTFUL), (seen, Verdict.TRUSTWORTHY)):
         if not group:
             continue
-        worst = max(one[0] for one in group)
         named = [_named(line, site, found, settings) for _, line, _ in group]
         more = f" and {len(named) - LISTED} more" if len(named) > LISTED else ""
         only_mains = all(mains_of(line.frequency_hz, found.rate_hz) for _, line, _ in group)
-        most = max(group, key=lambda one: one[0])[2]
+        worst, _, most = max(group, key=lambda one: one[0])
         yield Finding(
             "mains" if only_mains else "undeclared_line",
             f"magnetometer: undeclared lines: {'; '.join(named[:LISTED])}{more}. {most}",
@@ -342,11 +369,9 @@ def _named(line: Line, site: Site, found: Spectrum, settings: LockinSettings) ->
             )
         if near:
             return f"{size}, a neighbour of beacon {name} ({tone:g} Hz)"
-        for order in range(2, HARMONICS + 1):
-            at = aliased(order * tone, found.rate_hz)
-            weak = line.amplitude < 0.3 * found.amplitude(tone)
-            if abs(line.frequency_hz - at) < TELLABLE * found.resolution_hz and weak and not mains:
-                return f"{size}, {order} times the tone of beacon {name}: its drive is distorted"
+        harmonic = None if mains else _order_of(line, tone, found)
+        if harmonic is not None:
+            return f"{size}, {harmonic} times the tone of beacon {name}: its drive is distorted"
     if mains is not None:
         base, order = mains
         which = f"mains of {base:g} Hz" if order == 1 else f"{order} times mains of {base:g} Hz"
@@ -355,3 +380,14 @@ def _named(line: Line, site: Site, found: Spectrum, settings: LockinSettings) ->
     if line.amplitude > 0.1 * strongest:
         return f"{size}, as strong as a beacon"
     return size
+
+
+def _order_of(line: Line, tone: float, found: Spectrum) -> int | None:
+    """Return which harmonic of a tone a weaker line is, if it is one."""
+    if line.amplitude >= 0.3 * found.amplitude(tone):
+        return None
+    for order in range(2, HARMONICS + 1):
+        at = aliased(order * tone, found.rate_hz)
+        if abs(line.frequency_hz - at) < TELLABLE * found.resolution_hz:
+            return order
+    return None

@@ -74,14 +74,7 @@ def joint_phasors(
     assert states.velocity_world is not None
     site, n = calibration.site, len(windows)
     seen, tones, shown = _seen(designs, windows, time, left_sensor, imu, site)
-    known = shown if noise is None else np.concatenate([noise, shown])
-    if noise is None:
-        settings = designs.settings
-        smooth = smoothed_over_windows(
-            known[:, None], windows.centre, settings.step, settings.noise_windows, None
-        )[:, 0]
-    else:
-        smooth = np.mean(known, axis=0, keepdims=True)
+    smooth = _averaged(shown, noise, windows, designs)
     nyquist_hz = 0.5 / float(np.median(np.diff(time)))
     declared = site.platform.magnetometer.noise_density * float(np.sqrt(nyquist_hz))
     smooth = not_below(smooth, declared)
@@ -108,6 +101,17 @@ def joint_phasors(
     at_centre = value.reshape(n, elapsed.shape[1], *felt.shape[1:], 6)[:, len(NODES) // 2]
     whitening = _whitening(site, states, at_centre, found, smooth, alike)
     return replace(found, whitening=whitening), shown
+
+
+def _averaged(shown: Array, noise: Array | None, windows: Windows, designs: JointDesigns) -> Array:
+    """Return the noise of windows, averaged with that of others; as `joint_phasors` has them."""
+    if noise is not None:
+        return np.asarray(np.mean(np.concatenate([noise, shown]), axis=0, keepdims=True))
+    settings = designs.settings
+    smooth = smoothed_over_windows(
+        shown[:, None], windows.centre, settings.step, settings.noise_windows, None
+    )
+    return smooth[:, 0]
 
 
 def _at_nodes(nodes: Trajectory, states: Trajectory, site: Site) -> tuple[Array, Array]:

@@ -30,6 +30,7 @@ from magfusion.model.parameters import (
     retract,
 )
 from magfusion.model.prior import prior_sqrt_information
+from magfusion.model.short_repr import short_repr
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array
 
@@ -52,6 +53,8 @@ class Estimate:
     segments : tuple of Calibration
         Of every segment; empty where all have the same.
     """
+
+    __repr__ = short_repr
 
     values: gtsam.Values
     calibration: Calibration
@@ -84,6 +87,8 @@ class Graph:
     shift : PriorShift, optional
         What else is uncertain does this to the mean of the prior, where other logs made it.
     """
+
+    __repr__ = short_repr
 
     native: gtsam.NonlinearFactorGraph
     measurements: tuple[Measurement, ...]

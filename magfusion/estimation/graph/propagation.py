@@ -8,7 +8,6 @@ import numpy as np
 from magfusion.estimation.graph.imu_decimation import thinned
 from magfusion.estimation.graph.inertial import (
     Link,
-    Preintegrated,
     Steps,
     inertial_factor,
     links_between,
@@ -95,9 +94,6 @@ def propagate(
             increments = replace(increments, bridged=np.ones_like(increments.bridged))
         return Steps(thinned(increments, accel[None], gyro[None]), accel, gyro)
 
-    def predicted(measurement: Preintegrated) -> gtsam.NavState:
-        return measurement.predict(before, bias)
-
     def values(after: gtsam.NavState) -> gtsam.Values:
         both = before, after
         velocities = [at.velocity() for at in both]
@@ -110,25 +106,13 @@ def propagate(
         ],
         state.calibration,
         blocks,
-        lambda found: values(predicted(found[0])),
+        lambda found: values(found[0].predict(before, bias)),
     )
-    after = predicted(link.measurement)
-    factor = inertial_factor(0, link.measurement)
-    rows, _ = factor.linearize(values(after)).jacobian()
-    root = np.linalg.inv(rows[:, _AFTER])
-    transition = np.eye(len(state.cov))
-    transition[:MOTION, :MOTION] = -root @ rows[:, _BEFORE]
-    if link.by_calibration is not None:
-        transition[:MOTION, MOTION:] = -root @ link.by_calibration
-    noise = np.zeros_like(state.cov)
-    noise[:MOTION, :MOTION] = root @ root.T
+    after = link.measurement.predict(before, bias)
+    transition, noise = _linearized(link, values(after), len(state.cov))
     if process_noise is not None:
         noise[MOTION:, MOTION:] = process_noise.cov(state.calibration, time, time - state.time)
-    cov, motion = state.cov.copy(), transition[:MOTION]
-    across = motion @ state.cov
-    cov[:MOTION, :MOTION] = across @ motion.T
-    cov[:MOTION, MOTION:], cov[MOTION:, :MOTION] = across[:, MOTION:], across[:, MOTION:].T
-    cov += noise
+    cov = _moved_cov(state.cov, transition[:MOTION]) + noise
     pose = after.pose()
     later = replace(
         state,
@@ -140,3 +124,23 @@ def propagate(
     )
     bridged = bool(own.increments.bridged[0])
     return Propagated(later, replace(link, steps=own), bridged, transition, noise)
+
+
+def _linearized(link: Link, values: gtsam.Values, size: int) -> tuple[Array, Array]:
+    """Return transition and noise of a step of the motion, shape (size, size) each."""
+    rows, _ = inertial_factor(0, link.measurement).linearize(values).jacobian()
+    root = np.linalg.inv(rows[:, _AFTER])
+    transition, noise = np.eye(size), np.zeros((size, size))
+    transition[:MOTION, :MOTION] = -root @ rows[:, _BEFORE]
+    if link.by_calibration is not None:
+        transition[:MOTION, MOTION:] = -root @ link.by_calibration
+    noise[:MOTION, :MOTION] = root @ root.T
+    return transition, noise
+
+
+def _moved_cov(cov: Array, motion: Array) -> Array:
+    """Return a covariance after a step of the motion (15, size); the calibration stays."""
+    out, across = cov.copy(), motion @ cov
+    out[:MOTION, :MOTION] = across @ motion.T
+    out[:MOTION, MOTION:], out[MOTION:, :MOTION] = across[:, MOTION:], across[:, MOTION:].T
+    return out

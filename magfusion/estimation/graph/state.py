@@ -13,7 +13,8 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from magfusion.model.parameters import Block, Calibration, difference, retract
-from magfusion.model.trajectory import Trajectory
+from magfusion.model.short_repr import short_repr
+from magfusion.model.trajectory import PoseAccess, Trajectory
 from magfusion.units import Array, IntArray
 
 MOTION = 15
@@ -22,7 +23,7 @@ ACCEL_BIAS, GYRO_BIAS = slice(9, 12), slice(12, 15)
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class State(PoseAccess):
     """Motion and calibration at one time.
 
     Parameters
@@ -36,6 +37,8 @@ class State:
         (m/s^2, rad/s)
     cov : ndarray, shape (15 + calibration, 15 + calibration)
     """
+
+    __repr__ = short_repr
 
     time: float
     world_from_body: Array
@@ -130,27 +133,6 @@ def between(reference: State, state: State, blocks: tuple[Block, ...]) -> Array:
             difference(reference.calibration, state.calibration, blocks),
         ]
     )
-
-
-def consider_update(step: Array, cov: Array, prior_cov: Array, number: int) -> tuple[Array, Array]:
-    """Return step and covariance that learn nothing of the last parameters (Schmidt's filter).
-
-    What is known well enough is not estimated, but what it may be wrong by stays in the covariance
-    of all else, as long as the estimator runs.
-
-    Parameters
-    ----------
-    step : ndarray, shape (n,)
-    cov, prior_cov : ndarray, shape (n, n)
-        After the measurement, and of the considered parameters.
-    number : int
-        Of them.
-    """
-    if number:
-        step, cov = step.copy(), cov.copy()
-        step[-number:] = 0.0
-        cov[-number:, -number:] = prior_cov[-number:, -number:]
-    return step, cov
 
 
 @dataclass(frozen=True, eq=False)

@@ -111,22 +111,12 @@ def first_look(log: Log, site: Site | None, lockin: LockinSettings | None = None
         samples = FieldSamples.empty(site.channels)
     hearing = heard_in(log, site, lockin)
     if found is not None and not has_schedule(site):
-        settings = beside_lines(log, site, lockin) or usual_lockin(site)
-        harmless = judged_lines(found, site, settings)
-        # What `recorded` says below is not said twice.
-        findings += [
-            line
-            for line in harmless
-            if line.verdict is Verdict.TRUSTWORTHY and line.code != "fitted_line"
-        ]
+        findings += _harmless_lines(found, log, site, lockin)
     fixes = _fixed(log, site, samples, look[1].time)
     poses = None
     if fixes is not None:
         findings += findings_of_fit(fixes)
-        sure = (fixes.probability[:, 0] > SURE) & fixes.determined[:, 0]
-        best = fixes.best()
-        poses = Trajectory(best.time[sure], best.world_from_body[sure], best.position_world[sure])
-        poses = poses if len(poses) and not findings_of_fit(fixes) else None
+        poses = _sure_poses(fixes)
     if many and hearing is not None:
         hearing = within_reach(hearing, site, poses)
     findings += recorded(log, site, COPED, poses, beacons=True, hearing=hearing)
@@ -134,6 +124,27 @@ def first_look(log: Log, site: Site | None, lockin: LockinSettings | None = None
     if trust.reasons and trust.reasons[0].code in SYMPTOMS:
         trust = with_cause(trust, log, site, lockin)
     return Look(trust, *look, hearing, found, seen, fixes, depths_of(samples, site))
+
+
+def _harmless_lines(
+    found: Spectrum, log: Log, site: Site, lockin: LockinSettings | None
+) -> list[Finding]:
+    """Return the lines that harm nothing; the others `recorded` tells of."""
+    settings = beside_lines(log, site, lockin) or usual_lockin(site)
+    return [
+        line
+        for line in judged_lines(found, site, settings)
+        if line.verdict is Verdict.TRUSTWORTHY and line.code != "fitted_line"
+    ]
+
+
+def _sure_poses(fixes: Fixes) -> Trajectory | None:
+    """Return the fixes that are decided, where all of them fit."""
+    sure = (fixes.probability[:, 0] > SURE) & fixes.determined[:, 0]
+    if not np.any(sure) or findings_of_fit(fixes):
+        return None
+    best = fixes.best()
+    return Trajectory(best.time[sure], best.world_from_body[sure], best.position_world[sure])
 
 
 def _promoted(findings: list[Finding]) -> list[Finding]:

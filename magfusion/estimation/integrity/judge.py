@@ -6,7 +6,7 @@ and is not said beside it; the covariance takes what all of them say.
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from magfusion.estimation.integrity.smoothed_compass import compass
 from magfusion.estimation.integrity.testimony import NOTHING, Case, Testimony
 from magfusion.estimation.posterior.tuned_noise import tuned_noise
 from magfusion.estimation.solve.memory import give_back_memory
+from magfusion.model.arguments import check_arguments
 from magfusion.model.samples import Log
 from magfusion.model.trust import Trust, Verdict
 from magfusion.model.without_imu import logged
@@ -41,27 +42,36 @@ FEW = 2  # causes at once
 STRONGER = 1.5  # than a trace is what leaves it
 
 
-class Judged(NamedTuple):
+R = TypeVar("R", bound=Smoothed)
+
+
+class Judged(NamedTuple, Generic[R]):
     """A result with a covariance that its witnesses allow, what they say, and what is held."""
 
-    result: Smoothed
+    result: R
     trust: Trust
     score: Score | None
 
 
-def judged(result: Smoothed, log: Log) -> tuple[Smoothed, Trust]:
+def judged(result: R, log: Log) -> tuple[R, Trust]:
     """Return a result with a covariance that its witnesses allow, and what they say.
 
     Parameters
     ----------
     log : Log
         Of which the result is: its raw streams are witnesses too.
+
+    Raises
+    ------
+    TypeError
+        Where the arguments are not a result and a log, in this order.
     """
+    check_arguments("judged", result=(result, Smoothed), log=(log, Log))
     found = judged_with_score(result, log)
     return found.result, found.trust
 
 
-def judged_with_score(result: Smoothed, log: Log) -> Judged:
+def judged_with_score(result: R, log: Log) -> Judged[R]:
     """Return the same, with the score of everything that the result holds."""
     log, _ = logged(log, result.declared.site)
     alone = result.earth_residual is None
@@ -73,7 +83,7 @@ def judged_with_score(result: Smoothed, log: Log) -> Judged:
     give_back_memory()
     pose_cov = result.states.pose_cov
     if pose_cov is None:
-        return Judged(result, trust, None)
+        return Judged(replace(result, trust=trust), trust, None)
     at = result.states
     place = of_place(result.declared.site, at.time, at.world_from_body, at.position_world, pose_cov)
     trust |= Trust(place)
@@ -86,7 +96,7 @@ def judged_with_score(result: Smoothed, log: Log) -> Judged:
         factor = factor if said.factor is None else np.maximum(factor, said.factor)
         spread = spread if said.spread is None else spread + said.spread
     widened = replace(result.states, pose_cov=factor[:, None, None] * pose_cov + spread)
-    return Judged(replace(result, states=widened), trust, score)
+    return Judged(replace(result, states=widened, trust=trust), trust, score)
 
 
 def _heard(case: Case) -> Iterator[Testimony]:

@@ -60,24 +60,28 @@ def agreement(
     first = [_distance(shared, logs, pool, i, joint) for i in pool]
     found = dict(zip(pool, first, strict=True))
     while len(pool) > 1:
-        tests = [test for i in pool for test in found[i].tests]
-        speaks = holm([log_p for _, _, log_p in tests], WITNESS_BUDGET)
-        loud = [s and t[0] > TOLERATED * t[1] for t, s in zip(tests, speaks, strict=True)]
-        each = len(found[pool[0]].tests)
-        said = {i: loud[k * each : (k + 1) * each] for k, i in enumerate(pool)}
-        if not any(loud):
+        ratios = _contradictions(found)
+        if not ratios:
             break
-        worst = min((i for i in pool if any(said[i])), key=lambda i: _least(found[i]))
-        ratios = [
-            t[0] / t[1] for t, yes in zip(found[worst].tests, said[worst], strict=True) if yes
-        ]
-        excess = max(excess, *ratios)
+        worst = min(ratios, key=lambda i: _least(found[i]))
+        excess = max(excess, *ratios[worst])
         other = [names[i] for i in pool if i != worst]
         findings[worst] = (_finding(shared, names[worst], other, found[worst]),)
         pool.remove(worst)
         found = {i: _distance(shared, logs, pool, i, joint) for i in pool}
     far = np.array([float(sigmas(one.tests[-1][2])) for one in first])
     return Agreement(tuple(findings), excess, far)
+
+
+def _contradictions(found: dict[int, _Distance]) -> dict[int, list[float]]:
+    """Return of each log that contradicts the others by how much its chi squares are too large."""
+    tests = [(i, test) for i, one in found.items() for test in one.tests]
+    speaks = holm([log_p for _, (_, _, log_p) in tests], WITNESS_BUDGET)
+    out: dict[int, list[float]] = {}
+    for (i, (square, freedom, _)), yes in zip(tests, speaks, strict=True):
+        if yes and square > TOLERATED * freedom:
+            out.setdefault(i, []).append(square / freedom)
+    return out
 
 
 def _least(one: _Distance) -> float:

@@ -165,21 +165,19 @@ def changed(case: Case) -> Testimony:
         return NOTHING
     every = wide.held
     information, gradient = wide.with_declared()
-    asked = [
-        Change(suspect, at)
-        for at, part in zip(parts, _again(every, list(parts.values())), strict=True)
-        for suspect in _suspects(part, dimension(every))
+    known = [
+        (one, found.log_p)
+        for one in _changes(parts, every)
+        if (found := told_of(one.suspect, information, gradient)) is not None
     ]
-    told = [(one, told_of(one.suspect, information, gradient)) for one in asked]
-    known = [(one, found.log_p) for one, found in told if found is not None]
     speaks = holm([log_p for _, log_p in known], BUDGET)
     if not np.any(speaks):
         return NOTHING
     wide = answered(result, wide, case.log.imu)
     freed = [
-        (one, found)
+        (one, cause)
         for one, _ in known
-        if (found := freed_by(case.pose_cov, wide, one.suspect, information, gradient)) is not None
+        if (cause := freed_by(case.pose_cov, wide, one.suspect, information, gradient)) is not None
     ]
     likely = [
         pair
@@ -194,6 +192,15 @@ def changed(case: Case) -> Testimony:
     moved = cause.moved[:, :, None] * cause.moved[:, None, :]
     sure = wide.by_pose @ cause.known_cov @ np.swapaxes(wide.by_pose, 1, 2)
     return Testimony((_finding(change, cause, prior_sigma(every)),), spread=moved + sure)
+
+
+def _changes(parts: dict[float, list[Block]], every: tuple[Block, ...]) -> list[Change]:
+    """Return what may have changed at each of some times, as columns behind those held."""
+    return [
+        Change(suspect, at)
+        for at, part in zip(parts, _again(every, list(parts.values())), strict=True)
+        for suspect in _suspects(part, dimension(every))
+    ]
 
 
 def _throughout(case: Case, information: Array, gradient: Array) -> float:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.data_checks.statistics import (
     WITNESS_BUDGET,
     holm,
@@ -24,42 +25,59 @@ def calibration_change(case: Case) -> Testimony:
     result = case.result
     if not result.blocks:
         return NOTHING
+    change, cov = _change_of(result)
+    of_kind: dict[Parameter, list[Block]] = {}
+    for block in result.blocks:
+        of_kind.setdefault(block.parameter, []).append(block)
+    joint = {kind: distance(change, cov, blocks) for kind, blocks in of_kind.items()}
+    whole = distance(change, cov, list(result.blocks))
+    # Of each block, of each kind of parameter, and of all.
+    tests = [(block.parameter, distance(change, cov, [block])) for block in result.blocks]
+    excess = _too_far([*tests, *joint.items(), (None, whole)])
+    if not excess:
+        return NOTHING
+    findings = [
+        _finding(kind, blocks, *joint[kind], change)
+        for kind, blocks in of_kind.items()
+        if kind in excess
+    ]
+    factor = np.full(len(case.pose_cov), max(excess.values()))
+    return Testimony(tuple(findings or [_of_all(*whole)]), factor=factor)
+
+
+def _too_far(
+    tests: list[tuple[Parameter | None, tuple[float, int, float]]],
+) -> dict[Parameter | None, float]:
+    """Return the kinds of parameter of tests that fail, with the largest chi square per freedom."""
+    speaks = holm([log_p for _, (_, _, log_p) in tests], WITNESS_BUDGET)
+    excess: dict[Parameter | None, float] = {}
+    for (kind, (square, freedom, _)), yes in zip(tests, speaks, strict=True):
+        if yes and square > TOLERATED * freedom:
+            excess[kind] = max(square / freedom, excess.get(kind, 0.0))
+    return excess
+
+
+def _change_of(result: Smoothed) -> tuple[Array, Array]:
+    """Return by how much the calibration moved, in declared sigmas, and the covariance of that."""
     spread = prior_sqrt_covariance(result.declared.site, result.blocks)
     change = difference(result.declared, result.calibration, result.blocks)
     cov = spread @ spread.T - result.calibration_cov
     moved = result.calibration_response  # what is not estimated disturbs the change as well
     cov = cov + 2.0 * moved @ moved.T
     scale = np.sqrt(np.diagonal(spread @ spread.T))
-    change, cov = change / scale, cov / scale[:, None] / scale
-    tests = [distance(change, cov, [block]) for block in result.blocks]
-    kinds = list(dict.fromkeys(block.parameter for block in result.blocks))
-    of_kind = {kind: [b for b in result.blocks if b.parameter == kind] for kind in kinds}
-    joint = {kind: distance(change, cov, blocks) for kind, blocks in of_kind.items()}
-    whole = distance(change, cov, list(result.blocks))
-    every = [*tests, *joint.values(), whole]
-    speaks = holm([log_p for _, _, log_p in every], WITNESS_BUDGET)
-    said = [(t, yes and t[0] > TOLERATED * t[1]) for t, yes in zip(every, speaks, strict=True)]
-    if not any(yes for _, yes in said):
-        return NOTHING
-    excess = max(square / freedom for (square, freedom, _), yes in said if yes)
-    speaking = {b.parameter for b, (_, yes) in zip(result.blocks, said, strict=False) if yes}
-    speaking |= {k for k, (_, yes) in zip(kinds, said[len(tests) :], strict=False) if yes}
-    findings = [
-        _finding(kind, of_kind[kind], *joint[kind], change) for kind in kinds if kind in speaking
-    ]
-    if not findings:
-        square, freedom, log_p = whole
-        findings = [
-            Finding(
-                "prior",
-                "All together, the calibration moved farther from its declared values than their"
-                f" sigmas allow: a chi square of {square:.3g} on {freedom}. Declare sigmas that are"
-                f" {np.sqrt(square / freedom):.2g} times as large.",
-                Verdict.DOUBTFUL,
-                float(sigmas(log_p)),
-            )
-        ]
-    return Testimony(tuple(findings), factor=np.full(len(case.pose_cov), excess))
+    return change / scale, cov / scale[:, None] / scale
+
+
+def _of_all(square: float, freedom: int, log_p: float) -> Finding:
+    """Return that the calibration moved too far, though no kind of parameter alone did."""
+    return Finding(
+        "prior",
+        "All together, the calibration moved farther from its declared values than their"
+        f" sigmas allow: a chi square of {square:.3g} on {freedom}. Declare sigmas that are"
+        f" {np.sqrt(square / freedom):.2g} times as large.",
+        Verdict.DOUBTFUL,
+        float(sigmas(log_p)),
+    )
 
 
 def distance(change: Array, cov: Array, blocks: list[Block]) -> tuple[float, int, float]:

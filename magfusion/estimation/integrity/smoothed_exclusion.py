@@ -57,23 +57,8 @@ def separated_smooth(result: Smoothed, risk: Risk | None = None) -> SeparatedSmo
     found = separate_smoothed(result)
     if found is None or result.states.pose_cov is None:
         return _without_level(result)
-    out = np.zeros((len(result.fields.time), len(names)), dtype=bool)
     first = found
-    for _ in range(ROUNDS):
-        # What is significant is looked for, whether or not it is covered.
-        before = float(np.max(found.excess(risk)))
-        if before <= 1.0:
-            break
-        beacon = int(np.argmin(np.mean(found.cost + 2.0 * found.rows, axis=0)))
-        false = _false_stretches(result, found, beacon)
-        if not np.any(false & ~out[:, beacon]) or np.mean(false) > MOST_FALSE:
-            break
-        trial = _resolved(result, names[beacon], false)
-        again = None if trial is None else separate_smoothed(trial)
-        if trial is None or again is None or np.max(again.excess(risk)) > BETTER * before:
-            break  # it was not this beacon, or not it alone
-        result, found = trial, again
-        out[:, beacon] |= false
+    result, found, out = _without_false(result, found, names, risk)
     excess = found.excess(risk, SLACK)
     alarmed = np.any(excess > 1.0, axis=1)
     level_m, level_deg = protection_levels(found, risk, SLACK)
@@ -91,6 +76,37 @@ def separated_smooth(result: Smoothed, risk: Risk | None = None) -> SeparatedSmo
     verdict = tuple(Verdict.DOUBTFUL if a else Verdict.TRUSTWORTHY for a in alarmed.tolist())
     excluded = _names_by_state(result, out, names)
     return SeparatedSmooth(result, StateTrust(verdict, level_m, level_deg, excluded), trust)
+
+
+def _without_false(
+    result: Smoothed, found: Separation, names: tuple[str, ...], risk: Risk
+) -> tuple[Smoothed, Separation, BoolArray]:
+    """Leave out stretches of beacons, one after the other, as long as that mends the separation.
+
+    Returns
+    -------
+    result, found : Smoothed, Separation
+        Without them.
+    out : bool ndarray, shape (n, beacons)
+        The fields that were left out.
+    """
+    out = np.zeros((len(result.fields.time), len(names)), dtype=bool)
+    for _ in range(ROUNDS):
+        # What is significant is looked for, whether or not it is covered.
+        before = float(np.max(found.excess(risk)))
+        if before <= 1.0:
+            break
+        beacon = int(np.argmin(np.mean(found.cost + 2.0 * found.rows, axis=0)))
+        false = _false_stretches(result, found, beacon)
+        if not np.any(false & ~out[:, beacon]) or np.mean(false) > MOST_FALSE:
+            break
+        trial = _resolved(result, names[beacon], false)
+        again = None if trial is None else separate_smoothed(trial)
+        if trial is None or again is None or np.max(again.excess(risk)) > BETTER * before:
+            break  # it was not this beacon, or not it alone
+        result, found = trial, again
+        out[:, beacon] |= false
+    return result, found, out
 
 
 def states_judged(separated: SeparatedSmooth, result: Smoothed, whole: Verdict) -> StateTrust:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magfusion.estimation.batch.batch import Smoothed
+from magfusion.estimation.graph.graph import Graph
 from magfusion.estimation.graph.state import MOTION
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.phasors import FieldPhasors
@@ -34,9 +35,7 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
         Whether it is of solutions without each magnetometer, rather than without each beacon.
     """
     graph = result.graph
-    fields = [f.measurement for f in graph.factors if isinstance(f.measurement, FieldPhasors)]
-    together = any(isinstance(m, JointPhasors) for m in graph.measurements)
-    if together or len(fields) != 1 or len(graph.segments) > 1 or graph.declared is None:
+    if not _can_separate(graph):
         return None
     site = result.declared.site
     owner = site.sensor if by_magnetometer else site.owner
@@ -59,7 +58,7 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
     cost = kept @ tally.square - np.array([one.explained for one in solved])
     numbers = np.array([6 * np.sum(heard & (owner == j)) * count for j in every])
     others = np.array([np.any(heard & (owner != j)) for j in every])
-    step, cov = np.array([v.step for v in solved]), np.array([v.cov for v in solved])
+    step, cov = (np.array([getattr(v, name) for v in solved]) for name in ("step", "cov"))
     apart = np.array([v.apart for v in solved[1:]])
     del solved
     variance = np.einsum("hnii->hni", cov[1:])
@@ -77,6 +76,14 @@ def separate_smoothed(result: Smoothed, *, by_magnetometer: bool = False) -> Sep
         np.broadcast_to(cost[1:], shape),
         np.broadcast_to(numbers, shape),
     )
+
+
+def _can_separate(graph: Graph) -> bool:
+    """Return whether a graph has the fields of one calibration, each tone by itself."""
+    fields = [f for f in graph.factors if isinstance(f.measurement, FieldPhasors)]
+    together = any(isinstance(m, JointPhasors) for m in graph.measurements)
+    one = len(fields) == 1 and len(graph.segments) <= 1
+    return one and not together and graph.declared is not None
 
 
 class _Tally:

@@ -2,23 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 
 from magfusion.errors import EstimationError
+from magfusion.estimation.graph.kalman import PartialUpdateFilter, considered_share
 from magfusion.estimation.graph.measurement import Measurement, measured_rows
 from magfusion.estimation.graph.propagation import Propagated
-from magfusion.estimation.graph.state import (
-    State,
-    between,
-    consider_update,
-    moved,
-)
+from magfusion.estimation.graph.state import State, between, moved
 from magfusion.estimation.measurements.phasors import leaves_out
 from magfusion.model.parameters import Block
 from magfusion.units import Array
+
+FAR_ITERATIONS = 3  # where the prediction is too wide to linearise at
 
 
 def telling_rows(
@@ -32,29 +28,19 @@ def telling_rows(
     return error[kept], jacobian[kept]
 
 
-def _step(kalman: Any, cov: Array, error: Array, jacobian: Array) -> tuple[Array, Array]:
-    kalman.x = np.zeros(len(cov))  # filterpy's own (n, 1) would broadcast to a matrix
-    kalman.P = cov
-    kalman.update(
-        -error,
-        HJacobian=lambda _: jacobian,
-        Hx=lambda step: jacobian @ step,
-        R=np.eye(len(error)),
-    )
-    return np.asarray(kalman.x), np.asarray(0.5 * (kalman.P + kalman.P.T))
-
-
-def _step_from_far(cov: Array, error: Array, jacobian: Array) -> tuple[Array, Array]:
-    """Return step and covariance by QR: the innovation's covariance spans too many digits."""
-    prior = np.linalg.inv(np.linalg.cholesky(cov))
-    right = np.concatenate([np.zeros(len(cov)), -error])
-    orthogonal, root = np.linalg.qr(np.vstack([prior, jacobian]))
-    inverse = np.linalg.inv(root)
-    return inverse @ (orthogonal.T @ right), inverse @ inverse.T
-
-
-class ErrorStateFilter:
+class ErrorStateFilter(PartialUpdateFilter):
     """State of now, updated epoch by epoch.
+
+    A filterpy filter whose nominal state is ``state``: `absorb` predicts, updates, moves the
+    nominal state by ``x`` and sets ``x`` to zero.  Its attributes are filterpy's:
+
+    - ``F`` and ``Q`` are transition and noise of the last interval, in the tangent of the states;
+      the nominal state goes on by preintegration, not by ``F``.
+    - ``P`` is the covariance of ``state``.
+    - Rows are whitened, so ``R`` is one; ``y`` is the innovation in units of its noise, and ``z``
+      is measured minus predicted.  ``H``, ``K``, ``S``, ``log_likelihood`` and ``mahalanobis`` are
+      of the last update, ``x_post`` is what the state was moved by from its prediction.
+    - A robust loss has weighed the rows before.
 
     Parameters
     ----------
@@ -70,10 +56,10 @@ class ErrorStateFilter:
     lagged: State
 
     def __init__(self, state: State, blocks: tuple[Block, ...], considered: int = 0) -> None:
-        self.blocks, self.state, self.considered = blocks, state, considered
-        self.lagged = state
-        # How much is measured, each update says; to make another filter costs a third of one.
-        self._kalman = ExtendedKalmanFilter(dim_x=len(state.cov), dim_z=1)
+        size = len(state.cov)
+        super().__init__(size, considered_share(size, considered))
+        self.blocks = blocks
+        self.replace_state(state)
 
     def absorb(
         self,
@@ -97,28 +83,36 @@ class ErrorStateFilter:
         EstimationError
             Where the arithmetic fails; the state is then as it was.
         """
-        prior, far = predicted.state, linearization_point is not None
-        state = (
-            prior if linearization_point is None else replace(linearization_point, cov=prior.cov)
-        )
-        for _ in range((3 if far else 1) if measurements else 0):
+        self.F, self.Q = predicted.transition, predicted.noise
+        self.predict()
+        try:
+            state = self._update_nominal(predicted.state, measurements, linearization_point)
+        except EstimationError:
+            self.replace_state(self.state)
+            raise
+        self.replace_state(replace(state, cov=0.5 * (self.P + self.P.T)))
+
+    def _update_nominal(
+        self, prior: State, measurements: Sequence[Measurement], point: State | None
+    ) -> State:
+        """Return the state moved by the update, its covariance aside."""
+        state, cov = prior if point is None else replace(point, cov=prior.cov), self.P
+        for _ in range((1 if point is None else FAR_ITERATIONS) if measurements else 0):
+            self.x, self.P = np.zeros(len(cov)), cov
             error, jacobian = telling_rows(measurements, state, self.blocks)
             if state is not prior:  # from the prediction, which holds the prior
                 error = error - jacobian @ between(prior, state, self.blocks)
+            update = self.update_linear if point is None else self.update_from_far
             try:
-                found = (
-                    _step_from_far(prior.cov, error, jacobian)
-                    if far
-                    else _step(self._kalman, prior.cov, error, jacobian)
-                )
-            except np.linalg.LinAlgError as failure:
+                update(-error, jacobian)
+            except ValueError as failure:  # SciPy's of what is not finite, and LinAlgError
                 raise EstimationError(f"the filter's update failed ({failure})") from failure
-            step, cov = consider_update(*found, prior.cov, self.considered)
-            if not np.all(np.isfinite(step)):
+            if not np.all(np.isfinite(self.x)):
                 raise EstimationError("the filter's step is not finite")
-            state = moved(replace(prior, cov=cov), self.blocks, step)
-        self.state = self.lagged = state
+            state = moved(prior, self.blocks, self.x)
+        return state
 
     def replace_state(self, state: State) -> None:
         """Go on from another state."""
         self.state = self.lagged = state
+        self.x, self.P = np.zeros(len(state.cov)), state.cov

@@ -137,31 +137,16 @@ class EpochUpdate:
         if found is None or not np.any(found.samples.valid):
             self.gate.nothing_measured()
         else:
-            if lost and found.apart and self._found_again(estimator, found, predicted):
-                return self._judged(estimator.state, None)
-            found, point, refused = self._linearization_point(found, state)
-            explained, valid = state if point is None else point, found.samples.valid[0]
-            phasors = self._weighed_phasors(found, explained, asked=point is None)
-            if self.metal.comes:
-                return self._without_the_last(estimator, predicted)
-            phasors = self.gate.passed(phasors, explained, valid, refused)
-            found = replace(found, phasors=phasors)
-            if self.gate.lost and found.apart and self._found_again(estimator, found, predicted):
-                return self._judged(estimator.state, None)
+            passed = self._passed(estimator, predicted, found, lost=lost)
+            if isinstance(passed, Judgement):  # nothing of it is to be taken in
+                return passed
+            found, point = passed
         if found is not None:
             known = state if point is None else replace(point, cov=state.cov)
             measurements += self._of_fields(found, known, step)
         self._ask(arrived, before, predicted, measurements, point)
-        linear = predicted if point is None else None
-        try:
-            estimator.absorb(predicted, measurements, point)
-        except EstimationError:
-            self.gate.counts["update failed"] += 1
-            self.gate.refused_in_a_row += 1
-            self.witness.uncertain("update_failed", state.time)
-            self.score.end()
-            estimator.replace_state(state)
-            linear = None
+        absorbed = self._absorbed(estimator, predicted, measurements, point)
+        linear = predicted if absorbed and point is None else None
         self._separate(linear, measurements, estimator.state)
         self._hear(before, predicted, estimator.state, found)
         if found is not None and found.apart:
@@ -285,6 +270,51 @@ class EpochUpdate:
 
     def _lost(self, state: State) -> bool:
         return self.gate.lost or not _no_wider(state.cov[POSITION, POSITION], LOST_POSITION)
+
+    def _passed(
+        self, estimator: Estimator, predicted: Propagated, found: Measured, *, lost: bool
+    ) -> tuple[Measured, State | None] | Judgement:
+        """Return fields that pass the gate, and the fix where they are linearised, if one is.
+
+        Where they begin the state anew, or the last epochs are undone, the judgement of that.
+
+        Parameters
+        ----------
+        lost : bool
+            Whether the state was lost before.
+        """
+        state = predicted.state
+        if lost and found.apart and self._found_again(estimator, found, predicted):
+            return self._judged(estimator.state, None)
+        found, point, refused = self._linearization_point(found, state)
+        explained, valid = state if point is None else point, found.samples.valid[0]
+        phasors = self._weighed_phasors(found, explained, asked=point is None)
+        if self.metal.comes:
+            return self._without_the_last(estimator, predicted)
+        phasors = self.gate.passed(phasors, explained, valid, refused)
+        found = replace(found, phasors=phasors)
+        if self.gate.lost and found.apart and self._found_again(estimator, found, predicted):
+            return self._judged(estimator.state, None)
+        return found, point
+
+    def _absorbed(
+        self,
+        estimator: Estimator,
+        predicted: Propagated,
+        measurements: list[Measurement],
+        point: State | None,
+    ) -> bool:
+        """Take measurements in; where that fails the state stays as it was predicted."""
+        try:
+            estimator.absorb(predicted, measurements, point)
+        except EstimationError:
+            self.gate.counts["update failed"] += 1
+            self.gate.refused_in_a_row += 1
+            self.witness.uncertain("update_failed", predicted.state.time)
+            self.score.end()
+            estimator.replace_state(predicted.state)
+            return False
+        return True
 
     def _linearization_point(
         self, found: Measured, state: State

@@ -16,6 +16,7 @@ from magfusion.errors import EstimationError
 from magfusion.estimation.graph.factors import CALIBRATION_KEY, empty_factor
 from magfusion.estimation.graph.graph import Estimate, Graph
 from magfusion.estimation.graph.inertial import Link, inertial_factor
+from magfusion.estimation.graph.kalman import considered_share, partial_update
 from magfusion.estimation.graph.measurement import Measurement, joined
 from magfusion.estimation.graph.process_noise import ProcessNoise
 from magfusion.estimation.graph.propagation import Propagated
@@ -23,7 +24,6 @@ from magfusion.estimation.graph.state import (
     MOTION,
     State,
     between,
-    consider_update,
     moved_to,
     values_of,
 )
@@ -95,7 +95,7 @@ class SlidingWindow:
         process_noise: ProcessNoise,
         considered: int = 0,
     ) -> None:
-        self.considered, self._considered_cov = considered, state.cov
+        self._share, self._considered_cov = considered_share(len(state.cov), considered), state.cov
         self.blocks, self.lag, self.process_noise = blocks, lag, process_noise
         self.state = self.lagged = state
         self.left, self.nodes = [], []
@@ -108,6 +108,9 @@ class SlidingWindow:
         linearization_point: State | None = None,
     ) -> None:
         """Take in what was measured at the end of an interval.
+
+        Another code than `ErrorStateFilter.absorb`: it solves for all of the window by elimination,
+        that for one state by a gain.  They share rows, inertial factor, partial update and chart.
 
         Parameters
         ----------
@@ -170,7 +173,7 @@ class SlidingWindow:
         own = information[newest, newest] - information[newest, oldest] @ by_newest
         cov = np.asarray(np.linalg.inv(own))
         step = cov @ (vector[newest] - vector[oldest] @ by_newest)
-        step, cov = consider_update(step, cov, self._considered_cov, self.considered)
+        step, cov = partial_update(step, cov, self._considered_cov, self._share)
         if not np.all(np.isfinite(step)):
             raise EstimationError("the window's step is not finite")
         left = vector[oldest] - information[oldest, newest] @ step
@@ -276,11 +279,11 @@ class SlidingWindow:
         triangular = np.asarray(np.linalg.qr(np.column_stack([sqrt_information, right])).R)
         size = sqrt_information.shape[1]
         sqrt_information, right = triangular[:size, :size], triangular[:size, size]
-        if not (self.considered or np.any(noise > 0.0)):
+        if self._share is None and not np.any(noise > 0.0):
             return sqrt_information, right
         inverse = np.linalg.inv(sqrt_information)
-        mean, cov = consider_update(
-            inverse @ right, inverse @ inverse.T, self._considered_cov, self.considered
+        mean, cov = partial_update(
+            inverse @ right, inverse @ inverse.T, self._considered_cov, self._share
         )
         cov[MOTION:, MOTION:] += noise
         wide = np.asarray(np.linalg.inv(np.linalg.cholesky(cov)))

@@ -41,7 +41,9 @@ from magfusion.estimation.online_integrity.judgement import (
 )
 from magfusion.estimation.online_integrity.resets import Resets
 from magfusion.estimation.online_integrity.summary import Summary
+from magfusion.files.blas_threads import warn_about_threads
 from magfusion.files.plain_data import Rules, from_plain, resume, to_plain
+from magfusion.model.arguments import check_arguments
 from magfusion.model.drive import DriveSamples, DriveShares
 from magfusion.model.marks import Marks
 from magfusion.model.parameters import dimension, inertial_blocks, placed
@@ -60,6 +62,8 @@ class Navigator:
 
     Raises
     ------
+    TypeError
+        Where the first argument is no site.
     InputError
         Where the Earth field is to be measured but the site has none.
     """
@@ -83,6 +87,8 @@ class Navigator:
     rival_chi_square: float | None
 
     def __init__(self, site: Site, settings: NavigatorSettings | None = None) -> None:
+        check_arguments("Navigator", site=(site, Site))
+        warn_about_threads()
         if site.platform.imu == NO_IMU:
             site = on_motion_prior(site)
         require_motion_prior(site)

@@ -5,6 +5,7 @@ from typing import Literal
 
 from magfusion.estimation.batch.prepared import LONGEST_STEP
 from magfusion.estimation.batch.settings import EstimatorSettings
+from magfusion.model.short_repr import short_repr
 from magfusion.model.trust import Risk
 from magfusion.units import Rate
 
@@ -34,6 +35,8 @@ class NavigatorSettings(EstimatorSettings):
     blend : float
         A correction enters them within so long (s); at once where it is zero.
     """
+
+    __repr__ = short_repr
 
     estimator: Literal["smoother", "ekf"] = "smoother"
     lag: float = 4.0

@@ -27,6 +27,7 @@ from magfusion.estimation.online_integrity.judgement import (
     parts_of,
 )
 from magfusion.estimation.online_integrity.levels import Levels
+from magfusion.model.short_repr import short_repr
 from magfusion.units import DEGREE, Array
 
 
@@ -39,6 +40,8 @@ class CarriedState(JudgedState):
     epoch : float
         The time of the state that was carried (s).
     """
+
+    __repr__ = short_repr
 
     epoch: float = 0.0
 

@@ -8,6 +8,7 @@ import numpy as np
 from magfusion.estimation.graph.state import POSITION, ROTATION, State
 from magfusion.estimation.online_integrity.levels import Levels
 from magfusion.model.one_axis import opened_state, roll_is_open
+from magfusion.model.short_repr import short_repr
 from magfusion.model.trust import Finding, Trust, Verdict, worst
 from magfusion.units import Array
 
@@ -108,6 +109,8 @@ class JudgedState(State):
         How often the pose has jumped up to here, as `magfusion.estimation.online_integrity.resets`
         has it: who follows a pose by its changes begins anew where it rises.
     """
+
+    __repr__ = short_repr
 
     judgement: Judgement = Judgement()
     reset_counter: int = 0

@@ -132,33 +132,39 @@ def tune(
     now = estimate.calibration.site
     lag = max(1, round(windows))
     prior = declared.beacons
-    errors: list[BeaconErrors] = []
-    self_made: list[bool] = []
-    for i in range(len(now.beacons)):
-        channels = [_without(channel, blind) for channel in system.channels_of(i)]
-        own = prior[i].model_error
-        usual = declared.model_error if own is None else own
-        mapped = now.beacons[i].field_map is not None
-        sizes = prior[i].noise_factor, usual
-        errors.append(BeaconErrors(channels, sizes, bent=not mapped and usual > 0.0))
-        self_made.append(not declared.platform.inertial and _left_of_noise(channels) < SELF_MADE)
+    errors = [_errors_of(system, i, now, declared, blind) for i in range(len(now.beacons))]
     found = parts_of(errors, alike, lag)
     parts = {i: part for i, part in enumerate(found) if part is not None}
-    # Rare large errors say little, which makes those of a whole log seem smaller than they are.
-    taken = [part.taken for part in parts.values() if part.model is not None]
-    less = float(np.exp(np.mean(np.log(taken)))) if taken else 1.0
+    modelled = [part for part in parts.values() if part.model is not None]
+    less, smooth = 1.0, 0.0
+    if modelled:
+        # Rare large errors say little, which makes those of a whole log seem smaller than they are.
+        less = float(np.exp(np.mean(np.log([part.taken for part in modelled]))))
+        smooth = float(np.mean([part.smooth for part in modelled]))
     out: list[Tuned] = []
     for i, part in parts.items():
         name, (noise, usual) = prior[i].name, part.sizes
-        white = max(part.white, 1.0) if self_made[i] else part.white
+        alone = not declared.platform.inertial
+        self_made = alone and _left_of_noise(errors[i].channels) < SELF_MADE
+        white = max(part.white, 1.0) if self_made else part.white
         out.append(Tuned(name, "noise_factor", noise, white * noise))
         if part.model is not None:
             factor = min(part.model / min(less, 1.0), FAULT)  # faults come first
-            if not declared.platform.inertial:  # poses that nothing else ties follow a smooth error
+            if alone:  # poses that nothing else ties follow a smooth error
                 factor = max(factor, 1.0)
             out.append(Tuned(name, "model_error", usual, factor * usual))
-    smooth = [part.smooth for part in parts.values() if part.model is not None]
-    return (*out, *_tuned_imu(system, now, declared, float(np.mean(smooth)) if smooth else 0.0))
+    return (*out, *_tuned_imu(system, now, declared, smooth))
+
+
+def _errors_of(
+    system: Leavings, beacon: int, now: Site, declared: Site, blind: BoolArray | None
+) -> BeaconErrors:
+    """Return the errors of a beacon, with the noise that the sites declare and have now."""
+    prior = declared.beacons[beacon]
+    usual = declared.model_error if prior.model_error is None else prior.model_error
+    mapped = now.beacons[beacon].field_map is not None
+    channels = [_without(channel, blind) for channel in system.channels_of(beacon)]
+    return BeaconErrors(channels, (prior.noise_factor, usual), bent=not mapped and usual > 0.0)
 
 
 def _without(own: ChannelErrors, blind: BoolArray | None) -> ChannelErrors:

@@ -263,20 +263,14 @@ def likeliest(
     ndarray, shape (k, kinds)
     """
     count = parts.shape[1]
-    first, least = np.full(count, np.log(LEAST)), np.full(count, NONE)
-    for kind in kinds:
-        first[kind] = -0.5 * np.log(kind.stop - kind.start)
-        least[kind.start] = LEAST
+    first, least, of_kind = _of_kinds(count, kinds)
+    # Which parts belong together; of all kinds in one operation.
+    together = of_kind @ of_kind.T
     gain, width = NORMAL[components], STUDENT + components
 
     scaled = gain * square
     reach, constant = scaled / STUDENT, width * scaled
     doubled = 2.0 * weight
-    # Which parts belong to each kind, and which belong together; of both kinds in one operation.
-    of_kind = np.zeros((count, len(kinds)))
-    for k, kind in enumerate(kinds):
-        of_kind[kind, k] = 1.0
-    together = of_kind @ of_kind.T
 
     def cost(log: Array) -> Array:
         squares = np.exp(2.0 * log)
@@ -309,3 +303,14 @@ def likeliest(
         start = np.where(stays, near, np.maximum(near, little))
     limits = np.log(np.stack([least, np.full(count, MOST)], axis=1))
     return minimise_curved(cost, curved, start, limits)
+
+
+def _of_kinds(count: int, kinds: Sequence[slice]) -> tuple[Array, Array, Array]:
+    """Return where each part begins, the least it may be, and which parts are of each kind."""
+    first, least = np.full(count, np.log(LEAST)), np.full(count, NONE)
+    of_kind = np.zeros((count, len(kinds)))
+    for k, kind in enumerate(kinds):
+        first[kind] = -0.5 * np.log(kind.stop - kind.start)
+        least[kind.start] = LEAST
+        of_kind[kind, k] = 1.0
+    return first, least, of_kind

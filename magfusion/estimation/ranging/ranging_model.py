@@ -89,16 +89,14 @@ class RangingModel:
 
     def predicted(self, state: Array) -> tuple[ComplexArray, ComplexArray]:
         """Return phasors (k, n, tones, 3) of states (k, 12 + unknowns), and their Jacobian."""
+        beacon = self.beacon
         if "log_conductivity" in self.names:
             change = state[:, 12 + self.names.index("log_conductivity")]
             if np.any(change != change[0]):
-                each_ground = [self.predicted(one[None]) for one in state]
-                return np.concatenate([p for p, _ in each_ground]), np.concatenate(
-                    [j for _, j in each_ground]
-                )
+                each_ground = zip(*(self.predicted(one[None]) for one in state), strict=True)
+                phasor, jacobian = map(np.concatenate, each_ground)
+                return phasor, jacobian
             beacon = _in_other_ground(self.beacon, float(change[0]))
-        else:
-            beacon = self.beacon
         rotation, place = state[:, :9].reshape(-1, 3, 3), state[:, 9:12]
         extra = dict(zip(self.names, state[:, 12:].T, strict=True))
         scale = 1.0 + extra.get("depth_scale", np.zeros(len(state)))
@@ -138,16 +136,23 @@ class RangingModel:
                 by_way = np.sum(share[..., None] * each, axis=2)
                 column = np.einsum("kntab,knb->knta", by_way, way)
             else:
-                column = _column(name, sources, bend, phasor, share)
-                if self.casing is not None and bend is not None:
-                    of_steel = self.casing.column(name, bend, steel)
-                    column = column if of_steel is None else of_steel
+                column = self._of_steel(name, bend, steel)
+                if column is None:
+                    column = _column(name, sources, bend, phasor, share)
             columns.append(column[..., None])
         size = np.exp(extra.get("log_moment", np.zeros(len(state))))[:, None, None, None]
         phasor, jacobian = size * phasor, size[..., None] * np.concatenate(columns, axis=-1)
         if self.casing is None:
             return phasor, jacobian
         return self.casing.through(phasor, jacobian, extra, self.names, steel)
+
+    def _of_steel(
+        self, name: str, bend: Gathered | None, steel: list[Response]
+    ) -> ComplexArray | None:
+        """Return the derivative by an unknown of the casing; None of any other."""
+        if self.casing is None or bend is None:
+            return None
+        return self.casing.column(name, bend, steel)
 
     def residuals(self, state: Array) -> tuple[Array, Array]:
         """Return whitened residuals (k, d) and their Jacobian (k, d, n)."""

@@ -101,6 +101,35 @@ class AtRest:
         )
 
 
+def _epochs_at_rest(
+    log: Log, site: Site, usual: LockinSettings, lockin: LockinSettings | None, least: int
+) -> tuple[list[tuple[tuple[float, float], float]], Counter[str]]:
+    """Return when each epoch begins and ends, with the length of its pieces; and what is dropped.
+
+    Parameters
+    ----------
+    usual : LockinSettings
+        By the tones of the site.
+    lockin, least
+        As of `at_rest`.
+    """
+    longest, dropped = coherent(site), Counter[str]()
+    spans: list[tuple[tuple[float, float], float]] = []
+    found = rests(log, site)
+    divided = -(-least // max(len(found), 1))
+    for span in found:
+        duration = span[1] - span[0]
+        length, parted = piece_length(site, usual, lockin, duration / divided), divided
+        if length is None:
+            length, parted = piece_length(site, usual, lockin, duration), 1
+        if length is None:
+            dropped[TOO_SHORT] += 1
+            continue
+        ends = np.linspace(*span, max(int(np.ceil(duration / longest)), parted) + 1)
+        spans += [((begin, end), length) for begin, end in itertools.pairwise(ends.tolist())]
+    return spans, dropped
+
+
 def at_rest(
     log: Log,
     site: Site,
@@ -128,25 +157,9 @@ def at_rest(
         raise InputError("holds no magnetometer.parquet to integrate at rest; give the raw log")
     check_tones(site)
     usual = default_settings(site)
-    given = usual if lockin is None else lockin
-    longest = coherent(site)
-    dropped = Counter[str]()
-    parts: list[Rest] = []
-    found = rests(log, site)
-    divided = -(-least // max(len(found), 1))
-    for span in found:
-        duration = span[1] - span[0]
-        length, parted = piece_length(site, usual, lockin, duration / divided), divided
-        if length is None:
-            length, parted = piece_length(site, usual, lockin, duration), 1
-        if length is None:
-            dropped[TOO_SHORT] += 1
-            continue
-        count = max(int(np.ceil(duration / longest)), parted)
-        ends = np.linspace(*span, count + 1)
-        for begin, end in itertools.pairwise(ends):
-            one = (float(begin), float(end))
-            parts.append(rest_epoch(log, one, site, length, given.mains_hz, false_alarm))
+    mains_hz = (usual if lockin is None else lockin).mains_hz
+    spans, dropped = _epochs_at_rest(log, site, usual, lockin, least)
+    parts = [rest_epoch(log, span, site, length, mains_hz, false_alarm) for span, length in spans]
     if not parts:
         need = LEAST_LENGTHS * usual.window
         short = f" ({dropped[TOO_SHORT]} are shorter)" if dropped else ""

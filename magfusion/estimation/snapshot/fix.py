@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from magfusion.model.short_repr import short_repr
 from magfusion.model.trajectory import Trajectory
 from magfusion.units import Array, BoolArray, IntArray
 
@@ -55,6 +56,8 @@ class Fixes:
     gravity_cost, prior_cost : ndarray, shape (n, hypotheses)
         What gravity and the prior pose have of the cost; zero where nothing is known of them.
     """
+
+    __repr__ = short_repr
 
     time: Array
     world_from_body: Array

@@ -16,6 +16,7 @@ from magfusion.estimation.snapshot.place import outside
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA, Epochs, Problem, State, epochs_of
 from magfusion.estimation.snapshot.refine import Solved, as_fixes, cost, joined, solved_from
 from magfusion.estimation.snapshot.within_cycle import FEWEST, fixed_in_motion, velocities
+from magfusion.model.arguments import check_arguments
 from magfusion.model.audibility import are_many
 from magfusion.model.channel_effects import of_all_sensors
 from magfusion.model.coil_field import is_sized
@@ -61,9 +62,14 @@ def fix_epochs(
 
     Raises
     ------
+    TypeError
+        Where the arguments are not samples and a calibration, in this order.
     EstimationError
         Where there is no epoch.
     """
+    check_arguments(
+        "fix_epochs", samples=(samples, FieldSamples), calibration=(calibration, Calibration)
+    )
     if are_many(calibration.site) and prior is None and len(samples):
 
         def fixed(

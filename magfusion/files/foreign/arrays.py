@@ -91,14 +91,7 @@ def fields_of(name: str, array: Any, unit: str = "", by_column: bool = False) ->
     """
     shape, dtype = array.shape, array.dtype
     if dtype.names and len(shape) == 1:
-        return [
-            _Field(
-                Column(f"{name}:{part}" if name else part, unit),
-                *(array, shape[0], _rows, _part(part)),
-            )
-            for part in dtype.names
-            if _numeric(dtype[part]) and not dtype[part].shape
-        ]
+        return _named_parts(name, array, unit)
     if not _numeric(dtype) or len(shape) not in (1, 2):
         return []
     if len(shape) == 1 or 1 in shape:
@@ -107,6 +100,24 @@ def fields_of(name: str, array: Any, unit: str = "", by_column: bool = False) ->
         lone = len(shape) == 2 and shape[0] == 1
         block = _turned_rows if lone else _rows
         return [_Field(Column(name or "0", unit), array, max(shape), block, np.ravel)]
+    return _matrix_columns(name, array, unit, by_column)
+
+
+def _named_parts(name: str, array: Any, unit: str) -> list[_Field]:
+    """Return the columns of an array of records, shape (n,)."""
+    return [
+        _Field(
+            Column(f"{name}:{part}" if name else part, unit),
+            *(array, array.shape[0], _rows, _part(part)),
+        )
+        for part in array.dtype.names
+        if _numeric(array.dtype[part]) and not array.dtype[part].shape
+    ]
+
+
+def _matrix_columns(name: str, array: Any, unit: str, by_column: bool) -> list[_Field]:
+    """Return the columns of a matrix, the longer side down."""
+    shape = array.shape
     turned = shape[0] < shape[1] if not by_column else shape[0] <= MOST_COLUMNS
     rows, width = (shape[1], shape[0]) if turned else shape
     if width > MOST_COLUMNS:

@@ -139,29 +139,32 @@ def _chosen(
     reader: AnyReader,
     told: Findings,
 ) -> Topic | None:
-    for entry in entries:
-        if entry.column:
-            told.problems.append(
-                f"{path}: --map '{entry}': a bag's columns are known; name the topic, as"
-                f" {role}=/topic."
-            )
-            return None
-    fitting = [(name, kind) for name, kind in found if kind in ROW_OF[role]]
+    for column in (entry for entry in entries if entry.column):
+        told.problems.append(
+            f"{path}: --map '{column}': a bag's columns are known; name the topic, as"
+            f" {role}=/topic."
+        )
+        return None
     if entries:
         return _asked(path, role, entries[0], found, reader, told)
-    fitting = [one for one in fitting if one[1] in USUAL] or fitting
-    if len(fitting) > 1:
+    fitting = _fitting(found, role)
+    if len(fitting) == 1:
+        return Topic(*fitting[0])
+    if fitting:
         names = ", ".join(name for name, _ in fitting)
         told.problems.append(f"{path}: several topics may be {role}: {names}; name one.")
         told.proposals.append(f"{role}={fitting[0][0]}")
-        return None
-    if not fitting:
-        if role == "magnetometer":
-            names = ", ".join(f"{name} ({kind})" for name, kind in found) or "none"
-            kinds = " or ".join(ROW_OF[role])
-            told.problems.append(f"{path}: no topic is of {kinds}, for {role} (found {names}).")
-        return None
-    return Topic(*fitting[0])
+    elif role == "magnetometer":
+        names = ", ".join(f"{name} ({kind})" for name, kind in found) or "none"
+        kinds = " or ".join(ROW_OF[role])
+        told.problems.append(f"{path}: no topic is of {kinds}, for {role} (found {names}).")
+    return None
+
+
+def _fitting(found: Sequence[tuple[str, str]], role: str) -> list[tuple[str, str]]:
+    """Return the topics of a type for a role: of the usual ones, if there are such."""
+    fitting = [one for one in found if one[1] in ROW_OF[role]]
+    return [one for one in fitting if one[1] in USUAL] or fitting
 
 
 def _asked(
@@ -176,33 +179,42 @@ def _asked(
         r"(?P<name>[^:\[\]]+?)(:(?P<parent>.+?)->(?P<child>.+?))?(\[(?P<unit>.*)\])?", entry.value
     )
     name = entry.value if read is None else read["name"]
-    kind = next((kind for topic, kind in found if topic == name), None)
+    kind = dict(reversed(found)).get(name)  # of two of a name the first
     if read is None or kind is None:
         names = ", ".join(topic for topic, _ in found)
         told.problems.append(f"{path}: has no topic {name} for {role} (found {names}).")
         return None
+    unit = read["unit"] or ""
     if role == "truth" and kind in _TRANSFORMS:
-        pairs = _pairs(reader, name)
         frames = (read["parent"] or "", read["child"] or "")
-        if frames not in pairs:
-            shown = ", ".join(f"{a}->{b}" for a, b in pairs)
-            told.problems.append(
-                f"{path}: topic {name} has no transform {'->'.join(frames)} (found {shown});"
-                " write world and body as truth=TOPIC:PARENT->CHILD."
-            )
-            told.proposals += [f"{role}={name}:{a}->{b}" for a, b in pairs[:5]]
-            return None
-        return Topic(name, kind, frames)
+        there = _has_transform(path, name, frames, reader, told)
+        return Topic(name, kind, frames) if there else None
     if kind not in ROW_OF[role]:
         told.problems.append(
             f"{path}: topic {name} is of {kind}, which is none of {', '.join(ROW_OF[role])} for"
             f" {role}; name another."
         )
         return None
-    if read["unit"] and role != "magnetometer":
+    if unit and role != "magnetometer":
         told.problems.append(f"{path}: --map '{entry}': messages of {kind} are in SI units.")
         return None
-    return Topic(name, kind, None, read["unit"] or "")
+    return Topic(name, kind, None, unit)
+
+
+def _has_transform(
+    path: Path, name: str, frames: tuple[str, str], reader: AnyReader, told: Findings
+) -> bool:
+    """Tell whether a topic has a transform; what it has instead is proposed."""
+    pairs = _pairs(reader, name)
+    if frames in pairs:
+        return True
+    shown = ", ".join(f"{a}->{b}" for a, b in pairs)
+    told.problems.append(
+        f"{path}: topic {name} has no transform {'->'.join(frames)} (found {shown});"
+        " write world and body as truth=TOPIC:PARENT->CHILD."
+    )
+    told.proposals += [f"truth={name}:{a}->{b}" for a, b in pairs[:5]]
+    return False
 
 
 def _pairs(reader: AnyReader, name: str) -> list[tuple[str, str]]:

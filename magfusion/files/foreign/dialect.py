@@ -154,9 +154,7 @@ def _way_of_writing(
         if width < 2:
             continue
         for decimal in ".,":
-            cells = [cell for row in rows if len(row) == width for cell in row]
-            numbers = sum(_is_number(cell, decimal) for cell in cells)
-            score = numbers / sum(map(len, rows))
+            score = _share_of_numbers(rows, width, decimal)
             if score > best:
                 best, found = score, (sign, decimal, width)
     if found is None or best < LEAST_SCORE:
@@ -166,6 +164,12 @@ def _way_of_writing(
             " rows of numbers, or name the --delimiter."
         )
     return found
+
+
+def _share_of_numbers(rows: Sequence[Sequence[str]], width: int, decimal: str) -> float:
+    """Return how many of all cells are numbers in a row of some width."""
+    cells = [cell for row in rows if len(row) == width for cell in row]
+    return sum(_is_number(cell, decimal) for cell in cells) / sum(map(len, rows))
 
 
 def _is_data(line: str, sign: str, decimal: str, width: int) -> bool:

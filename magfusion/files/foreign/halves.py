@@ -48,17 +48,7 @@ def join_halves(directory: Path, counts: dict[str, Counts]) -> Joined:
     gyro_leads = _rate(counts["gyro"]) > ALIKE * _rate(counts["accel"])
     fast, slow = HALVES if gyro_leads else HALVES[::-1]
     paths = {half: directory / f"{half}.parquet" for half in HALVES}
-    begin = max(counts[half].first for half in HALVES)
-    end = min(counts[half].last for half in HALVES)
-    if begin > end:
-        spans = (
-            f"{h} {counts[h].first * NANOSECOND:.9g} to {counts[h].last * NANOSECOND:.9g} s"
-            for h in HALVES
-        )
-        raise InputError(
-            f"the times of gyro and accel have no moment in common ({', '.join(spans)}): bring them"
-            " to one clock, by the unit of a time or --offset TABLE=SECONDS."
-        )
+    begin, end = _in_common(counts)
     names = [f"{half}_{axis}" for half in HALVES for axis in "xyz"]
     schema = pa.schema([(TIME, pa.int64()), *((name, pa.float64()) for name in names)])
     made = Counts(read=counts[fast].read)
@@ -89,6 +79,22 @@ def join_halves(directory: Path, counts: dict[str, Counts]) -> Joined:
         " and sampled apart."
     )
     return Joined(made, "" if exact else note)
+
+
+def _in_common(counts: dict[str, Counts]) -> tuple[int, int]:
+    """Return from when to when both halves have samples (ns)."""
+    begin = max(counts[half].first for half in HALVES)
+    end = min(counts[half].last for half in HALVES)
+    if begin > end:
+        spans = (
+            f"{h} {counts[h].first * NANOSECOND:.9g} to {counts[h].last * NANOSECOND:.9g} s"
+            for h in HALVES
+        )
+        raise InputError(
+            f"the times of gyro and accel have no moment in common ({', '.join(spans)}): bring them"
+            " to one clock, by the unit of a time or --offset TABLE=SECONDS."
+        )
+    return begin, end
 
 
 def _rate(counts: Counts) -> float:

@@ -1,7 +1,7 @@
 """What an import asks for: tables, maps of columns, rates; by options or a small YAML file."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
@@ -82,26 +82,34 @@ def asked(
         name = getattr(model, stream)
         if name is not None and stream not in named:
             named[stream] = root / name
+    entries = _by_stream((_as_options(model.map), maps), told)
+    return Asked(
+        named,
+        entries,
+        _rates([*_as_options(model.rate_hz), *rates], told),
+        model.delimiter if delimiter is None else delimiter,
+        epoch if epoch is not None or model.epoch is None else str(model.epoch),
+        _shifts([*_as_options(model.offset), *offsets], told),
+        _rows([*_as_options(model.rows), *rows], told),
+    )
+
+
+def _as_options(entries: Mapping[str, object]) -> list[str]:
+    """Return entries of a file as the command line has them."""
+    return [f"{name}={value}" for name, value in entries.items()]
+
+
+def _by_stream(sources: Iterable[Sequence[str]], told: Findings) -> dict[str, list[Entry]]:
+    """Return what columns of each stream are, by the last source that says so."""
     entries: dict[str, dict[str, Entry]] = defaultdict(dict)
-    for lines in ([f"{key}={value}" for key, value in model.map.items()], maps):
+    for lines in sources:
         seen: set[tuple[str, str]] = set()
         for entry in _entries(lines, told):
             if (entry.stream, entry.column) in seen:
                 told.problems.append(f"--map {entry.stream}.{entry.column} is given twice.")
             seen.add((entry.stream, entry.column))
             entries[entry.stream][entry.column] = entry
-    every = [f"{name}={hz}" for name, hz in model.rate_hz.items()] + list(rates)
-    late = [f"{name}={value}" for name, value in model.offset.items()] + list(offsets)
-    chosen = [f"{name}={value}" for name, value in model.rows.items()] + list(rows)
-    return Asked(
-        named,
-        {stream: list(those.values()) for stream, those in entries.items()},
-        _rates(every, told),
-        model.delimiter if delimiter is None else delimiter,
-        epoch if epoch is not None or model.epoch is None else str(model.epoch),
-        _shifts(late, told),
-        _rows(chosen, told),
-    )
+    return {stream: list(those.values()) for stream, those in entries.items()}
 
 
 def _entries(lines: Sequence[str], told: Findings) -> list[Entry]:

@@ -110,18 +110,25 @@ def as_options(stream: str, source: Source, terms: Terms) -> list[str]:
         if target in done:
             continue
         group = next((g for g, names in GROUPS.items() if target == names[0]), "")
-        every = [terms[name][0] for name in GROUPS.get(group, ()) if name in terms]
-        names = [source.columns[term.place].name for term in every]
-        alike = len({term.unit for term in every}) == 1 and "," not in "".join(names)
-        if group and len(every) == len(GROUPS[group]) and alike:
-            done |= set(GROUPS[group])
-            tag = "wxyz" if group == "quaternion" else str(every[0].unit)
-            signed = [("-" if t.sign < 0.0 else "") + n for t, n in zip(every, names, strict=True)]
-            tag = "" if all(_says(name, tag) for name in names) else f"[{tag}]"
-            options.append(f"{stream}.{group}={','.join(signed)}{tag}")
-        else:
+        together = _as_vector(group, source, terms) if group else None
+        if together is None:
             options.append(f"{stream}.{target}={shown(source, own)}")
+        else:
+            done |= set(GROUPS[group])
+            options.append(f"{stream}.{group}={together}")
     return options
+
+
+def _as_vector(group: str, source: Source, terms: Terms) -> str | None:
+    """Return the components of a vector in one option's value, where that says the same."""
+    every = [terms[name][0] for name in GROUPS[group] if name in terms]
+    names = [source.columns[term.place].name for term in every]
+    alike = len({term.unit for term in every}) == 1 and "," not in "".join(names)
+    if len(every) < len(GROUPS[group]) or not alike:
+        return None
+    tag = "wxyz" if group == "quaternion" else str(every[0].unit)
+    signed = [("-" if t.sign < 0.0 else "") + n for t, n in zip(every, names, strict=True)]
+    return ",".join(signed) + ("" if all(_says(name, tag) for name in names) else f"[{tag}]")
 
 
 def plan_stream(
@@ -213,12 +220,7 @@ class _Planning:
             return
         if len(named) > 1:
             if not optional:
-                names = " and ".join(self.source.columns[n.place].name for n in named)
-                self.problem(f"columns {names} may both be {self.stream}.{target}; name one")
-                first = named[0]
-                term = self._likely(target, first.place, 1.0)
-                term = term if first.unit is None else Term(first.place, first.unit)
-                self.told.proposals += as_options(self.stream, self.source, {target: (term,)})
+                self._tell_several(target, named)
             return
         (one,) = named
         unit = one.unit
@@ -257,6 +259,15 @@ class _Planning:
         if self.absent == [TIME]:
             remedy += f", or give --rate-hz {self.stream}=HZ"
         self.problem(f"{what} (found {names}); {remedy}")
+
+    def _tell_several(self, target: str, named: Sequence[Named]) -> None:
+        """Tell that several columns may be one, and propose the first."""
+        names = " and ".join(self.source.columns[n.place].name for n in named)
+        self.problem(f"columns {names} may both be {self.stream}.{target}; name one")
+        first = named[0]
+        term = self._likely(target, first.place, 1.0)
+        term = term if first.unit is None else Term(first.place, first.unit)
+        self.told.proposals += as_options(self.stream, self.source, {target: (term,)})
 
     def _propose_by_place(self) -> None:
         """Propose what columns that nothing is known of may be, by their sizes."""

@@ -17,6 +17,7 @@ from magfusion.model.channel_effects import (
 from magfusion.model.field import EarthObservation
 from magfusion.model.receive_coils import Observation
 from magfusion.model.samples import ImuSamples
+from magfusion.model.short_repr import short_repr
 from magfusion.model.site import Beacon, Site
 from magfusion.units import DEGREE, Array, ComplexArray
 
@@ -51,6 +52,8 @@ class Calibration:
 
     ``phase`` and ``log_gain`` may have one row for each pose.
     """
+
+    __repr__ = short_repr
 
     site: Site
     phase: Array

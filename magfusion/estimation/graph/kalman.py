@@ -1,0 +1,140 @@
+"""filterpy's extended Kalman filter of an error state, with partial updates."""
+
+from math import exp, log, pi, sqrt
+from sys import float_info
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+
+from magfusion.units import Array
+
+
+def partial_update(
+    step: Array, cov: Array, prior_cov: Array, share: Array | None
+) -> tuple[Array, Array]:
+    """Return step and covariance of an update that each parameter takes only a share of.
+
+    A share of zero is Schmidt's filter: what is known well enough is considered, not estimated, but
+    what it may be wrong by stays in the covariance of all else (Brink, "Partial-update
+    Schmidt-Kalman filter", J. Guid. Control Dyn. 40(9), 2017).
+
+    Parameters
+    ----------
+    step : ndarray, shape (n,)
+        Of a whole update.
+    cov, prior_cov : ndarray, shape (n, n)
+        After a whole update, and before it.
+    share : ndarray, shape (n,), optional
+        From zero to one; None where all of it is taken.
+    """
+    if share is None:
+        return step, cov
+    kept = np.outer(1.0 - share, 1.0 - share)
+    return share * step, kept * prior_cov + (1.0 - kept) * cov
+
+
+def considered_share(size: int, considered: int) -> Array | None:
+    """Return the share of each parameter where the last are considered; None where none are."""
+    return (np.arange(size) < size - considered).astype(np.float64) if considered else None
+
+
+class PartialUpdateFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no types
+    """Kalman filter of an error state, whose parameters may take a share of each update.
+
+    All is as in filterpy, by filterpy's `predict` and `update`, but for this:
+
+    - ``x`` is the error of a nominal state, shape (n,), zero before an update; who owns the nominal
+      state moves it by ``x`` after the update and sets ``x`` to zero.  ``x_post`` keeps it.
+    - ``H`` and ``dim_z`` are those of the last update: each may have another number of rows.
+    - ``K`` is the gain that was applied, a share of the optimal one.
+    - ``log_likelihood`` is exact whatever ``S`` spans; filterpy's leaves out what varies by less
+      than 2e-10 of the largest variance.
+
+    Parameters
+    ----------
+    size : int
+        Of the error state.
+    share : ndarray, shape (n,), optional
+        As in `partial_update`.
+    """
+
+    def __init__(self, size: int, share: Array | None = None) -> None:
+        super().__init__(dim_x=size, dim_z=1)
+        self.x: Array = np.zeros(size)
+        self.P: Array = np.eye(size)
+        self.share = share
+
+    def update(
+        self,
+        z: Any,
+        HJacobian: Any,
+        Hx: Any,
+        R: Any = None,
+        args: Any = (),
+        hx_args: Any = (),
+        residual: Any = np.subtract,
+    ) -> None:
+        """Update as filterpy; of what it finds each parameter takes its share."""
+        prior = self.x, self.P
+        super().update(z, HJacobian, Hx, R, args, hx_args, residual)
+        if z is not None:
+            self._take_share(*prior)
+
+    def update_linear(self, z: Array, H: Array, R: Array | None = None) -> None:
+        """Update by measurements ``z = H x + noise``.
+
+        Parameters
+        ----------
+        z : ndarray, shape (m,)
+        H : ndarray, shape (m, n)
+        R : ndarray, shape (m, m), optional
+            One where rows are whitened.
+        """
+        self.H, self.dim_z = H, len(z)
+        self.R = np.eye(len(z)) if R is None else R
+        self.update(z, HJacobian=lambda _: H, Hx=lambda x: H @ x)
+
+    def update_from_far(self, z: Array, H: Array) -> None:
+        """Update by whitened rows as `update_linear`, by QR: here ``S`` spans too many digits.
+
+        Raises
+        ------
+        LinAlgError
+            Where ``P`` is not positive definite.
+        """
+        x, cov, size = self.x, self.P, len(self.x)
+        information = np.linalg.inv(np.linalg.cholesky(cov))
+        orthogonal, root = np.linalg.qr(np.vstack([information, H]), mode="complete")
+        inverse = np.linalg.inv(root[:size])
+        of_rows, remaining = orthogonal[size:, :size], orthogonal[size:, size:]
+        self.H, self.dim_z, self.R, self.z = H, len(z), np.eye(len(z)), z.copy()
+        self.y = z - H @ x
+        self.S, self.SI = H @ cov @ H.T + self.R, remaining @ remaining.T
+        self.K = inverse @ of_rows.T
+        self.x, self.P = x + inverse @ (of_rows.T @ self.y), inverse @ inverse.T
+        self.x_post, self.P_post = self.x.copy(), self.P.copy()
+        self._take_share(x, cov)
+
+    def _take_share(self, x: Array, cov: Array) -> None:
+        if self.share is None:
+            return
+        step, self.P = partial_update(self.x - x, self.P, cov, self.share)
+        self.x, self.K = x + step, self.share[:, None] * self.K
+        self.x_post, self.P_post = self.x.copy(), self.P.copy()
+
+    @property
+    def mahalanobis(self) -> float:
+        """Mahalanobis distance of the last innovation."""
+        return sqrt(self.y @ self.SI @ self.y)
+
+    @property
+    def log_likelihood(self) -> float:
+        """Logarithm of the probability density of the last innovation."""
+        _, volume = np.linalg.slogdet(self.S)
+        return -0.5 * (len(self.y) * log(2.0 * pi) + float(volume) + self.mahalanobis**2)
+
+    @property
+    def likelihood(self) -> float:
+        """Probability density of the last innovation, not below the least positive number."""
+        return max(exp(self.log_likelihood), float_info.min)

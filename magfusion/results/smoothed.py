@@ -1,0 +1,64 @@
+"""What a program or a notebook gets of a smoothed log: a result that shows itself."""
+
+from dataclasses import dataclass
+
+from magfusion.estimation.batch import batch
+from magfusion.estimation.batch.batch import Smoothed, SmootherSettings
+from magfusion.files.blas_threads import warn_about_threads
+from magfusion.model.progress import Report, quiet
+from magfusion.model.samples import Log
+from magfusion.model.site import Site
+from magfusion.results.figures import Figures, heading
+from magfusion.results.page import head_in_notebook
+from magfusion.results.report import smoothed_figures
+from magfusion.results.trajectory import ResultTrajectory, result_trajectory
+from magfusion.results.verdict import trust_figures
+
+NOT_JUDGED = "Not judged yet: call mf.judged(result, log) for the verdict."
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SmoothedLog(Smoothed):
+    """The posterior of one log, with the trajectory as a table, a file or a figure.
+
+    The fields are those of `magfusion.estimation.batch.batch.Smoothed`: ``states`` and their
+    covariance, ``calibration`` with ``calibration_cov``, ``residual``, and what they came of.  A
+    notebook shows the head of the page of a result.
+    """
+
+    @property
+    def trajectory(self) -> ResultTrajectory:
+        """The states, with what is needed to save and plot them."""
+        return result_trajectory(self.states, self.epoch_ns, self.calibration.site)
+
+    def _repr_html_(self) -> str:
+        figures = heading("smooth", self.log_name)
+        figures |= Figures() if self.trust is None else trust_figures(self.trust)
+        return head_in_notebook(figures | smoothed_figures(self), NOT_JUDGED)
+
+
+def smooth(
+    log: Log, site: Site, settings: SmootherSettings | None = None, report: Report = quiet
+) -> SmoothedLog:
+    """Estimate the best trajectory of a log, with the calibration in the same solution.
+
+    Parameters
+    ----------
+    log : Log
+        With a waveform, or with phasors in the site's channel order.
+    site : Site
+    settings : SmootherSettings, optional
+    report : callable, optional
+        Called with stage, steps done and steps in all.
+
+    Raises
+    ------
+    TypeError
+        Where the arguments are not a log and a site, in this order.
+    InputError
+        Where the log holds nothing usable.
+    EstimationError
+        Where the graph cannot be solved.
+    """
+    warn_about_threads()
+    return SmoothedLog(**vars(batch.smooth(log, site, settings, report)))
