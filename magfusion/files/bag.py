@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
@@ -103,9 +105,6 @@ def read_bag(
 
 def _opened(path: Path, topics: Topics, report: Report) -> dict[str, _Stream]:
     """Return the streams of a bag by their roles; refuse one that cannot be read."""
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
-
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
             return _read(reader, path, topics, report)

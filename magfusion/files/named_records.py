@@ -6,6 +6,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from magfusion.errors import InputError
+from magfusion.files.fields import on_log_clock, side_by_side
+from magfusion.files.stream import field_samples
 from magfusion.model.samples import FieldSamples
 from magfusion.model.site import Site
 
@@ -45,9 +47,6 @@ def site_fields(entry: FieldsRecord, site: Site) -> FieldSamples:
     InputError
         As `magnetometer_number` and `field_samples`.
     """
-    from magfusion.files.fields import on_log_clock, side_by_side
-    from magfusion.files.stream import field_samples
-
     which = magnetometer_number(site, entry.magnetometer, "fields")
     sensors = site.platform.magnetometers
     if len(sensors) == 1:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from magfusion.errors import InputError
+from magfusion.files.bag import read_bag
 from magfusion.files.bag_topics import Topics, is_bag
 from magfusion.files.euroc import is_euroc, read_euroc
 from magfusion.files.log import HEADER, is_log, read_log
@@ -41,8 +42,6 @@ def open_log(
     if is_euroc(path):
         return read_euroc(path, start, end)
     if is_bag(path):
-        from magfusion.files.bag import read_bag
-
         return read_bag(path, start, end, topics, report)
     raise InputError(
         f"{path}: is no log: found neither {HEADER}, nor mav0/imu0/data.csv (EuRoC), nor"

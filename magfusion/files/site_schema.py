@@ -52,6 +52,7 @@ from magfusion.files.site_values import (
 )
 from magfusion.files.site_warming import WarmingEntry
 from magfusion.files.yaml_files import StrictModel
+from magfusion.model.physics.winding import Winding, wound_coil
 from magfusion.model.site import (
     Beacon,
     ClockModel,
@@ -157,8 +158,6 @@ class WindingEntry(StrictModel):
 
     def coil(self) -> "WoundCoil":
         """Return the coil that stands for it."""
-        from magfusion.model.physics.winding import Winding, wound_coil
-
         pitch = self.wire_m if self.pitch_m is None else self.pitch_m
         size = (self.inner_radius_m, self.wire_m, pitch)
         return wound_coil(Winding(self.current_a, self.layers, self.rows, *size))

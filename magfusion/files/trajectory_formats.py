@@ -7,6 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
 from magfusion.errors import InputError
+from magfusion.files.atomic import whole_file
+from magfusion.files.odometry_bag import Frames, write_bag
+from magfusion.files.result_states import states_of, write_csv, write_kitti
+from magfusion.files.trajectory_table import write_trajectory
+from magfusion.files.tum import write_tum
 
 if TYPE_CHECKING:
     from magfusion.files.odometry_bag import Frames
@@ -58,21 +63,14 @@ def write_states(
     InputError
         As `magfusion.files.odometry_bag.write_bag`.
     """
-    from magfusion.files.atomic import whole_file
-    from magfusion.files.result_states import write_csv, write_kitti
-
     with whole_file(path) as unfinished:
         if form == "csv":
             write_csv(states, unfinished)
         elif form == "kitti":
             write_kitti(states, unfinished)
         elif form == "tum":
-            from magfusion.files.tum import write_tum
-
             write_tum(states.trajectory, unfinished, int(states.stamp_ns[0]))
         else:
-            from magfusion.files.odometry_bag import Frames, write_bag
-
             write_bag(states, unfinished, form, frames or Frames(), report or (lambda _: None))
 
 
@@ -97,10 +95,6 @@ def save_trajectory(trajectory: Trajectory, path: Path, epoch_ns: int) -> None:
     if len(trajectory) == 0:
         raise InputError(f"{path}: the trajectory has no pose to write")
     if form is None:
-        from magfusion.files.trajectory_table import write_trajectory
-
         write_trajectory(trajectory, path, epoch_ns)
     else:
-        from magfusion.files.result_states import states_of
-
         write_states(states_of(trajectory, epoch_ns), path, form)

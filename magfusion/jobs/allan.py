@@ -7,9 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from magfusion.files.site import load_site, save_site
 from magfusion.jobs.settings import Command, LogSettings
 from magfusion.model.progress import Report, quiet
+from magfusion.model.trust import Verdict
 from magfusion.results.figures import Figure, Figures, Section, heading
+from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.jobs.allan_noise import Measured
@@ -34,13 +37,10 @@ def run_allan(settings: AllanSettings, output: Path, report: Report = quiet) -> 
     InputError
         Where the log cannot be read, or is too short for any figure.
     """
-    from magfusion.files.site import save_site
     from magfusion.jobs.allan_noise import measured
     from magfusion.jobs.inputs import claim, found_in
-    from magfusion.model.trust import Verdict
     from magfusion.results.plots.allan import write_allan_plot
     from magfusion.results.report import write_report
-    from magfusion.results.verdict import trust_figures
 
     claimed, job = claim(output, "allan"), settings.job(output)
     began = time.perf_counter()
@@ -59,8 +59,6 @@ def run_allan(settings: AllanSettings, output: Path, report: Report = quiet) -> 
 
 
 def _site(job: Job) -> Site | None:
-    from magfusion.files.site import load_site
-
     if job.site_path is None and not job.declared_path.is_file():
         return None
     return load_site(job.declared_path, unknown=True, without=True)

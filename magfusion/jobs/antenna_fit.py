@@ -9,6 +9,32 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from magfusion.calibration.antenna import (
+    AntennaFit,
+    fit_at_known_poses,
+    prior_sigma,
+    with_receiver_gain,
+)
+from magfusion.calibration.antenna_observability import observability
+from magfusion.calibration.antenna_probe import (
+    bench_sigma,
+    fit_by_probe,
+    in_units_of_sensitivity,
+    left_out_errors,
+    read_of_beacon,
+    read_of_term,
+)
+from magfusion.calibration.antenna_site import coils_of, of_site, with_fit
+from magfusion.calibration.antenna_tracking import (
+    Expected,
+    differences,
+    expected,
+    own_errors,
+    turned_elsewhere,
+)
+from magfusion.files.site import load_site, save_site
+from magfusion.jobs.antenna_inputs import columns_of
+from magfusion.model.antenna import Antenna, antenna_from_vector
 from magfusion.model.site import Beacon, Site
 from magfusion.units import DEGREE, Array
 
@@ -68,8 +94,6 @@ class Solved:
 
 def declared_sigma(start: Antenna, *, sizes: bool) -> Array:
     """Return what the site's antennas may be off by; their size where it is asked for."""
-    from magfusion.calibration.antenna import prior_sigma
-
     kappa = KAPPA_SIGMA if sizes else KAPPA_KEPT
     return prior_sigma(start, GAIN_SIGMA, TILT_SIGMA, CENTRE_SIGMA, kappa)
 
@@ -82,12 +106,6 @@ def solved(bench: Bench, settings: AntennaSettings) -> Solved:
     EstimationError
         Where a fit does not converge.
     """
-    from magfusion.calibration.antenna import AntennaFit
-    from magfusion.calibration.antenna_observability import observability
-    from magfusion.calibration.antenna_site import with_fit
-    from magfusion.calibration.antenna_tracking import turned_elsewhere
-    from magfusion.model.antenna import antenna_from_vector
-
     mean = bench.start.vector()
     cov = np.diag(declared_sigma(bench.start, sizes=settings.sizes) ** 2)
     chi2, dof, errors = 0.0, 0, {}
@@ -112,10 +130,7 @@ def solved(bench: Bench, settings: AntennaSettings) -> Solved:
 def _by_survey(
     bench: Bench, survey: BodySurvey, mean: Array, root: Array, settings: AntennaSettings
 ) -> AntennaFit:
-    from magfusion.calibration.antenna import fit_at_known_poses, with_receiver_gain
     from magfusion.calibration.antenna_graph import fit_at_uncertain_poses
-    from magfusion.calibration.antenna_site import of_site
-    from magfusion.model.antenna import antenna_from_vector
 
     sensor = bench.site.platform.magnetometer
     own, model = survey.of_sensor(bench.beacon, sensor), of_site(bench.beacon, sensor)
@@ -138,15 +153,6 @@ def _by_probe(
     settings: AntennaSettings,
 ) -> tuple[Array, Array, tuple[float, int], tuple[Array, Array]]:
     """Return mean and covariance of all numbers, chi square and readings, and errors left out."""
-    from magfusion.calibration.antenna_probe import (
-        bench_sigma,
-        fit_by_probe,
-        in_units_of_sensitivity,
-        left_out_errors,
-        read_of_term,
-    )
-    from magfusion.jobs.antenna_inputs import columns_of
-
     columns = columns_of(side, len(mean))
     start, sigma = mean[columns], np.sqrt(np.diagonal(cov))[columns]
     predict: Predict = read_of_term
@@ -172,10 +178,6 @@ def _by_probe(
 
 def _of_coils(beacon: Beacon, size: int) -> Predict:
     """Return what a probe reads of the beacon's coils, as a site has them."""
-    from magfusion.calibration.antenna_probe import read_of_beacon
-    from magfusion.calibration.antenna_site import coils_of
-    from magfusion.model.antenna import Antenna
-
     none = np.zeros((3, 3))
 
     def put(coils: Beacon, vector: Array) -> Beacon:
@@ -193,10 +195,6 @@ def left_out(
 
     Every fold's site is written to a file and read again: what is judged is what others will load.
     """
-    from magfusion.calibration.antenna_site import with_fit
-    from magfusion.calibration.antenna_tracking import Expected, differences, expected, own_errors
-    from magfusion.files.site import load_site, save_site
-
     survey, name = bench.survey, bench.beacon.name
     assert survey is not None
     own = np.array([settings.pose_rotation_deg * DEGREE, settings.pose_position_m])

@@ -7,9 +7,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from magfusion.calibration.antenna_site import BodySurvey
 from magfusion.errors import EstimationError, InputError
+from magfusion.files.probe import read_probe
+from magfusion.model.antenna import CENTRES, KAPPAS, MOMENTS, SENSITIVITIES, SENSOR_CENTRES
+from magfusion.model.probe import ProbeReadings
 from magfusion.model.site import Beacon, Site
+from magfusion.papers.p000_tracker.equations import eq_09_whitened
+from magfusion.papers.p000_tracker.pose import locate_by_svd
 from magfusion.units import IntArray
 
 if TYPE_CHECKING:
@@ -65,8 +72,6 @@ def couplings(survey: Survey, beacon: Beacon) -> tuple[BodySurvey, int]:
     InputError
         Where it has no phasors of the tracker, or too few poses with all of them.
     """
-    from magfusion.calibration.antenna_site import BodySurvey
-
     if survey.phasor_sensor is None:
         raise InputError("holds amplitudes, and antennas need phasors; survey again")
     wanted = [(beacon.name, tone) for tone in range(3)]
@@ -105,9 +110,6 @@ def refuse_swapped(survey: BodySurvey, antenna: Antenna) -> None:
     ------
     InputError
     """
-    from magfusion.papers.p000_tracker.equations import eq_09_whitened
-    from magfusion.papers.p000_tracker.pose import locate_by_svd
-
     receiver = np.asarray(np.linalg.inv(antenna.sensitivities_sensor))
     try:
         locate_by_svd(eq_09_whitened(survey.coupling, receiver, antenna.moments_beacon.T))
@@ -120,11 +122,6 @@ def mounted_by_fixes(survey: BodySurvey, site: Site, beacon: Beacon) -> Site:
 
     Its pose at each reading is that of the closed form; on the body it is their mean.
     """
-    from scipy.spatial.transform import Rotation
-
-    from magfusion.papers.p000_tracker.equations import eq_09_whitened
-    from magfusion.papers.p000_tracker.pose import locate_by_svd
-
     sensor = site.platform.magnetometer
     receiver = np.asarray(np.linalg.inv(sensor.matrix))
     unit = eq_09_whitened(survey.coupling, receiver, beacon.moments_beacon.T)
@@ -149,9 +146,6 @@ def probed(paths: tuple[Path, ...]) -> dict[Side, ProbeReadings]:
     ------
     InputError
     """
-    from magfusion.files.probe import read_probe
-    from magfusion.model.probe import ProbeReadings
-
     found: dict[Side, ProbeReadings] = {}
     for path in paths:
         for side, readings in read_probe(path).items():
@@ -164,8 +158,6 @@ def probed(paths: tuple[Path, ...]) -> dict[Side, ProbeReadings]:
 
 def columns_of(side: Side, size: int) -> IntArray:
     """Return the columns of one antenna in `magfusion.model.antenna.Antenna.vector`."""
-    from magfusion.model.antenna import CENTRES, KAPPAS, MOMENTS, SENSITIVITIES, SENSOR_CENTRES
-
     if side == "transmitter":
         whole = np.r_[MOMENTS, CENTRES, KAPPAS.start : KAPPAS.stop - 1]
     else:

@@ -5,7 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from magfusion.jobs.antenna_fit import declared_sigma
+from magfusion.model.antenna import CENTRES, KAPPAS, MOMENTS, SENSITIVITIES, SENSOR_CENTRES
 from magfusion.results.figures import Estimate, Figure, Figures
 from magfusion.units import DEGREE
 
@@ -23,8 +26,6 @@ _AXES = "xyz"
 
 def estimates(fit: AntennaFit, start: Antenna, *, sizes: bool) -> list[Estimate]:
     """Return every number of the antennas with its sigma and that of its prior."""
-    from magfusion.jobs.antenna_fit import declared_sigma
-
     blocks = ("transmitter.moment", "transmitter.centre", "receiver.matrix", "receiver.centre")
     names = [f"{block}_{coil}{axis}" for block in blocks for coil in _AXES for axis in _AXES]
     names += [*(f"transmitter.kappa_{c}" for c in _AXES), "receiver.kappa"] if sizes else []
@@ -78,8 +79,6 @@ def figures(
     fit: AntennaFit, observed: Observability | None, start: Antenna, settings: AntennaSettings
 ) -> Figures:
     """Return what was found of the antennas, and what was not."""
-    from magfusion.model.antenna import CENTRES, KAPPAS, MOMENTS, SENSITIVITIES, SENSOR_CENTRES
-
     sigma = np.sqrt(np.diagonal(fit.cov))
     found = fit.antenna.vector()
     change = found - start.vector()
@@ -123,8 +122,6 @@ def _observed_figures(observed: Observability, *, exact: bool) -> list[Figure]:
 
 def mounting_figures(site: Site, declared: Site) -> Figures:
     """Return by how much the receiver is mounted otherwise than declared, and its sigmas."""
-    from scipy.spatial.transform import Rotation
-
     found, before = site.platform.magnetometer, declared.platform.magnetometer
     turn = before.body_from_sensor.T @ found.body_from_sensor
     turned = float(Rotation.from_matrix(turn).magnitude()) / DEGREE

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from magfusion.estimation.snapshot.priors import contradiction, trust_of, unexplained
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.units import DEGREE, Array
 
@@ -33,8 +34,6 @@ def judged(
         Of fixes at surveyed poses with the declared antenna, and with one that was fitted without
         the pose; None where there was no survey.
     """
-    from magfusion.estimation.snapshot.priors import contradiction, trust_of, unexplained
-
     fit = found.fit
     fitted = unexplained(
         "the couplings" if errors else "the probe's readings",

@@ -8,9 +8,19 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
+from magfusion.calibration.steady_field import average, window_length
 from magfusion.errors import InputError
+from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.files.attitude_table import write_database
 from magfusion.jobs.settings import Command, LogSettings, Settings, option
 from magfusion.model.site import Site
+from magfusion.model.trajectory import interpolate
+from magfusion.model.trust import Finding, Trust, Verdict
+from magfusion.papers.p001_magnetometer.matching import predict_field
+from magfusion.papers.p001_magnetometer.matching_database import build_database, prepare
+from magfusion.receiver.admission import sample_rate_hz
+from magfusion.results.figures import Figure, Figures, heading
+from magfusion.results.verdict import trust_figures
 from magfusion.units import DEGREE, Array
 
 if TYPE_CHECKING:
@@ -96,15 +106,9 @@ def run_attitude_database(settings: DatabaseSettings, output: Path) -> Figures:
         Where the log has no reference, an angle varies that one vector cannot determine, or
         ``output`` is in the way.
     """
-    from magfusion.files.attitude_table import write_database
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
-    from magfusion.model.trajectory import interpolate
-    from magfusion.papers.p001_magnetometer.matching import predict_field
-    from magfusion.papers.p001_magnetometer.matching_database import build_database, prepare
-    from magfusion.results.figures import Figure, Figures, heading
     from magfusion.results.plots.match import write_database_plot
     from magfusion.results.report import write_report
-    from magfusion.results.verdict import trust_figures
 
     job, claimed = settings.job(output), claim(output, "calibrate attitude-database")
     log, site = read_job(job)
@@ -157,9 +161,6 @@ def judged(index: Index, site: Site, log: Log) -> Trust:
     Iron on the platform may distort it, for which a database is made; what no uniform field
     resembles has attitudes that are not those of the field.
     """
-    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
-    from magfusion.model.trust import Finding, Trust, Verdict
-
     found = list(recorded(log, site, BRIDGED))
     size = float(np.linalg.norm(index.field_world))
     share = float(np.sqrt(3.0)) * index.sigma / size
@@ -204,9 +205,6 @@ def steady(log: Log, site: Site, sampling: Sampling) -> Steady:
     InputError
         Where the log has no waveform, or no stretch of it is long enough.
     """
-    from magfusion.calibration.steady_field import average, window_length
-    from magfusion.receiver.admission import sample_rate_hz
-
     if log.waveform is None:
         raise InputError(
             "holds no magnetometer.parquet, in whose steady part the Earth's field is; give the raw"

@@ -8,8 +8,32 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from magfusion.calibration.antenna_site import into_mounting, with_fit
+from magfusion.calibration.antenna_tracking import PoseErrors
+from magfusion.files.site import load_site, save_site
+from magfusion.files.survey import read_survey
+from magfusion.jobs import antenna_report as told
+from magfusion.jobs.antenna_fit import Bench, left_out, solved
+from magfusion.jobs.antenna_inputs import (
+    couplings,
+    mounted_by_fixes,
+    probed,
+    refuse_swapped,
+    tracker,
+)
 from magfusion.jobs.antenna_settings import AntennaSettings
+from magfusion.jobs.antenna_trust import judged
+from magfusion.jobs.receiver_axes import three_axes
 from magfusion.jobs.settings import Command
+from magfusion.model.antenna import antenna_from_vector, antenna_of
+from magfusion.results.figures import (
+    Figure,
+    Figures,
+    calibration_record,
+    determined_figures,
+    heading,
+)
+from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.calibration.antenna_site import BodySurvey
@@ -32,30 +56,9 @@ def run_calibrate_antenna(settings: AntennaSettings, output: Path) -> Figures:
     EstimationError
         Where the fit does not converge.
     """
-    from magfusion.calibration.antenna_site import into_mounting, with_fit
-    from magfusion.calibration.antenna_tracking import PoseErrors
-    from magfusion.files.site import load_site, save_site
-    from magfusion.jobs import antenna_report as told
-    from magfusion.jobs.antenna_fit import Bench, left_out, solved
-    from magfusion.jobs.antenna_inputs import (
-        mounted_by_fixes,
-        probed,
-        tracker,
-    )
-    from magfusion.jobs.antenna_trust import judged
     from magfusion.jobs.inputs import claim, found_in, named, refuse_failed
-    from magfusion.jobs.receiver_axes import three_axes
-    from magfusion.model.antenna import antenna_from_vector, antenna_of
-    from magfusion.results.figures import (
-        Figure,
-        Figures,
-        calibration_record,
-        determined_figures,
-        heading,
-    )
     from magfusion.results.plots.antenna import write_antenna_plot
     from magfusion.results.report import write_report
-    from magfusion.results.verdict import trust_figures
 
     claimed, site_path = claim(output, JOB), settings.site
     declared = site = three_axes(load_site(site_path), site_path)
@@ -106,8 +109,6 @@ def _survey(
     settings: AntennaSettings, beacon: Beacon, start: Antenna
 ) -> tuple[BodySurvey | None, int]:
     """Return what was read at known poses, if anything was, and how many poses are left out."""
-    from magfusion.files.survey import read_survey
-    from magfusion.jobs.antenna_inputs import couplings, refuse_swapped
     from magfusion.jobs.inputs import named
 
     if settings.survey is None:

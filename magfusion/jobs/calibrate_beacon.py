@@ -7,11 +7,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from magfusion.calibration.beacon import REACH, BeaconMeasurements
+from magfusion.calibration.beacon_refined import calibrate_one
 from magfusion.errors import InputError
+from magfusion.estimation.snapshot.priors import contradiction, trust_of, unexplained
+from magfusion.files.site import load_site, save_site
+from magfusion.files.survey import read_survey
+from magfusion.jobs.receiver_axes import three_axes
 from magfusion.jobs.settings import Command, Settings, argument, option, required
+from magfusion.model.field import model_error_cov, predict
 from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Beacon, Site
+from magfusion.model.trust import Finding, Trust, Verdict
+from magfusion.results.figures import (
+    Estimate,
+    Figure,
+    Figures,
+    calibration_record,
+    determined_figures,
+    heading,
+)
+from magfusion.results.verdict import said_as_notes, trust_figures
 from magfusion.units import DEGREE, Array
 
 if TYPE_CHECKING:
@@ -61,11 +79,7 @@ def run_calibrate_beacon(settings: BeaconSettings, output: Path, report: Report 
     InputError
         Where a file cannot be used, a beacon was not surveyed, or it is not determined.
     """
-    from magfusion.files.site import load_site, save_site
-    from magfusion.files.survey import read_survey
     from magfusion.jobs.inputs import claim, found_in, named, refuse_failed
-    from magfusion.jobs.receiver_axes import three_axes
-    from magfusion.model.trust import Trust
     from magfusion.results.plots.beacon import write_beacon_plot
     from magfusion.results.report import write_report
 
@@ -126,10 +140,6 @@ def _check_tones(survey: Survey, known: dict[str, Beacon], path: Path) -> None:
 
 
 def _calibrated(site: Site, beacon: Beacon, survey: Survey) -> _Calibrated:
-    from magfusion.calibration.beacon import REACH, BeaconMeasurements
-    from magfusion.calibration.beacon_refined import calibrate_one
-    from magfusion.model.field import model_error_cov
-
     assert survey.phasor_sensor is not None
     shape = (len(survey), len(beacon.tones))
     phasor, sigma = np.full((*shape, 3), np.nan + 0j), np.ones(shape)
@@ -153,8 +163,6 @@ def _calibrated(site: Site, beacon: Beacon, survey: Survey) -> _Calibrated:
 
 def _residual(found: _Calibrated) -> Array:
     """Return the root mean square of each point's whitened residual."""
-    from magfusion.model.field import predict
-
     measured = found.measured
     turned, place = measured.world_from_body, measured.position_world
     phase = np.broadcast_to(found.refined.phase, (len(place), len(found.refined.phase)))
@@ -179,10 +187,6 @@ def _panel(found: _Calibrated) -> BeaconPanel:
 
 def _estimates(found: _Calibrated) -> list[Estimate]:
     """Return each parameter before and after the survey."""
-    from scipy.spatial.transform import Rotation
-
-    from magfusion.results.figures import Estimate
-
     old, new = found.measured.beacon, found.refined.beacon
     turn = Rotation.from_matrix(old.world_from_beacon.T @ new.world_from_beacon).as_rotvec()
     size = [np.linalg.norm(b.moments_beacon, axis=1) for b in (old, new)]
@@ -244,9 +248,6 @@ def _estimates(found: _Calibrated) -> list[Estimate]:
 
 def judged(found: _Calibrated) -> tuple[_Calibrated, Trust]:
     """Return a calibration with sigmas that its witnesses allow, and what they say."""
-    from magfusion.estimation.snapshot.priors import contradiction, trust_of, unexplained
-    from magfusion.model.trust import Finding, Trust, Verdict
-
     name = found.refined.beacon.name
     fitted = unexplained(
         f"beacon {name}",
@@ -291,9 +292,7 @@ def judged(found: _Calibrated) -> tuple[_Calibrated, Trust]:
 
 
 def _figures(path: Path, survey: Survey, found: list[_Calibrated], trust: Trust) -> Figures:
-    from magfusion.results.figures import Figure, Figures, determined_figures, heading
     from magfusion.results.report import residual_figure
-    from magfusion.results.verdict import said_as_notes, trust_figures
 
     estimates = [estimate for c in found for estimate in _estimates(c)]
     figures = [Figure("points", len(survey))]
@@ -341,8 +340,6 @@ def _rivals(found: _Calibrated) -> list[tuple[Array, float]]:
 
 
 def _refined_site(site: Site, found: list[_Calibrated], path: Path) -> Site:
-    from magfusion.results.figures import calibration_record
-
     new = {c.refined.beacon.name: c.refined.beacon for c in found}
     estimates = [estimate for c in found for estimate in _estimates(c)]
     beacons = tuple(new.get(b.name, b) for b in site.beacons)

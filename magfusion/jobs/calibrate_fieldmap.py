@@ -9,10 +9,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from magfusion.calibration.fieldmap import MapPoints, learn_field_map, thinned
 from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.files.site import load_site, save_site
+from magfusion.files.survey import read_survey
+from magfusion.jobs.receiver_axes import three_axes
 from magfusion.jobs.settings import Command, Settings, argument, option
+from magfusion.model.parameters import initial_calibration
 from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Site
+from magfusion.model.trajectory import interpolate
+from magfusion.model.trust import Finding, Trust, Verdict
+from magfusion.results.figures import Figure, Figures, heading
+from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.calibration.fieldmap import MapFit, MapPoints
@@ -54,13 +64,9 @@ def run_calibrate_fieldmap(settings: MapSettings, output: Path, report: Report =
     ------
     InputError
     """
-    from magfusion.calibration.fieldmap import learn_field_map
-    from magfusion.files.site import save_site
     from magfusion.jobs.inputs import claim, found_in, refuse_failed
-    from magfusion.results.figures import Figure, Figures, heading
     from magfusion.results.plots.fieldmap import write_plot
     from magfusion.results.report import write_report
-    from magfusion.results.verdict import trust_figures
 
     claimed = claim(output, "calibrate fieldmap")
     report("reading", 0, 2)
@@ -101,8 +107,6 @@ def judged(fit: MapFit, streams: tuple[Finding, ...] = ()) -> Trust:
     streams : tuple of Finding
         Of the log that the points come from.
     """
-    from magfusion.model.trust import Finding, Trust, Verdict
-
     found = []
     for beacon, error in fit.error_with.items():
         without = fit.error_without[beacon]
@@ -127,11 +131,6 @@ def _survey_path(path: Path) -> Path | None:
 
 
 def _from_survey(settings: MapSettings, path: Path) -> tuple[Site, MapPoints, Figures]:
-    from magfusion.files.site import load_site
-    from magfusion.files.survey import read_survey
-    from magfusion.jobs.receiver_axes import three_axes
-    from magfusion.results.figures import Figures
-
     if settings.trajectory is not None:
         raise InputError(f"{path}: a survey has its own poses; leave --trajectory out")
     beside = path.parent / "site.yaml"
@@ -150,8 +149,6 @@ def points_of(survey: Survey, site: Site, path: Path) -> MapPoints:
     InputError
         Where the survey holds amplitudes only, or channels that the site does not have.
     """
-    from magfusion.calibration.fieldmap import MapPoints
-
     if survey.phasor_sensor is None:
         raise InputError(f"{path}: holds amplitudes, and a field map needs phasors; survey again")
     for beacon, tone in survey.channels:
@@ -171,10 +168,7 @@ def points_of(survey: Survey, site: Site, path: Path) -> MapPoints:
 
 
 def _from_log(settings: MapSettings) -> tuple[Site, MapPoints, Figures, tuple[Finding, ...]]:
-    from magfusion.calibration.fieldmap import MapPoints, thinned
-    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
     from magfusion.jobs.inputs import Job, named, read_estimate, read_job
-    from magfusion.model.trajectory import interpolate
     from magfusion.results.report import dropped_figures
 
     site_path, result = settings.site, settings.trajectory
@@ -204,7 +198,6 @@ def _from_log(settings: MapSettings) -> tuple[Site, MapPoints, Figures, tuple[Fi
 def _samples(log: Log, site: Site, poses: Trajectory) -> tuple[FieldSamples, dict[str, int]]:
     """Return phasors; with the motion in each window taken off where the poses are its own."""
     from magfusion.estimation.demodulation.demodulation import demodulated
-    from magfusion.model.parameters import initial_calibration
 
     source = demodulated(log, site, None)
     calibration = initial_calibration(site, 0.0)
@@ -217,8 +210,6 @@ def _samples(log: Log, site: Site, poses: Trajectory) -> tuple[FieldSamples, dic
 
 
 def _figures(fit: MapFit) -> Figures:
-    from magfusion.results.figures import Figure, Figures
-
     found = fit.site.beacons[0].field_map
     assert found is not None
     by_beacon: list[tuple[str, str, Mapping[str, float]]] = [

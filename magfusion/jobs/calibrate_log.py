@@ -9,9 +9,19 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.estimation.snapshot.priors import contradiction, trust_of, unexplained
+from magfusion.files.site import save_site
 from magfusion.jobs.settings import Command, EstimateSettings, LogsSettings, WindowSettings, option
+from magfusion.model.parameters import difference
+from magfusion.model.prior import prior_sqrt_covariance
 from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Site
+from magfusion.model.trust import Finding, Trust
+from magfusion.results.figures import Column, Figure, Figures, Section, heading
+from magfusion.results.motion_coverage import missing_motion, motion_coverage
+from magfusion.results.observability import observability
+from magfusion.results.transfer import Estimated, agreement
+from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.estimation.batch.batch import Smoothed, SmootherSettings
@@ -92,11 +102,7 @@ def run_calibrate_log(
     from magfusion.estimation.batch.batch import SmootherSettings
     from magfusion.estimation.batch.self_survey import smooth_and_place
     from magfusion.estimation.integrity.judge import judged
-    from magfusion.files.site import save_site
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
-    from magfusion.results.figures import Figure, Figures, Section, heading
-    from magfusion.results.motion_coverage import missing_motion, motion_coverage
-    from magfusion.results.observability import observability
     from magfusion.results.plots.log_calibration import write_log_calibration_plot
     from magfusion.results.refinement import parameter_estimates, result_site
     from magfusion.results.report import (
@@ -105,7 +111,6 @@ def run_calibrate_log(
         smoothed_figures,
         write_report,
     )
-    from magfusion.results.verdict import trust_figures
 
     job = settings.job(output)
     smoother = SmootherSettings(estimate=settings.groups, lockin=settings.lockin(job))
@@ -161,8 +166,6 @@ def run_calibrate_log(
 
 def _told_once(trust: Trust, moved: Trust) -> Trust:
     """Return both together, what both say in the words of the first."""
-    from magfusion.model.trust import Trust
-
     moved = Trust(tuple(f for f in moved.findings if f.code not in _said(trust, f.verdict)))
     kept = tuple(f for f in trust.findings if f.code not in _said(moved, f.verdict))
     return Trust(kept, trust.unverified) | moved
@@ -190,9 +193,6 @@ def against_site(result: Smoothed, least: float = 1.0) -> tuple[Smoothed, Trust]
     least : float
         What the covariance of the calibration is multiplied by at least.
     """
-    from magfusion.estimation.snapshot.priors import contradiction, trust_of, unexplained
-    from magfusion.model.parameters import difference
-    from magfusion.model.prior import prior_sqrt_covariance
     from magfusion.results.refinement import parameter_estimates
 
     parts = result.calibration, result.blocks, result.calibration_cov
@@ -219,8 +219,6 @@ def against_site(result: Smoothed, least: float = 1.0) -> tuple[Smoothed, Trust]
 
 def transferred(compared: Transfer) -> Trust:
     """Return whether the calibrations of parts of a log agree, and serve its other parts."""
-    from magfusion.model.trust import Finding, Trust
-
     found = []
     if compared.disagreement > APART:
         text = (
@@ -243,8 +241,6 @@ def transferred(compared: Transfer) -> Trust:
 
 
 def _coverage_figures(covered: MotionCoverage) -> Figures:
-    from magfusion.results.figures import Figure, Figures, Section
-
     motion = {"motion_at_rest": covered.rest_share}
     for axis, extent, turned in zip("xyz", covered.extent_world, covered.turned_deg, strict=True):
         motion[f"motion_extent_{axis}_m"] = float(extent)
@@ -284,7 +280,6 @@ def _transfer(
     from magfusion.estimation.batch.batch import smooth
     from magfusion.jobs.inputs import read_job
     from magfusion.results.refinement import result_site
-    from magfusion.results.transfer import Estimated, agreement
 
     count = len(cuts) - 1
     logs = [read_job(replace(job, start=cuts[i], end=cuts[i + 1]))[0] for i in range(count)]
@@ -329,8 +324,6 @@ _SCORES = (
 
 
 def _transfer_figures(transfer: Transfer) -> Figures:
-    from magfusion.results.figures import Column, Figure, Figures, Section
-
     figures = [Figure("cross_parts", len(transfer.declared), section=Section.REPORT)]
     by_part = {f"part_{j + 1}_declared": score for j, score in enumerate(transfer.declared)}
     for (i, j), score in zip(transfer.pairs, transfer.calibrated, strict=True):

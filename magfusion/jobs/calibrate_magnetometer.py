@@ -9,9 +9,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from magfusion.calibration.magnetometer import field_from_measured, refined, spread
 from magfusion.errors import InputError
+from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.estimation.snapshot.priors import contradiction, trust_of
+from magfusion.files.site import save_site
 from magfusion.jobs.settings import Command, LogSettings, option
 from magfusion.model.site import Magnetometer, Site
+from magfusion.model.trust import Finding, Trust, Verdict
+from magfusion.results.figures import (
+    Estimate,
+    Figure,
+    Figures,
+    calibration_record,
+    determined_figures,
+    heading,
+)
+from magfusion.results.verdict import said_as_notes, trust_figures
 from magfusion.units import DEGREE, NANOTESLA, Array
 
 if TYPE_CHECKING:
@@ -63,7 +77,6 @@ def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
     EstimationError
         Where the calibration has no solution.
     """
-    from magfusion.files.site import save_site
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed, require_imu
     from magfusion.results.report import write_report
 
@@ -93,8 +106,6 @@ def run_calibrate_magnetometer(job: Job, *, positions: bool = False) -> Figures:
 
 
 def _fields(found: LogCalibration, magnetometer: Magnetometer) -> Array:
-    from magfusion.calibration.magnetometer import field_from_measured
-
     measured = found.readings.measured_sensor
     return field_from_measured(measured, magnetometer.matrix, magnetometer.offset)
 
@@ -108,8 +119,6 @@ def _plot(path: Path, found: LogCalibration, before: Array, after: Array, size: 
 def _refined_site(
     site: Site, found: LogCalibration, log_name: str, estimates: list[Estimate]
 ) -> Site:
-    from magfusion.results.figures import calibration_record
-
     platform = replace(site.platform, magnetometer=found.magnetometer)
     known = site.correlation
     return replace(
@@ -122,8 +131,6 @@ def _refined_site(
 
 def estimates_of(found: LogCalibration, declared: Magnetometer) -> list[Estimate]:
     """Return the twelve numbers as found, beside those that a site declared."""
-    from magfusion.results.figures import Estimate
-
     fit, prior = found.graph.fit, found.prior
     names = [f"magnetometer.matrix_{row}{column}" for row in _AXES for column in _AXES]
     names += [f"magnetometer.offset_nt_{axis}" for axis in _AXES]
@@ -158,10 +165,6 @@ def _figures(
     after: Array,
     trust: Trust,
 ) -> Figures:
-    from magfusion.calibration.magnetometer import spread
-    from magfusion.results.figures import Figure, Figures, determined_figures, heading
-    from magfusion.results.verdict import said_as_notes, trust_figures
-
     graph, readings = found.graph, found.readings
     sizes = [float(np.mean(np.linalg.norm(field, axis=1))) for field in (before, after)]
     scale = "the site's Earth field" if found.scale_known else "the declared matrix"
@@ -213,11 +216,6 @@ def calibrated(log: Log, site: Site, *, positions: bool = False) -> tuple[LogCal
 
 def judged(found: LogCalibration, site: Site, log: Log) -> tuple[LogCalibration, Trust]:
     """Return a calibration with sigmas that its witnesses allow, and what they say."""
-    from magfusion.calibration.magnetometer import refined
-    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
-    from magfusion.estimation.snapshot.priors import contradiction, trust_of
-    from magfusion.model.trust import Trust
-
     declared, prior, fit = site.platform.magnetometer, found.prior, found.graph.fit
     estimates = estimates_of(found, declared)
     change = np.concatenate([(fit.matrix - declared.matrix).ravel(), fit.offset - declared.offset])
@@ -242,8 +240,6 @@ def judged(found: LogCalibration, site: Site, log: Log) -> tuple[LogCalibration,
 
 def _beside(found: LogCalibration) -> Contradiction:
     """Return whether what was found beside the calibration contradicts the site."""
-    from magfusion.estimation.snapshot.priors import contradiction
-
     graph, prior = found.graph, found.prior
     names = ["earth.dip", *(f"imu.{k}_bias_{axis}" for k in ("accel", "gyro") for axis in _AXES)]
     change = np.concatenate([[graph.dip_change], graph.accel_bias_body, graph.gyro_bias_body])
@@ -257,8 +253,6 @@ def _beside(found: LogCalibration) -> Contradiction:
 
 
 def _doubts(found: LogCalibration, site: Site) -> Iterator[Finding]:
-    from magfusion.model.trust import Finding, Verdict
-
     yield from _of_another_scale(found, site)
     if found.rival is not None:
         own, other = (_microtesla(b) for b in (found.magnetometer.offset, found.rival))
@@ -299,8 +293,6 @@ def _of_another_scale(found: LogCalibration, site: Site) -> Iterator[Finding]:
 
     It is said before what the calibration says against its prior, of which it is the cause.
     """
-    from magfusion.model.trust import Finding, Verdict
-
     declared = site.platform.magnetometer.matrix
     ratio = float(np.cbrt(np.linalg.det(found.graph.fit.matrix) / np.linalg.det(declared)))
     sigma = float(np.sqrt(np.mean(np.diagonal(found.prior.cov)[[0, 4, 8]]) / 3.0))
@@ -324,8 +316,6 @@ def _of_another_scale(found: LogCalibration, site: Site) -> Iterator[Finding]:
 
 def _of_another_size(found: LogCalibration, site: Site) -> Iterator[Finding]:
     """Yield that the calibrated field is not of the declared size, or of no size on Earth."""
-    from magfusion.model.trust import Finding, Verdict
-
     size = float(np.mean(np.linalg.norm(_fields(found, found.magnetometer), axis=1)))
     remedy = (
         " A hard iron remains that this motion does not tell from the field: turn the sensor about"
@@ -354,8 +344,6 @@ def _of_another_size(found: LogCalibration, site: Site) -> Iterator[Finding]:
 
 
 def _remarks(found: LogCalibration, log: Log) -> Iterator[Finding]:
-    from magfusion.model.trust import Finding, Verdict
-
     for sentence in found.missing:
         text = f"{sentence[0].upper()}{sentence[1:]}."
         yield Finding("few_data", text, Verdict.TRUSTWORTHY)

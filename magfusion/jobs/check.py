@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from magfusion.jobs.settings import Command, LogSettings, WindowSettings
 from magfusion.model.progress import Report, quiet
+from magfusion.model.trust import Trust
 from magfusion.results.figures import Figure, Figures, Section, heading
+from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.estimation.integrity.first_look import Look
@@ -35,15 +40,11 @@ def run_check(
     ------
     InputError
     """
-    from contextlib import nullcontext
-
     from magfusion.estimation.demodulation.demodulated_apart import by_name, each_recorded
     from magfusion.estimation.integrity.first_look import first_look
     from magfusion.jobs.inputs import claim, found_in, read_recording
-    from magfusion.model.trust import Trust
     from magfusion.results.plots.check import write_check_plot
     from magfusion.results.report import write_report
-    from magfusion.results.verdict import trust_figures
 
     claimed = nullcontext(None) if output is None else claim(output, "check")
     job = settings.job(Path() if output is None else output)
@@ -129,8 +130,6 @@ def check_figures(look: Look) -> Figures:
 
 def _of_compasses(look: Look) -> Figures:
     """Return the sizes of gravity and field, and the angle between them."""
-    import numpy as np
-
     means = look.means
     if len(means) == 0:
         return Figures()

@@ -9,9 +9,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.files.site import load_site
+from magfusion.files.table import write_table
+from magfusion.jobs.receiver_axes import three_axes
 from magfusion.jobs.settings import Command, RiskSettings, argument, option
 from magfusion.jobs.simulate import box_option
 from magfusion.model.site import Site
+from magfusion.model.trust import Trust
+from magfusion.receiver.windows import default_settings
+from magfusion.results.coverage import (
+    best_extra_beacon,
+    coverage,
+    phasor_variance,
+    usual_box,
+    volume,
+)
+from magfusion.results.figures import Figure, Figures, heading
+from magfusion.results.verdict import trust_figures
 from magfusion.units import Array
 
 if TYPE_CHECKING:
@@ -55,10 +69,7 @@ def run_coverage(settings: CoverageSettings, output: Path) -> Figures:
     InputError
         Where the site cannot be read, the settings do not fit, or ``output`` is in the way.
     """
-    from magfusion.files.site import load_site
     from magfusion.jobs.inputs import claim
-    from magfusion.jobs.receiver_axes import three_axes
-    from magfusion.results.coverage import best_extra_beacon, coverage, usual_box, volume
     from magfusion.results.plots.coverage import write_plot
     from magfusion.results.recording_coverage import write_coverage_recording
     from magfusion.results.report import write_report
@@ -87,7 +98,6 @@ def run_coverage(settings: CoverageSettings, output: Path) -> Figures:
 
 def _window(site: Site, site_path: Path, given: float | None) -> float:
     from magfusion.jobs.inputs import named
-    from magfusion.receiver.windows import default_settings
 
     if given is None:
         in_turn = [b.name for b in site.beacons if any(slot is not None for _, slot in b.tones)]
@@ -124,11 +134,6 @@ def _figures(
     found: Coverage,
     extra: ExtraBeacon | None,
 ) -> Figures:
-    from magfusion.model.trust import Trust
-    from magfusion.results.coverage import phasor_variance
-    from magfusion.results.figures import Figure, Figures, heading
-    from magfusion.results.verdict import trust_figures
-
     position, attitude = found.position_quantile, found.attitude_quantile
     figures = [
         Figure("points", len(found)),
@@ -166,8 +171,6 @@ def _figures(
 
 def level_figures(found: Coverage) -> list[Figure]:
     """Return median and worst of the protection levels, and where there is one."""
-    from magfusion.results.figures import Figure
-
     parts = (
         ("m", "position", found.protection_level_m),
         ("deg", "attitude", found.protection_level_deg),
@@ -196,8 +199,6 @@ def finite(value: float) -> float | None:
 
 def write_points(path: Path, found: Coverage) -> None:
     """Write every point with its bounds."""
-    from magfusion.files.table import write_table
-
     columns: dict[str, object] = dict(
         zip(("position_x", "position_y", "position_z"), found.position_world.T, strict=True)
     )

@@ -12,6 +12,9 @@ from magfusion.jobs.simulate import run_simulate
 from magfusion.jobs.smooth import run_smooth
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figures
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.log import SimulationConfig
+from magfusion.simulation.motion import Rests
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,9 +35,6 @@ def run_demo(settings: DemoSettings, output: Path, report: Report = quiet) -> Fi
     """
     from magfusion.estimation.batch.batch import SmootherSettings
     from magfusion.jobs.inputs import Job
-    from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
-    from magfusion.simulation.log import SimulationConfig
-    from magfusion.simulation.motion import Rests
 
     config = SimulationConfig(
         box_world=DEMO_BOX_WORLD,

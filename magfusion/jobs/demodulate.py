@@ -6,11 +6,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from magfusion.errors import InputError
+from magfusion.estimation.data_checks.recording import passed_on
+from magfusion.estimation.demodulation.drive_reference import referred
+from magfusion.files.fields import by_own_clocks
+from magfusion.files.log import write_log
+from magfusion.files.site import save_site
 from magfusion.jobs.rest_settings import RestSettings
 from magfusion.jobs.settings import Command, LogSettings, WindowSettings
+from magfusion.model.audibility import MANY
 from magfusion.model.progress import Report, quiet
+from magfusion.model.trust import Trust
 from magfusion.results.figures import Figure, Figures, heading
+from magfusion.results.rest_figures import rest_figures
+from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.model.samples import FieldSamples, Log
@@ -30,19 +41,10 @@ def run_demodulate(settings: DemodulateSettings, output: Path, report: Report = 
     InputError
         Where the log has no waveform, or no window of it is usable.
     """
-    from magfusion.estimation.data_checks.recording import passed_on
     from magfusion.estimation.demodulation.demodulated_apart import demodulated_apart
     from magfusion.estimation.demodulation.demodulation import phasors
-    from magfusion.estimation.demodulation.drive_reference import referred
-    from magfusion.files.fields import by_own_clocks
-    from magfusion.files.log import write_log
-    from magfusion.files.site import save_site
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
-    from magfusion.model.audibility import MANY
-    from magfusion.model.trust import Trust
     from magfusion.results.report import dropped_figures, write_report
-    from magfusion.results.rest_figures import rest_figures
-    from magfusion.results.verdict import trust_figures
 
     claimed, job = claim(output, "demodulate"), settings.job(output)
     lockin = settings.lockin(job)
@@ -108,8 +110,6 @@ def _phasor_figures(samples: FieldSamples, every: bool) -> Figures:
     every : bool
         Whether a tone is told of that no window has.
     """
-    import numpy as np
-
     sigma = np.sqrt(np.trace(samples.phasor_cov, axis1=2, axis2=3) / 3.0)
     return Figures(
         Figure("epochs", len(samples)),

@@ -10,12 +10,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.files.hall import load_hall
+from magfusion.files.site import load_site, save_site
 from magfusion.jobs.coverage import write_points
+from magfusion.jobs.design_figures import design_figures
+from magfusion.jobs.design_motion import run_motion
 from magfusion.jobs.design_settings import ALL, DesignSettings
+from magfusion.jobs.receiver_axes import three_axes
 from magfusion.jobs.settings import Command
 from magfusion.jobs.simulate import box_option
+from magfusion.model.hall import Hall, Mounts, mounting_places, points_of_use, prism_of
 from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Beacon, Site
+from magfusion.results.coverage import coverage, usual_box
+from magfusion.results.design.pattern import Band, template_of
+from magfusion.results.design.planning import Task, designed, with_moment
+from magfusion.results.design.turns import cycle_of, is_in_turn
 
 if TYPE_CHECKING:
     from magfusion.model.hall import Hall
@@ -36,13 +46,7 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
     InputError
         Where a file cannot be read, the settings do not fit, or ``output`` is in the way.
     """
-    from magfusion.files.site import load_site, save_site
-    from magfusion.jobs.design_figures import design_figures
-    from magfusion.jobs.design_motion import run_motion
     from magfusion.jobs.inputs import claim
-    from magfusion.jobs.receiver_axes import three_axes
-    from magfusion.results.coverage import coverage
-    from magfusion.results.design.planning import designed
     from magfusion.results.plots.design import Panel, write_plot
     from magfusion.results.recording_design import write_design_recording
     from magfusion.results.report import write_report
@@ -89,10 +93,6 @@ def run_design(settings: DesignSettings, output: Path, report: Report = quiet) -
 
 def _hall(settings: DesignSettings, site: Site) -> tuple[Hall, float]:
     """Return the hall, and the spacing of its points of use (m)."""
-    from magfusion.files.hall import load_hall
-    from magfusion.model.hall import Hall, Mounts, prism_of
-    from magfusion.results.coverage import usual_box
-
     if settings.hall is not None:
         hall = load_hall(settings.hall)
     else:
@@ -118,8 +118,6 @@ def _hall(settings: DesignSettings, site: Site) -> tuple[Hall, float]:
 
 
 def _points(hall: Hall, spacing: float) -> Array:
-    from magfusion.model.hall import points_of_use
-
     points = points_of_use(hall, spacing)
     if not 0 < len(points) <= MOST_POINTS:
         raise InputError(
@@ -131,10 +129,6 @@ def _points(hall: Hall, spacing: float) -> Array:
 
 
 def _task(settings: DesignSettings, site: Site, hall: Hall, spacing: float) -> Task:
-    from magfusion.model.hall import mounting_places
-    from magfusion.results.design.pattern import template_of
-    from magfusion.results.design.planning import Task, with_moment
-
     points = _points(hall, spacing)
     template = template_of(site, settings.template)
     moment = settings.moment
@@ -160,8 +154,6 @@ def _task(settings: DesignSettings, site: Site, hall: Hall, spacing: float) -> T
 
 def _check_turns(settings: DesignSettings, kept: Site, template: Beacon) -> None:
     """Refuse beacons in time slots beside others, and a window that does not hold a cycle."""
-    from magfusion.results.design.turns import cycle_of, is_in_turn
-
     in_turn = [beacon for beacon in (*kept.beacons, template) if is_in_turn(beacon)]
     if kept.beacons and in_turn:
         raise InputError(
@@ -202,8 +194,6 @@ def _kept(site: Site, keep: str | None) -> Site:
 
 
 def _band(settings: DesignSettings, site: Site) -> Band:
-    from magfusion.results.design.pattern import Band
-
     try:
         low, high = (float(part) for part in settings.band.split(","))
     except ValueError:

@@ -8,6 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magfusion.jobs.coverage import finite, level_figures
+from magfusion.model.trust import Trust
+from magfusion.results.design.pattern import pattern_axis, peak_moment
+from magfusion.results.figures import Figure, Figures, Section, heading
+from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.jobs.design_settings import DesignSettings
@@ -31,10 +35,6 @@ def design_figures(
     spacing : float
         Of the points (m).
     """
-    from magfusion.model.trust import Trust
-    from magfusion.results.figures import Figure, Figures, Section, heading
-    from magfusion.results.verdict import trust_figures
-
     before, after = (panel.found for panel in panels)
     notes = [] if found.complete else [_OUT_OF_TIME]
     if before.protection_level_m is None or after.protection_level_m is None:
@@ -75,8 +75,6 @@ _OPEN = (
 
 
 def _sigma_figures(found: Coverage) -> list[Figure]:
-    from magfusion.results.figures import Figure
-
     return [
         Figure(
             f"position_sigma_m_{key}",
@@ -90,8 +88,6 @@ def _sigma_figures(found: Coverage) -> list[Figure]:
 
 def _random_figures(worst_m: Array, reached_m: float) -> list[Figure]:
     """Return what random layouts of the same candidates have, and what the design gains."""
-    from magfusion.results.figures import Figure
-
     if not len(worst_m):
         return []
     median, best = float(np.median(worst_m)), float(np.min(worst_m))
@@ -107,9 +103,6 @@ def _random_figures(worst_m: Array, reached_m: float) -> list[Figure]:
 
 
 def _of_beacon(beacon: Beacon) -> list[Figure]:
-    from magfusion.results.design.pattern import pattern_axis, peak_moment
-    from magfusion.results.figures import Figure
-
     name, axis = beacon.name, pattern_axis(beacon)
     rows: list[tuple[str, float, str]] = [
         (f"position_{letter}_m", float(value), "m")

@@ -8,6 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magfusion.errors import InputError
+from magfusion.files.table import write_table
+from magfusion.model.trust import Trust
+from magfusion.results.design.motion import next_motion
+from magfusion.results.figures import Figure, Figures, Section, heading
+from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.jobs.design_settings import DesignSettings
@@ -29,7 +34,6 @@ def run_motion(
         Where the site says that everything is known, or ``output`` is in the way.
     """
     from magfusion.jobs.inputs import claim
-    from magfusion.results.design.motion import next_motion
     from magfusion.results.plots.motion import write_motion_plot
     from magfusion.results.report import write_report
 
@@ -63,10 +67,6 @@ def said(found: Motion, number: int) -> str:
 
 
 def _figures(settings: DesignSettings, found: Motion) -> Figures:
-    from magfusion.model.trust import Trust
-    from magfusion.results.figures import Figure, Figures, Section, heading
-    from magfusion.results.verdict import trust_figures
-
     parameters = found.parameters
     start, left = (parameters.excess(r) for r in (np.ones(len(found.ratio)), found.ratio))
     asked = parameters.asked
@@ -98,8 +98,6 @@ def _figures(settings: DesignSettings, found: Motion) -> Figures:
 
 
 def _write_stops(path: Path, found: Motion) -> None:
-    from magfusion.files.table import write_table
-
     def column(of: str) -> Array:
         return np.array([getattr(stop, of) for stop in found.stops])
 

@@ -11,8 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from magfusion.errors import InputError
+from magfusion.files.atomic import real
+from magfusion.files.checkpoint import read_position
 from magfusion.jobs.settings import Command, RandomSettings, option
 from magfusion.model.progress import Report
+from magfusion.model.trust import Finding, Trust
+from magfusion.results.drift import QUANTITIES, Course, settled_after
+from magfusion.results.figures import Figure, Figures, Section, heading
+from magfusion.results.verdict import trust_figures
+from magfusion.simulation.monte_carlo import run_many
 
 if TYPE_CHECKING:
     from magfusion.jobs.drift_figures import Judgement
@@ -95,14 +102,11 @@ def run_drift(settings: DriftSettings, output: Path, report: Report | None = Non
     EstimationError
         Where an estimator finds no start.
     """
-    from magfusion.files.atomic import real
-    from magfusion.files.checkpoint import read_position
     from magfusion.jobs.drift_world import claim_place, run_world
     from magfusion.jobs.inputs import UNFINISHED_DRIFT, claim
     from magfusion.results.plots.drift import write_plot, write_stability
     from magfusion.results.recording_drift import write_drift_recording
     from magfusion.results.report import write_report
-    from magfusion.simulation.monte_carlo import run_many
 
     claimed = claim(output, "drift")
     place = real(output) / UNFINISHED_DRIFT
@@ -145,10 +149,6 @@ def summarise(settings: DriftSettings, runs: list[WorldRun]) -> Figures:
     An instability that is found makes the estimates doubtful; a run too short to tell does not.
     """
     from magfusion.jobs.drift_figures import STABILITY, judged
-    from magfusion.model.trust import Finding, Trust
-    from magfusion.results.drift import QUANTITIES, settled_after
-    from magfusion.results.figures import Figure, Figures, Section, heading
-    from magfusion.results.verdict import trust_figures
 
     figures = Figures()
     judgements: list[Judgement] = []
@@ -198,7 +198,6 @@ def overall(verdicts: list[Verdict]) -> Verdict:
 def courses(settings: DriftSettings, runs: list[WorldRun]) -> list[Course]:
     """Return what is drawn of each estimator: its errors, and its pace in the first world."""
     from magfusion.jobs.drift_figures import MINUTE, minutes
-    from magfusion.results.drift import Course
 
     out = []
     for estimator in settings.estimators:

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magfusion.errors import InputError
+from magfusion.files.bag_topics import BAG_SUFFIXES
+from magfusion.files.open import open_log
 from magfusion.jobs.settings import Command, TopicSettings, argument
 from magfusion.results.figures import Figure, Figures, Section
 
@@ -43,8 +45,6 @@ def run_evaluate(settings: EvaluateSettings) -> Figures:
 
 def _read_truth(settings: EvaluateSettings) -> tuple[Trajectory, int]:
     """Return the truth, and the zero of the clock (ns) from which its times count."""
-    from magfusion.files.bag_topics import BAG_SUFFIXES
-    from magfusion.files.open import open_log
     from magfusion.jobs.inputs import read_estimate, topics_option
 
     path, topics = settings.truth, topics_option(settings.topics)

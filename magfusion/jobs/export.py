@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from magfusion.errors import InputError
+from magfusion.files.odometry_bag import Frames
+from magfusion.files.result_states import read_result_states
 from magfusion.files.trajectory_formats import (
     BAGS,
     FORMATS,
@@ -64,7 +66,6 @@ def run_export(settings: ExportSettings, output: Path, report: Report = quiet) -
     InputError
         Where there is no result, none of its states has a pose, or a directory is in the way.
     """
-    from magfusion.files.result_states import read_result_states
     from magfusion.jobs.inputs import named
 
     form = settings.format_of(output)
@@ -76,8 +77,6 @@ def run_export(settings: ExportSettings, output: Path, report: Report = quiet) -
     total = len(states.stamp_ns)
     frames = None
     if form in BAGS:
-        from magfusion.files.odometry_bag import Frames
-
         frames = Frames(settings.frame, settings.child, settings.namespace)
     with named(path):
         write_states(states, output, form, frames, lambda k: report("writing", k, total))

@@ -7,12 +7,32 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
 from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.estimation.integrity.place_witness import of_place
+from magfusion.estimation.snapshot.ambiguity import relations
+from magfusion.estimation.snapshot.explained_fixes import explained_fixes
+from magfusion.estimation.snapshot.fix_magnetometers import contradicting_magnetometers
+from magfusion.estimation.snapshot.problem import FREE
+from magfusion.files.fix_table import write_hypotheses
+from magfusion.files.survey import read_survey
+from magfusion.files.trajectory_table import write_trajectory
+from magfusion.files.tum import write_tum
 from magfusion.jobs.region import RegionSettings
 from magfusion.jobs.rest_settings import RestSettings
 from magfusion.jobs.settings import Command, RiskSettings, WindowSettings, option
+from magfusion.model.parameters import initial_calibration
 from magfusion.model.progress import Report, quiet
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Finding, Trust, alike
+from magfusion.papers.p004_fingerprints.algorithms import fix_as_published
+from magfusion.papers.p004_fingerprints.fingerprint import fingerprint_database
+from magfusion.papers.p004_fingerprints.rotating import rotating_beacons, rotating_fields
 from magfusion.results.figures import Figure, Figures, heading
+from magfusion.results.rest_figures import rest_figures
+from magfusion.results.verdict import level_figures, trust_figures
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -92,8 +112,6 @@ def run(settings: FixSettings, output: Path, report: Report = quiet) -> Figures:
 
 def _free(text: str | None) -> tuple[str, ...]:
     """Read ``phase,gain`` or either."""
-    from magfusion.estimation.snapshot.problem import FREE
-
     chosen = () if text is None else tuple(part.strip() for part in text.split(","))
     unknown = [part for part in chosen if part not in FREE]
     if unknown:
@@ -129,17 +147,9 @@ def run_fix(
     ------
     InputError, EstimationError
     """
-    import numpy as np
-
-    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
     from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
-    from magfusion.estimation.snapshot.explained_fixes import explained_fixes
     from magfusion.jobs.inputs import claim, found_in, named, refuse_failed
-    from magfusion.model.parameters import initial_calibration
-    from magfusion.model.trust import Trust
     from magfusion.results.report import dropped_figures, fix_figures, where_found
-    from magfusion.results.rest_figures import rest_figures
-    from magfusion.results.verdict import level_figures, trust_figures
 
     claimed = claim(job.output, "smooth", "fix")
     used = rest is not None and rest.at_rest
@@ -213,10 +223,6 @@ def _trust(
     of_log: tuple[Finding, ...],
 ) -> Trust:
     """Return what fixes say, of the place and of several magnetometers too, and the recording."""
-    from magfusion.estimation.integrity.place_witness import of_place
-    from magfusion.estimation.snapshot.fix_magnetometers import contradicting_magnetometers
-    from magfusion.model.trust import Trust
-
     fixes = found.fixes
     best = (fixes.world_from_body, fixes.position_world, fixes.pose_cov)
     place = of_place(calibration.site, fixes.time, *(part[:, 0] for part in best))
@@ -285,10 +291,6 @@ def write_fix_result(
     nearest : Trajectory, optional
         What is compared with the truth, where it is not the best hypotheses.
     """
-    from magfusion.estimation.snapshot.ambiguity import relations
-    from magfusion.files.fix_table import write_hypotheses
-    from magfusion.files.trajectory_table import write_trajectory
-    from magfusion.files.tum import write_tum
     from magfusion.results.page_motion import Motion
     from magfusion.results.recording import write_recording
     from magfusion.results.report import compared_with_truth, write_report
@@ -337,21 +339,11 @@ def run_published_fix(job: Job, settings: FixSettings) -> Figures:
         share fewer than three rotating beacons, or as many are detected in no epoch.
     EstimationError
     """
-    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
     from magfusion.estimation.demodulation.demodulation import phasors
-    from magfusion.files.survey import read_survey
-    from magfusion.files.trajectory_table import write_trajectory
-    from magfusion.files.tum import write_tum
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
-    from magfusion.model.trajectory import Trajectory
-    from magfusion.model.trust import Finding, Trust, alike
-    from magfusion.papers.p004_fingerprints.algorithms import fix_as_published
-    from magfusion.papers.p004_fingerprints.fingerprint import fingerprint_database
-    from magfusion.papers.p004_fingerprints.rotating import rotating_beacons, rotating_fields
     from magfusion.results.page_motion import Motion
     from magfusion.results.recording import write_recording
     from magfusion.results.report import compared_with_truth, dropped_figures, write_report
-    from magfusion.results.verdict import trust_figures
 
     method, survey_path, lockin = settings.method, settings.survey, settings.lockin(job)
     assert method != "likelihood"

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from magfusion.errors import InputError, InputErrors
+from magfusion.files.foreign.bag_table import first_stamp
+from magfusion.files.foreign.columns import STREAMS
+from magfusion.files.foreign.convert import write_stream
+from magfusion.files.foreign.gather import gather
+from magfusion.files.foreign.halves import HALVES, join_halves
+from magfusion.files.foreign.map_file import asked
+from magfusion.files.foreign.plan import Findings
+from magfusion.files.log import HEADER
+from magfusion.files.yaml_files import write_yaml
+from magfusion.jobs.check import CheckSettings, run_check
 from magfusion.jobs.settings import Command, Settings, option
 from magfusion.model.progress import Report, quiet
 from magfusion.results.figures import Figure, Figures, Section, heading
+from magfusion.units import NANOSECOND
 
 if TYPE_CHECKING:
     from magfusion.files.foreign.convert import Counts
@@ -95,12 +107,6 @@ def run_import(settings: ImportSettings, output: Path, report: Report = quiet) -
     InputError
         With every problem that was found, and options that would decide what is undecided.
     """
-    from magfusion.files.foreign.columns import STREAMS
-    from magfusion.files.foreign.convert import write_stream
-    from magfusion.files.foreign.gather import gather
-    from magfusion.files.foreign.halves import HALVES, join_halves
-    from magfusion.files.foreign.map_file import asked
-    from magfusion.files.foreign.plan import Findings
     from magfusion.jobs.inputs import claim
     from magfusion.results.report import write_report
 
@@ -178,8 +184,6 @@ def _refuse(told: Findings) -> None:
 
 
 def _quoted(text: str) -> str:
-    import shlex
-
     return shlex.quote(text)
 
 
@@ -198,8 +202,6 @@ def _epoch(text: str | None, found: Gathered) -> str | int:
             f"--epoch {text!r}: write a stamp in ns, or first; a topic is of a bag."
         )
         return 0
-    from magfusion.files.foreign.bag_table import first_stamp
-
     try:
         return first_stamp(found.bags[0], text)
     except InputError as error:
@@ -209,8 +211,6 @@ def _epoch(text: str | None, found: Gathered) -> str | int:
 
 def _refuse_apart(counts: dict[str, Counts], told: Findings) -> None:
     """Refuse streams whose times have no moment in common: they are of different clocks."""
-    from magfusion.units import NANOSECOND
-
     if not {"imu", "magnetometer"} <= set(counts):
         return
     for name in set(counts) - {"imu", "gyro", "accel"}:
@@ -233,9 +233,6 @@ def _first(counts: dict[str, Counts]) -> int:
 
 
 def _write_header(directory: Path, output: Path, found: Gathered, epoch_ns: int) -> None:
-    from magfusion.files.log import HEADER
-    from magfusion.files.yaml_files import write_yaml
-
     source = "imported: " + ", ".join(
         dict.fromkeys(plan.source.place for plan in found.plans.values())
     )
@@ -245,8 +242,6 @@ def _write_header(directory: Path, output: Path, found: Gathered, epoch_ns: int)
 
 def _checked(directory: Path, output: Path, found: Gathered, site: Path | None) -> Figures:
     """Return what the check of the log says, of which no reader knows the unfinished name."""
-    from magfusion.jobs.check import CheckSettings, run_check
-
     try:
         figures = run_check(CheckSettings(log=directory, site=site))
     except InputError as error:

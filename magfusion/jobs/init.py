@@ -3,15 +3,31 @@
 from __future__ import annotations
 
 import sys
+import tempfile
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.console import Console
+from rich.table import Table
+
 from magfusion.errors import InputError
+from magfusion.estimation.data_checks.mending import mended
+from magfusion.estimation.data_checks.tones import transmitted
+from magfusion.files.atomic import whole_file
+from magfusion.files.instruments import UNNAMED, imus, magnetometers, named_imu, named_magnetometer
+from magfusion.files.open import open_log
+from magfusion.files.site import load_site
+from magfusion.files.site_draft import BeaconDraft, beacon_draft, numbers, place_of
+from magfusion.files.site_text import SiteDraft, site_text, to_do
+from magfusion.jobs.init_questions import answered, recording
 from magfusion.jobs.init_settings import InitSettings
 from magfusion.jobs.settings import Command
+from magfusion.model.physics.earth import gravity
+from magfusion.model.trust import Finding, Trust
 from magfusion.results.figures import Figure, Figures, Section, heading
+from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.estimation.data_checks.tones import Tone, Transmitted
@@ -40,10 +56,6 @@ def run_init(settings: InitSettings, output: Path) -> Figures | None:
         return None
     if output.exists() or output.is_symlink():
         raise InputError(f"{output}: is there already; name another file with -o, or remove it")
-    from magfusion.files.site_text import site_text, to_do
-    from magfusion.model.trust import Finding, Trust
-    from magfusion.results.verdict import trust_figures
-
     heard = _heard(settings)
     settings, heard = _asked(settings, heard)
     draft, findings = _draft(settings, heard)
@@ -60,9 +72,6 @@ def _heard(settings: InitSettings) -> Transmitted | None:
     """Return what transmits in the recording, if there is one."""
     if settings.log is None:
         return None
-    from magfusion.estimation.data_checks.mending import mended
-    from magfusion.estimation.data_checks.tones import transmitted
-    from magfusion.files.open import open_log
     from magfusion.jobs.inputs import topics_option
 
     log = open_log(settings.log, topics=topics_option(settings.topics))
@@ -94,8 +103,6 @@ def _asked(
     if settings.described:
         return settings, heard
     if sys.stdin is not None and sys.stdin.isatty():
-        from magfusion.jobs.init_questions import answered, recording
-
         if settings.log is None:
             settings = replace(settings, log=recording())
             heard = _heard(settings)
@@ -109,11 +116,6 @@ def _asked(
 
 
 def _draft(settings: InitSettings, heard: Transmitted | None) -> tuple[SiteDraft, list[Finding]]:
-    from magfusion.files.instruments import UNNAMED, named_imu, named_magnetometer
-    from magfusion.files.site_draft import beacon_draft, numbers, place_of
-    from magfusion.files.site_text import SiteDraft
-    from magfusion.model.physics.earth import gravity
-
     beacons = [beacon_draft(text) for text in settings.beacon]
     names = [beacon.name for beacon in beacons]
     for name in names:
@@ -137,8 +139,6 @@ def _with_tones(
     beacons: list[BeaconDraft], heard: Transmitted | None
 ) -> tuple[list[BeaconDraft], list[Finding]]:
     """Return the beacons with the tones of the recording, and what the two say of each other."""
-    from magfusion.files.site_draft import BeaconDraft
-
     silent = [beacon.name for beacon in beacons if beacon.frequency_hz is None]
     if heard is None:
         if silent:
@@ -177,8 +177,6 @@ def _switched_off(
     beacons: list[BeaconDraft], tones: Iterable[Tone], free: list[Tone]
 ) -> list[Finding]:
     """Return which frequencies of beacons are not in a recording, and what else is."""
-    from magfusion.model.trust import Finding
-
     return [
         Finding(
             "silent_beacon",
@@ -193,8 +191,6 @@ def _switched_off(
 
 def _undeclared(tones: Iterable[Tone]) -> list[Finding]:
     """Return that some tones of a recording are of no beacon."""
-    from magfusion.model.trust import Finding
-
     return [
         Finding(
             "undeclared_line",
@@ -224,11 +220,6 @@ def _listed(tones: list[Tone]) -> str:
 
 def _bare_site(settings: InitSettings) -> Site:
     """Return the platform alone: how magnetometer and gyroscope are mounted."""
-    import tempfile
-
-    from magfusion.files.site import load_site
-    from magfusion.files.site_text import site_text
-
     draft, _ = _draft(replace(settings, beacon=()), None)
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory) / "site.yaml"
@@ -243,9 +234,6 @@ def _write(text: str, output: Path) -> None:
     ------
     InputError
     """
-    from magfusion.files.atomic import whole_file
-    from magfusion.files.site import load_site
-
     with whole_file(output) as unfinished:
         unfinished.write_text(text, encoding="utf-8")
         try:
@@ -281,11 +269,6 @@ def _figures(draft: SiteDraft, heard: Transmitted | None) -> Figures:
 
 def _list(settings: InitSettings) -> None:
     """Print the instruments that are known by name."""
-    from rich.console import Console
-    from rich.table import Table
-
-    from magfusion.files.instruments import imus, magnetometers
-
     console = Console(highlight=False, emoji=False)
     if settings.list_imus:
         table = Table("IMU", "gyro", "accel", "gyro walk", "accel walk", "source", box=None)

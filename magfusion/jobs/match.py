@@ -8,11 +8,32 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
-from magfusion.jobs.attitude_database import Sampling
+from magfusion.files.attitude_table import read_database, write_attitudes
+from magfusion.jobs.attitude_database import MAX_GAP, TABLE, Sampling, steady
+from magfusion.jobs.match_trust import judged
 from magfusion.jobs.settings import Command, LogSettings, option
+from magfusion.model.physics.earth import earth_field_world
 from magfusion.model.site import Site
+from magfusion.model.strapdown import resting
+from magfusion.model.trajectory import interpolate
+from magfusion.papers.p001_magnetometer.matching import (
+    THREE_ANGLES,
+    match_roll,
+    match_roll_pitch,
+    match_with_gravity,
+    wrap,
+)
+from magfusion.papers.p001_magnetometer.matching_database import (
+    angles_about,
+    match_interpolated,
+    match_nearest,
+    prepare,
+)
+from magfusion.results.figures import Column, Figure, Figures, Section, heading
+from magfusion.results.verdict import trust_figures
 from magfusion.units import DEGREE, Array, BoolArray
 
 if TYPE_CHECKING:
@@ -64,14 +85,9 @@ def run_match(settings: MatchSettings, output: Path) -> Figures:
         Where more angles are asked than the vectors determine, in one sentence that says what is
         lacking; where a file cannot be read, or ``output`` is in the way.
     """
-    from magfusion.files.attitude_table import write_attitudes
-    from magfusion.jobs.attitude_database import steady
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed, require_imu
-    from magfusion.jobs.match_trust import judged
-    from magfusion.results.figures import Figure, Figures, heading
     from magfusion.results.plots.match import write_match_plot
     from magfusion.results.report import write_report
-    from magfusion.results.verdict import trust_figures
 
     _check(settings)
     job, claimed = settings.job(output), claim(output, "match")
@@ -116,8 +132,6 @@ def run_match(settings: MatchSettings, output: Path) -> Figures:
 
 def _check(settings: MatchSettings) -> None:
     """Refuse what cannot be asked together, and more than the vectors determine."""
-    from magfusion.papers.p001_magnetometer.matching import THREE_ANGLES
-
     if settings.gravity:
         _check_gravity(settings)
         return
@@ -142,8 +156,6 @@ def _check_gravity(settings: MatchSettings) -> None:
 
 
 def _check_given(settings: MatchSettings) -> None:
-    from magfusion.papers.p001_magnetometer.matching import THREE_ANGLES
-
     for name, value, limit in (
         ("--pitch-deg", settings.pitch_deg, 90.0),
         ("--yaw-deg", settings.yaw_deg, 360.0),
@@ -168,12 +180,6 @@ def _given(settings: MatchSettings) -> bool:
 
 def _match(job: Job, log: Log, site: Site, taken: Steady, settings: MatchSettings) -> _Found:
     from magfusion.jobs.inputs import named
-    from magfusion.papers.p001_magnetometer.matching import (
-        match_roll,
-        match_roll_pitch,
-        match_with_gravity,
-        wrap,
-    )
 
     if settings.database is not None:
         return _by_database(settings.database, taken, settings)
@@ -199,23 +205,13 @@ def _match(job: Job, log: Log, site: Site, taken: Steady, settings: MatchSetting
 
 def _resting(log: Log, site: Site, time: Array) -> BoolArray:
     """Tell at which times the platform rests: else its acceleration passes for gravity."""
-    from magfusion.model.strapdown import resting
-
     stamps = log.imu.time + site.platform.imu.time_offset
     still = resting(stamps, log.imu.gyro_body, log.imu.accel_body, motion=site.platform.motion)
     return still[np.minimum(np.searchsorted(stamps, time), len(stamps) - 1)]
 
 
 def _by_database(place: Path, taken: Steady, settings: MatchSettings) -> _Found:
-    from magfusion.files.attitude_table import read_database
-    from magfusion.jobs.attitude_database import TABLE
     from magfusion.jobs.inputs import named
-    from magfusion.papers.p001_magnetometer.matching import match_roll, match_roll_pitch
-    from magfusion.papers.p001_magnetometer.matching_database import (
-        match_interpolated,
-        match_nearest,
-        prepare,
-    )
 
     path = place / TABLE if place.is_dir() else place
     database = read_database(path)
@@ -241,8 +237,6 @@ def _by_database(place: Path, taken: Steady, settings: MatchSettings) -> _Found:
 
 
 def _earth_field(job: Job, site: Site) -> Array:
-    from magfusion.model.physics.earth import earth_field_world
-
     if site.earth_field_world is not None:
         return site.earth_field_world
     place = site.location
@@ -258,11 +252,6 @@ def _earth_field(job: Job, site: Site) -> Array:
 
 def _compared(log: Log, time: Array, found: _Found) -> tuple[Array | None, Figures]:
     """Return the true angles (NaN where there are none) and the errors against them."""
-    from magfusion.jobs.attitude_database import MAX_GAP
-    from magfusion.model.trajectory import interpolate
-    from magfusion.papers.p001_magnetometer.matching import wrap
-    from magfusion.results.figures import Figure, Figures, Section
-
     if log.truth is None:
         return None, Figures()
     poses, exists = interpolate(log.truth, time, MAX_GAP)
@@ -291,10 +280,6 @@ def _compared(log: Log, time: Array, found: _Found) -> tuple[Array | None, Figur
 
 def _whole_attitude(poses: Trajectory, rpy: Array, used: BoolArray) -> Figure:
     """Return the error of the attitude with the angles that were given, and of what was given."""
-    from scipy.spatial.transform import Rotation
-
-    from magfusion.results.figures import Column, Figure, Section
-
     true = Rotation.from_matrix(poses.world_from_body[used])
     turn = true.inv() * Rotation.from_euler("xyz", rpy[used])
     rms = float(np.sqrt(np.mean(turn.magnitude() ** 2)) / DEGREE)
@@ -303,8 +288,6 @@ def _whole_attitude(poses: Trajectory, rpy: Array, used: BoolArray) -> Figure:
 
 def _true_angles(world_from_body: Array, given: Array, angles: tuple[int, ...]) -> Array:
     """Return the true angles about those that were given."""
-    from magfusion.papers.p001_magnetometer.matching_database import angles_about
-
     if 2 in angles:
         heading = np.arctan2(world_from_body[:, 1, 0], world_from_body[:, 0, 0])
         return angles_about(world_from_body, heading)

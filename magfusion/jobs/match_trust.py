@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from magfusion.estimation.data_checks.recording import BRIDGED, recorded
 from magfusion.model.trust import Finding, Trust, Unverified, Verdict
 from magfusion.units import DEGREE, NANOTESLA, Array
 
@@ -43,8 +44,6 @@ def judged(
         The field that was taken as exact (T); none with a database, which refuses what it does not
         know by itself.
     """
-    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
-
     findings = [*_undetermined(matches), *recorded(log, site, BRIDGED)]
     unverified = []
     if field_world is not None:

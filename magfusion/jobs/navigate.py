@@ -11,12 +11,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.estimation.data_checks.spectrum import beside_lines
+from magfusion.files.checkpoint import claim_checkpoint, run_key
+from magfusion.files.row_file import RowFile, claim_rows
+from magfusion.files.site import load_site
+from magfusion.files.standard_streams import binary_input, binary_output, until_closed
 from magfusion.jobs.live import state_sinks
+from magfusion.jobs.navigate_rests import run_at_rest
 from magfusion.jobs.navigate_settings import NavigateSettings
 from magfusion.jobs.rates import refuse_rate
+from magfusion.jobs.replay import PIECE, Replay, feed, paced
 from magfusion.jobs.settings import Command
+from magfusion.jobs.state_rows import CARRIED, CURRENT, LAGGED, StateRows, row_columns
 from magfusion.model.progress import Report, quiet
 from magfusion.model.site import Site
+from magfusion.model.trust import Trust
+from magfusion.model.without_imu import require_motion_prior
+from magfusion.results.figures import heading
+from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.estimation.online.navigator import Navigator, NavigatorSettings
@@ -40,8 +53,6 @@ def run(
 ) -> Figures | None:
     """Navigate as the settings ask; see `run_navigate` and `run_stream`."""
     if settings.at_rest:
-        from magfusion.jobs.navigate_rests import run_at_rest
-
         return run_at_rest(settings, output, given, report)
     if str(settings.log) == "-":
         _run_pipe(settings, given)
@@ -60,8 +71,6 @@ def run(
 
 
 def _run_pipe(settings: NavigateSettings, given: set[str]) -> None:
-    from magfusion.files.site import load_site
-    from magfusion.files.standard_streams import binary_input, binary_output, until_closed
     from magfusion.jobs.stream import StreamSettings, run_stream
 
     if settings.site is None:
@@ -105,12 +114,8 @@ def run_navigate(settings: NavigateSettings, output: Path, report: Report = quie
     EstimationError
         Where the log leads to no state.
     """
-    from magfusion.estimation.data_checks.spectrum import beside_lines
-    from magfusion.files.checkpoint import claim_checkpoint
-    from magfusion.files.row_file import claim_rows
     from magfusion.jobs.inputs import CHECKPOINT, claim, found_in, named, read_job, refuse_failed
     from magfusion.jobs.navigate_results import motion_of, write_navigated
-    from magfusion.model.without_imu import require_motion_prior
     from magfusion.results.report import write_report
 
     job, claimed = settings.job(output), claim(output, "navigate")
@@ -179,13 +184,8 @@ def _refuse_phasors(path: Path, log: Log, settings: NavigateSettings) -> None:
 
 def _results(run: NavigateRun) -> tuple[Figures, Trust, NavigateResults | None]:
     """Return figures and verdict of a run, and its results where it led to a state."""
-    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
     from magfusion.estimation.integrity.diagnosis import with_cause
     from magfusion.jobs.navigate_results import navigated, no_start
-    from magfusion.jobs.replay import PIECE
-    from magfusion.model.trust import Trust
-    from magfusion.results.figures import heading
-    from magfusion.results.verdict import trust_figures
 
     log, navigator = run.replay.log, run.navigator
     if not navigator.started:
@@ -247,11 +247,7 @@ def _open_run(
     place: Path,
     sinks: tuple[StateSink, ...],
 ) -> NavigateRun:
-    from magfusion.files.checkpoint import run_key
-    from magfusion.files.row_file import RowFile
     from magfusion.jobs.checkpoint import Kept, begin
-    from magfusion.jobs.replay import PIECE, Replay
-    from magfusion.jobs.state_rows import StateRows, row_columns
 
     known = (log.imu, log.waveform, log.fields, *log.waveforms.values())
     streams = [stream for stream in known if stream is not None]
@@ -272,9 +268,6 @@ def _open_run(
 
 def _advance(run: NavigateRun, settings: NavigateSettings, report: Report) -> None:
     """Take in the pieces that are left, and leave a checkpoint from time to time."""
-    from magfusion.jobs.replay import PIECE, feed, paced
-    from magfusion.jobs.state_rows import CARRIED, CURRENT, LAGGED
-
     began = time.perf_counter() - run.elapsed
     every, told = max(1, round(settings.every / PIECE)), -np.inf
     for k, piece in paced(run.replay.pieces(run.position), settings.realtime):

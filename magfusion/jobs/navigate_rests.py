@@ -11,8 +11,18 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
 import numpy as np
 
 from magfusion.errors import EstimationError, InputError
+from magfusion.estimation.data_checks.recording import BRIDGED, recorded
+from magfusion.files.site import load_site, save_site
+from magfusion.files.standard_streams import binary_input, binary_output, until_closed
+from magfusion.files.stream import json_line, read_records, whole_rows
+from magfusion.files.trajectory_table import write_trajectory
+from magfusion.files.tum import write_tum
 from magfusion.model.progress import Report, quiet
+from magfusion.model.quaternion import of_matrices
+from magfusion.model.trajectory import Trajectory
+from magfusion.model.trust import Trust, alike
 from magfusion.results.figures import Figure, Figures, heading
+from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.estimation.rests.rest_stream import RestNavigator, RestState
@@ -53,9 +63,6 @@ def run_at_rest(
     settings: NavigateSettings, output: Path, given: set[str], report: Report
 ) -> Figures | None:
     """Tell where the platform stands, as it stands."""
-    from magfusion.files.site import load_site
-    from magfusion.files.standard_streams import binary_input, binary_output, until_closed
-
     refuse_other(given)
     pipe = str(settings.log) == "-"
     job = settings.job(Path() if pipe else output)
@@ -118,9 +125,7 @@ def run_rests(job: Job, how: How, report: Report = quiet) -> Figures:
     InputError, EstimationError
         Where it does not rest, or no beacon is heard.
     """
-    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
     from magfusion.jobs.inputs import claim, named, read_job, refuse_failed
-    from magfusion.model.trust import Trust
 
     claimed = claim(job.output, "navigate")
     log, site = read_job(job, reference=True, heard=False, report=report)
@@ -167,15 +172,9 @@ def _newest_of_rests(states: list[RestState]) -> list[RestState]:
 
 def _written(whole: Path, log: Log, site: Site, told: list[RestState], trust: Trust) -> Figures:
     """Write the poses, and return their figures."""
-    from magfusion.files.site import save_site
-    from magfusion.files.trajectory_table import write_trajectory
-    from magfusion.files.tum import write_tum
     from magfusion.jobs.inputs import found_in
-    from magfusion.model.trajectory import Trajectory
-    from magfusion.model.trust import alike
     from magfusion.results.recording import write_recording
     from magfusion.results.report import compared_with_truth
-    from magfusion.results.verdict import trust_figures
 
     fixes = [one.found.fixes for one in told if one.found is not None]
     best = Trajectory(
@@ -237,8 +236,6 @@ def run_rests_stream(
     InputError
         Where a record is none and ``keep_going`` is not set.
     """
-    from magfusion.files.stream import json_line, read_records
-
     navigator, refused = how.navigator(site), 0
     for numbered in read_records(source, form):
         try:
@@ -263,8 +260,6 @@ def run_rests_stream(
 
 
 def _take_in(navigator: RestNavigator, record: Record) -> None:
-    from magfusion.files.stream import whole_rows
-
     if record.imu is not None:
         time, gyro, accel = whole_rows(record.imu.time, record.imu.gyro, record.imu.accel)
         navigator.add_imu(time, gyro, accel)
@@ -281,7 +276,6 @@ def _take_in(navigator: RestNavigator, record: Record) -> None:
 def rest_content(state: RestState) -> dict[str, Any]:
     """Return a state of a rest as it is written; what is not known is null."""
     from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
-    from magfusion.model.quaternion import of_matrices
 
     trust, names = state.trust, () if state.samples is None else state.samples.channels
     heard = zip(names, state.heard.tolist(), strict=False)

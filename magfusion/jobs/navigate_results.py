@@ -1,5 +1,6 @@
 """What a navigation along a log comes to: trajectories with their verdicts, figures and files."""
 
+import resource
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -250,8 +251,6 @@ def _memory_mb() -> float | None:
     """Return the most memory that the process has had; None where the system does not report it."""
     if sys.platform == "win32":
         return None
-    import resource
-
     unit = 1 << 20 if sys.platform == "darwin" else 1 << 10  # macOS reports bytes
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 

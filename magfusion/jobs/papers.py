@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from magfusion.jobs.settings import Command, Settings, argument, option
+from magfusion.papers.register import paper, papers
 
 if TYPE_CHECKING:
     from magfusion.papers.register import Numbered, Paper
@@ -37,8 +38,6 @@ def run_papers(settings: PapersSettings) -> None:
     InputError
         Where there is no such paper, or the paper has no such number.
     """
-    from magfusion.papers.register import paper, papers
-
     if settings.paper is None:
         found = papers()
         text, content = "\n\n".join(map(_head, found)), [_told(one) for one in found]

@@ -6,8 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from magfusion.estimation.ranging.ranging import find_range
+from magfusion.estimation.ranging.ranging_windows import DepthErrors, ranging_log
+from magfusion.estimation.ranging.relative_wells import Wells
+from magfusion.estimation.snapshot.priors import trust_of, unexplained
+from magfusion.files.table import Span, write_table
 from magfusion.jobs.settings import Command, LogSettings, option
+from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.figures import Figure, Figures, Section, heading
+from magfusion.results.verdict import trust_figures
+from magfusion.units import DEGREE
 
 if TYPE_CHECKING:
     from magfusion.estimation.ranging.ranging import Ranged
@@ -42,17 +52,9 @@ def run_range(settings: RangeSettings, output: Path) -> Figures:
     InputError
         Where the site has no rotor, or more than it; or the log lacks what ranging needs.
     """
-    import numpy as np
-
-    from magfusion.estimation.ranging.ranging import find_range
-    from magfusion.estimation.ranging.ranging_windows import DepthErrors, ranging_log
-    from magfusion.estimation.ranging.relative_wells import Wells
-    from magfusion.files.table import Span, write_table
     from magfusion.jobs.inputs import claim, found_in, named, read_job, refuse_failed
     from magfusion.results.plots.ranging import RangePicture, write_range_plot
     from magfusion.results.report import write_report
-    from magfusion.results.verdict import trust_figures
-    from magfusion.units import DEGREE
 
     job, claimed = settings.job(output), claim(output, "range")
     log, site = read_job(job, unknown=True, rotor=True)
@@ -103,11 +105,7 @@ def run_range(settings: RangeSettings, output: Path) -> Figures:
 
 
 def _judged(log: Log, told: RangingLog, found: Ranged) -> tuple[Trust, float]:
-    import numpy as np
-
     from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
-    from magfusion.estimation.snapshot.priors import trust_of, unexplained
-    from magfusion.model.trust import Finding, Trust, Verdict
 
     fields = told.windows.fields
     name = fields.channels[0][0]
@@ -154,8 +152,6 @@ def _judged(log: Log, told: RangingLog, found: Ranged) -> tuple[Trust, float]:
 
 
 def _vague(wells: Wells, sensor: float) -> Trust:
-    from magfusion.model.trust import Finding, Trust
-
     one = wells.abreast(sensor)
     if one.distance_sigma <= VAGUE * one.distance:
         return Trust()
@@ -167,10 +163,6 @@ def _vague(wells: Wells, sensor: float) -> Trust:
 
 
 def _figures(told: RangingLog, found: Ranged, wells: Wells, sensor: object) -> Figures:
-    import numpy as np
-
-    from magfusion.units import DEGREE
-
     figures = [
         Figure("windows", len(told.windows.fields)),
         Figure("windows_dropped", told.dropped, section=Section.REPORT),

@@ -6,7 +6,10 @@ import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from magfusion.errors import InputError
+from magfusion.model.region import Region
 
 if TYPE_CHECKING:
     from magfusion.model.site import Site
@@ -41,8 +44,6 @@ class Where:
             site = _in_front(site, text)
         if self.region is None:
             return site
-        from magfusion.model.region import Region
-
         box, earlier = _box(self.region), site.region or Region()
         return dataclasses.replace(site, region=dataclasses.replace(earlier, box_world=box))
 
@@ -73,8 +74,6 @@ def _in_front(site: Site, text: str) -> Site:
 
 
 def _direction(direction: str, text: str) -> Array:
-    import numpy as np
-
     if len(direction) == 2 and direction[0] in "+-" and direction[1] in "xyz":
         sign = 1.0 if direction[0] == "+" else -1.0
         return np.asarray(sign * np.eye(3)["xyz".index(direction[1])])
@@ -91,8 +90,6 @@ def _direction(direction: str, text: str) -> Array:
 
 
 def _box(text: str) -> Array:
-    import numpy as np
-
     try:
         box = np.array([float(part) for part in text.split(",")]).reshape(3, 2).T
     except ValueError:

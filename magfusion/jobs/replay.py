@@ -10,7 +10,23 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
+from magfusion.estimation.demodulation.drive_reference import cosines
+from magfusion.files.long_log import LongLog, long_log
+from magfusion.files.open import open_log
+from magfusion.files.standard_streams import binary_output, until_closed
+from magfusion.files.stream_contents import (
+    drive_content,
+    fields_contents,
+    imu_content,
+    magnetometer_content,
+    marks_content,
+    reference_content,
+    temperature_content,
+    write_record,
+)
 from magfusion.jobs.settings import Command, PartSettings, ReplayedSettings
+from magfusion.model.samples import ImuSamples, Waveform
+from magfusion.model.temperature import Temperatures
 from magfusion.units import Array, IntArray
 
 if TYPE_CHECKING:
@@ -84,8 +100,6 @@ class Replay:
 
     def piece(self, k: int) -> Piece:
         """Return one piece."""
-        from magfusion.model.samples import ImuSamples
-
         imu, waveform = self.log.imu, self.log.waveform
         own = slice(*self._imu[k : k + 2])
         part = slice(*self._waveform[k : k + 2])
@@ -160,8 +174,6 @@ def _field_arrival(fields: FieldSamples | None) -> Array:
 
 def _of_long(log: LongLog) -> Iterator[tuple[int, Piece]]:
     """Yield the pieces of a log that is read while they are used."""
-    from magfusion.model.samples import ImuSamples, Waveform
-
     imu, waveform = log.imu(), log.waveform()
     arrival = _field_arrival(log.fields)
     known = [first for first in (imu.first, waveform.first) if first is not None]
@@ -185,9 +197,6 @@ def _of_long(log: LongLog) -> Iterator[tuple[int, Piece]]:
 
 def _currents(log: Log | LongLog) -> DriveSamples | None:
     """Return the currents of coils, or those that stand for the angles of rotors."""
-    from magfusion.estimation.demodulation.drive_reference import cosines
-    from magfusion.files.long_log import LongLog
-
     if isinstance(log, LongLog) or log.drive is not None or log.rotation is None:
         return None if isinstance(log, LongLog) else log.drive
     return cosines(log.rotation)
@@ -195,13 +204,6 @@ def _currents(log: Log | LongLog) -> DriveSamples | None:
 
 def _contents(piece: Piece) -> Iterator[dict[str, Any]]:
     """Yield a piece as records."""
-    from magfusion.files.stream_contents import (
-        fields_contents,
-        imu_content,
-        magnetometer_content,
-        marks_content,
-    )
-
     if len(piece.imu):
         yield imu_content(piece.imu)
     for name, wave in piece.waves:
@@ -217,9 +219,6 @@ class _Beside:
     """What goes with the samples of a log, and is known before them."""
 
     def __init__(self, log: Log | LongLog) -> None:
-        from magfusion.files.long_log import LongLog
-        from magfusion.model.temperature import Temperatures
-
         degrees = log.temperatures or Temperatures()
         self._readings = deque(sorted(degrees.each()))
         self._currents = _currents(log)
@@ -227,12 +226,6 @@ class _Beside:
 
     def until(self, arrival: float) -> Iterator[dict[str, Any]]:
         """Yield the records of what has come up to a time (s)."""
-        from magfusion.files.stream_contents import (
-            drive_content,
-            reference_content,
-            temperature_content,
-        )
-
         while self._readings and self._readings[0][0] < arrival:
             yield temperature_content(*self._readings.popleft())
         if self._currents is not None:
@@ -249,9 +242,6 @@ class _Beside:
 
 def run_replay(log: Log | LongLog, sink: BinaryIO, form: Format, realtime: bool) -> None:
     """Write a log as the records of a stream, in the order of their arrival."""
-    from magfusion.files.long_log import LongLog
-    from magfusion.files.stream_contents import write_record
-
     pieces = _of_long(log) if isinstance(log, LongLog) else Replay(log).pieces()
     beside = _Beside(log)
     for _, piece in paced(pieces, realtime):
@@ -269,9 +259,6 @@ class ReplaySettings(PartSettings, ReplayedSettings):
 
 def run(settings: ReplaySettings) -> None:
     """Print a log as records; see `run_replay`."""
-    from magfusion.files.long_log import long_log
-    from magfusion.files.open import open_log
-    from magfusion.files.standard_streams import binary_output, until_closed
     from magfusion.jobs.inputs import topics_option
 
     sink = binary_output()

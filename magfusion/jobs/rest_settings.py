@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from magfusion.estimation.rests.at_rest import at_rest
 from magfusion.jobs.settings import Settings, option
 
 if TYPE_CHECKING:
@@ -45,6 +46,4 @@ class RestSettings(Settings):
         """
         if not self.at_rest:
             return None
-        from magfusion.estimation.rests.at_rest import at_rest
-
         return at_rest(log, site, lockin, self.false_alarm, least)

@@ -1,7 +1,7 @@
 """What a job asks of its user: fields that know their help, unit and bounds.
 
-The command line is made of them (`magfusion.cli`), so nothing heavy is imported here or at the
-top of any job: that happens inside ``run``, when it is known which job it is.
+The command line is made of them (`magfusion.cli`) before BLAS threads are set, so NumPy is not
+imported here, and gtsam, rerun and matplotlib not at the top of any job but inside ``run``.
 """
 
 from __future__ import annotations

@@ -6,10 +6,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
 from magfusion.errors import InputError
+from magfusion.files.log import write_log
+from magfusion.files.site import load_site, save_site
+from magfusion.jobs.rotor_inputs import is_for_ranging
 from magfusion.jobs.settings import Command, option
 from magfusion.jobs.simulate_passes import ShaftSettings, run_passes
+from magfusion.model.trust import Trust
 from magfusion.results.figures import Figure, Figures, Section, heading
+from magfusion.results.verdict import trust_figures
+from magfusion.simulation.atmosphere import Atmosphere
+from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
+from magfusion.simulation.disturbance import Ambient, FieldDrift, office_noise
+from magfusion.simulation.layers import layers_option
+from magfusion.simulation.log import EPOCH_NS, Reference, SimulationConfig, simulate_log
+from magfusion.simulation.rails import laid, rails_option
+from magfusion.simulation.slots import Multiplexer
+from magfusion.simulation.waveform import usual_rate_hz
 
 if TYPE_CHECKING:
     from magfusion.model.site import Site
@@ -98,8 +113,6 @@ def box_option(text: str | None) -> Array | None:
     ------
     InputError
     """
-    import numpy as np
-
     if text is None:
         return None
     try:
@@ -125,10 +138,6 @@ def reference_option(text: str | None) -> Reference | None:
     ------
     InputError
     """
-    import numpy as np
-
-    from magfusion.simulation.log import Reference
-
     if text is None:
         return None
     try:
@@ -145,16 +154,6 @@ def reference_option(text: str | None) -> Reference | None:
 
 def run(settings: SimulateSettings, output: Path) -> Figures:
     """Simulate a log as the settings ask; see `run_simulate`."""
-    from magfusion.files.site import load_site
-    from magfusion.jobs.rotor_inputs import is_for_ranging
-    from magfusion.simulation.atmosphere import Atmosphere
-    from magfusion.simulation.demo_site import DEMO_BOX_WORLD, demo_site
-    from magfusion.simulation.disturbance import Ambient, FieldDrift, office_noise
-    from magfusion.simulation.layers import layers_option
-    from magfusion.simulation.log import EPOCH_NS, SimulationConfig
-    from magfusion.simulation.slots import Multiplexer
-    from magfusion.simulation.waveform import usual_rate_hz
-
     site = demo_site()
     if settings.site is not None:
         site = load_site(settings.site, several=True, unknown=True)
@@ -195,10 +194,6 @@ def run(settings: SimulateSettings, output: Path) -> Figures:
 
 def _rails(text: str | None, box_world: Array, site: Site) -> Steel | None:
     """Return the steel that is asked for, laid about a room (m, shape (2, 3)) and its beacons."""
-    import numpy as np
-
-    from magfusion.simulation.rails import laid, rails_option
-
     if text is None:
         return None
     beacons_world = np.array([beacon.position_world for beacon in site.beacons]).reshape(-1, 3)
@@ -207,9 +202,6 @@ def _rails(text: str | None, box_world: Array, site: Site) -> Steel | None:
 
 def _passes(settings: SimulateSettings, site: Site, output: Path) -> Figures:
     """Simulate passes of a magnet in a well, where nothing else is asked for."""
-    from magfusion.simulation.layers import layers_option
-    from magfusion.simulation.rails import rails_option
-
     usual = SimulateSettings(seed=settings.seed)
     without = ("motion", "box", "iron", "ambient", "drift", "storms", "reference", "random_field")
     for name in without:
@@ -259,15 +251,8 @@ def run_simulate(site: Site, config: SimulationConfig, output: Path, seed: int) 
     InputError
         Where ``output`` is in the way, or the configuration does not fit the site.
     """
-    import numpy as np
-
-    from magfusion.files.log import write_log
-    from magfusion.files.site import save_site
     from magfusion.jobs.inputs import claim
-    from magfusion.model.trust import Trust
     from magfusion.results.report import write_report
-    from magfusion.results.verdict import trust_figures
-    from magfusion.simulation.log import simulate_log
 
     claimed = claim(output, "simulate")
     rng = np.random.default_rng(seed)

@@ -6,9 +6,26 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from magfusion.errors import InputError
+from magfusion.files.log import write_log
+from magfusion.files.site import save_site
+from magfusion.files.wells_file import read_wells
 from magfusion.jobs.settings import RandomSettings, option
+from magfusion.model.platform_motion import NO_IMU
+from magfusion.model.samples import ImuSamples
+from magfusion.model.trust import Trust
 from magfusion.results.figures import Figure, Figures, heading
+from magfusion.results.verdict import trust_figures
+from magfusion.simulation.perturbed import perturb_site, with_earth_field
+from magfusion.simulation.pipe import Steel
+from magfusion.simulation.rails import beside_wells
+from magfusion.simulation.rotor import Surroundings, simulate_passes
+from magfusion.simulation.shaft import ShaftErrors, draw_shaft
+from magfusion.simulation.waveform import LEAST_SAMPLES_PER_CYCLE
+from magfusion.simulation.wells import TwoWells, drawn_steel, lean_of
+from magfusion.units import DEGREE
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,9 +71,6 @@ class ShaftSettings(RandomSettings):
 
     def shaft_errors(self) -> ShaftErrors:
         """Return what they say of shafts."""
-        from magfusion.simulation.shaft import ShaftErrors
-        from magfusion.units import DEGREE
-
         return ShaftErrors(
             self.shaft_drift,
             self.shaft_whirl * DEGREE,
@@ -67,11 +81,6 @@ class ShaftSettings(RandomSettings):
 
 def laid_wells(entry: WellsEntry, rng: np.random.Generator) -> TwoWells:
     """Return the wells of a file; how the magnet is turned on its shaft is drawn."""
-    import numpy as np
-
-    from magfusion.simulation.wells import TwoWells, lean_of
-    from magfusion.units import DEGREE
-
     return TwoWells(
         distance=entry.distance_m,
         direction=entry.high_side_deg * DEGREE,
@@ -107,21 +116,8 @@ def run_passes(
     beside : tuple of Pipe
         Steel beside the wells.
     """
-    import numpy as np
-
-    from magfusion.files.log import write_log
-    from magfusion.files.site import save_site
-    from magfusion.files.wells_file import read_wells
     from magfusion.jobs.inputs import claim
-    from magfusion.model.platform_motion import NO_IMU
-    from magfusion.model.samples import ImuSamples
-    from magfusion.model.trust import Trust
     from magfusion.results.report import write_report
-    from magfusion.results.verdict import trust_figures
-    from magfusion.simulation.perturbed import perturb_site, with_earth_field
-    from magfusion.simulation.rotor import simulate_passes
-    from magfusion.simulation.shaft import draw_shaft
-    from magfusion.simulation.waveform import LEAST_SAMPLES_PER_CYCLE
 
     entry, claimed = read_wells(settings.wells), claim(output, "simulate")
     rng = np.random.default_rng(settings.seed)
@@ -158,10 +154,6 @@ def run_passes(
 
 def _laid(beside: tuple[Pipe, ...], passes: tuple[Pass, ...], wells: TwoWells) -> tuple[Pipe, ...]:
     """Return steel in segments that are short against how near sensor and magnet come."""
-    import numpy as np
-
-    from magfusion.simulation.rails import beside_wells
-
     ways_world = [np.stack([one.sensor_world for one in passes])]
     for one in passes:
         way = np.linspace(0.0, one.depth[1] - one.depth[0], WAY_POINTS)
@@ -179,10 +171,6 @@ def _around(
     *,
     perturb: bool,
 ) -> Surroundings:
-    from magfusion.simulation.pipe import Steel
-    from magfusion.simulation.rotor import Surroundings
-    from magfusion.simulation.wells import drawn_steel
-
     casing, steel = site.platform.magnetometer.casing, None
     if casing is not None:
         true = drawn_steel(casing, rng) if perturb else casing
@@ -206,8 +194,6 @@ def _figures(
     settings: ShaftSettings, wells: TwoWells, passes: tuple[Pass, ...], stretch: float
 ) -> Figures:
     """Return what is true, in the words of `range`; depths of the magnet as they are read."""
-    from magfusion.units import DEGREE
-
     figures = [
         Figure("seed", settings.seed),
         Figure("passes", len(passes)),

@@ -7,8 +7,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
 from magfusion.errors import EstimationError, InputError
-from magfusion.jobs.rates import RateSettings
+from magfusion.estimation.data_checks.recording import BRIDGED, beyond, recorded
+from magfusion.estimation.snapshot.coil_gain import with_found_gain
+from magfusion.estimation.solve.memory import give_back_memory
+from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
+from magfusion.jobs.failure import OPEN, reason_of
+from magfusion.jobs.fix import write_fix_result
+from magfusion.jobs.rates import RateSettings, refuse_rate
 from magfusion.jobs.region import RegionSettings
 from magfusion.jobs.rest_settings import RestSettings
 from magfusion.jobs.settings import (
@@ -20,8 +28,12 @@ from magfusion.jobs.settings import (
     WindowSettings,
     option,
 )
+from magfusion.model.parameters import initial_calibration
 from magfusion.model.progress import Report, quiet
+from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.figures import Figure, Figures, Section, heading
+from magfusion.results.rest_figures import rest_figures
+from magfusion.results.verdict import trust_figures
 
 if TYPE_CHECKING:
     from magfusion.estimation.batch.batch import Smoothed, SmootherSettings
@@ -169,14 +181,9 @@ def run_smooth(
         In the latter case the single-epoch fixes have been saved in the output directory.
     """
     from magfusion.estimation.batch.self_survey import smooth_and_place
-    from magfusion.estimation.data_checks.recording import beyond
-    from magfusion.estimation.solve.memory import give_back_memory
-    from magfusion.jobs.failure import reason_of
     from magfusion.jobs.inputs import claim, named, refuse_failed
-    from magfusion.jobs.rates import refuse_rate
     from magfusion.jobs.smooth_result import finished, with_errors, write_finished
     from magfusion.results.report import FAILED
-    from magfusion.results.rest_figures import rest_figures
 
     claimed = claim(job.output, "smooth", "fix")
     recording, site = _read(job, settings, by_rests=rest is not None, report=report)
@@ -256,7 +263,6 @@ def _passes(
 ) -> PassFile:
     """Return the file that keeps the passes, of a log with this site and these settings."""
     from magfusion.estimation.batch.passes import PassFile
-    from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
 
     if any(beacon.unknown is not None for beacon in site.beacons):
         raise InputError(
@@ -277,8 +283,6 @@ def _rested(
     job: Job, log: Log, site: Site, rest: RestSettings, settings: SmootherSettings
 ) -> AtRest:
     """Return the rests of a log, of which at least one beacon is heard in any."""
-    import numpy as np
-
     from magfusion.jobs.inputs import named
 
     if site.platform.further:
@@ -297,7 +301,6 @@ def _rested(
 def _with_gain(job: Job, log: Log, site: Site, settings: SmootherSettings) -> Site:
     """Return the site with the gain that the epochs of a receiver of one axis tell."""
     from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
-    from magfusion.estimation.snapshot.coil_gain import with_found_gain
     from magfusion.jobs.inputs import named
 
     if len(site.platform.magnetometer.axes) != 1:
@@ -335,18 +338,10 @@ def _save_fixes_instead(
     whole: Path, settings: SmootherSettings, log: Log, site: Site, reason: str
 ) -> str:
     """Write the fixes where there is no trajectory, below a name that says so; return why."""
-    import numpy as np
-
-    from magfusion.estimation.data_checks.recording import BRIDGED, recorded
     from magfusion.estimation.demodulation.demodulation import first_fixes, phasors
     from magfusion.estimation.integrity.diagnosis import OF_CATCH_ALL, with_cause
-    from magfusion.jobs.failure import OPEN
-    from magfusion.jobs.fix import write_fix_result
     from magfusion.jobs.inputs import found_in
-    from magfusion.model.parameters import initial_calibration
-    from magfusion.model.trust import Finding, Trust, Verdict
     from magfusion.results.report import dropped_figures, fix_figures
-    from magfusion.results.verdict import trust_figures
 
     samples, dropped = phasors(log, site, settings.lockin)
     fixes = first_fixes(samples, log, initial_calibration(site, float(np.mean(samples.time))))

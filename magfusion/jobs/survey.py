@@ -7,10 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from magfusion.errors import InputError
+from magfusion.estimation.data_checks.recording import passed_on
+from magfusion.files.survey import Survey, write_survey
 from magfusion.jobs.settings import Command, LogSettings, WindowSettings, option
 from magfusion.model.site import Site
+from magfusion.model.strapdown import resting
+from magfusion.model.trajectory import interpolate
+from magfusion.results.figures import Figure, Figures, heading
+from magfusion.results.verdict import trust_figures
 from magfusion.units import Array, BoolArray, ComplexArray, IntArray
 
 if TYPE_CHECKING:
@@ -56,7 +64,6 @@ def run_survey(settings: SurveySettings, output: Path) -> Figures:
         Where the log has no pose, none of its epochs can be a point, or ``output`` is in the way.
     """
     from magfusion.estimation.demodulation.demodulation import fix_inputs, phasors
-    from magfusion.files.survey import write_survey
     from magfusion.jobs.inputs import claim, named, read_job
     from magfusion.results.plots.survey import write_survey_plot
     from magfusion.results.report import dropped_figures, write_report
@@ -112,9 +119,6 @@ def make_survey(
     A stop's phasors are averaged with the pose over its windows; those of an unsynchronised beacon
     are first turned to one drive phase, which drifts.  ``sigma`` counts overlapping windows once.
     """
-    from magfusion.files.survey import Survey
-    from magfusion.model.trajectory import interpolate
-
     known, exists = interpolate(poses, samples.time, MAX_GAP)
     detected = samples.valid.any(axis=1)
     still = np.ones(len(samples), dtype=bool)
@@ -152,8 +156,6 @@ def make_survey(
 
 def _at_rest(samples: FieldSamples, log: Log, site: Site) -> BoolArray:
     """Return during which windows every inertial sample is at rest."""
-    from magfusion.model.strapdown import resting
-
     time = log.imu.time + site.platform.imu.time_offset
     motion = site.platform.motion
     moving = ~resting(time, log.imu.gyro_body, log.imu.accel_body, motion=motion)
@@ -166,8 +168,6 @@ def _at_rest(samples: FieldSamples, log: Log, site: Site) -> BoolArray:
 
 def _stands(samples: FieldSamples, poses: Trajectory) -> BoolArray:
     """Return during which windows the known poses stay within `STILL`, where no IMU tells."""
-    from magfusion.model.trajectory import interpolate
-
     still = np.ones(len(samples), dtype=bool)
     ends = []
     for sign in (-0.5, 0.5):
@@ -197,8 +197,6 @@ def _mean(
     samples: FieldSamples, site: Site, rows: IntArray, position: Array, attitude: Array
 ) -> _Point:
     """Return the mean of the windows of one stop."""
-    from scipy.spatial.transform import Rotation
-
     valid = samples.valid[rows]
     phasor = np.where(valid[..., None], samples.phasor_sensor[rows], 0.0)
     free = [not b.synchronised for b in site.beacons for _ in b.tones]
@@ -226,8 +224,6 @@ def _windows_beside(samples: FieldSamples, rows: IntArray) -> float:
 
 def _spaced(position: Array, spacing: float) -> IntArray:
     """Return the points, in their order, that no earlier one is nearer to than the spacing."""
-    from scipy.spatial import KDTree
-
     if spacing == 0.0 or len(position) == 0:
         return np.arange(len(position))
     keep = np.ones(len(position), dtype=bool)
@@ -239,10 +235,7 @@ def _spaced(position: Array, spacing: float) -> IntArray:
 
 
 def _figures(log: Log, site: Site, survey: Survey, dropped: dict[str, int]) -> Figures:
-    from magfusion.estimation.data_checks.recording import passed_on
-    from magfusion.results.figures import Figure, Figures, heading
     from magfusion.results.report import dropped_figures
-    from magfusion.results.verdict import trust_figures
 
     detected = np.isfinite(survey.sigma)
     own = np.array([name for name, _ in survey.channels])

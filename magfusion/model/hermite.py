@@ -1,6 +1,7 @@
 """Cubics through values and slopes.
 
-As `scipy.interpolate.CubicHermiteSpline`, which takes longer to import than what it does here.
+As `scipy.interpolate.CubicHermiteSpline`, which first makes the cubics between all known times:
+of a hundred times among five thousand it takes fifty times as long.
 """
 
 import numpy as np

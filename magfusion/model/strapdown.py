@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from magfusion.model.quaternion import components, cross, of_vectors, product, unit
 from magfusion.model.site import MotionModel
@@ -32,8 +33,6 @@ def rotation_increments(time: Array, gyro_body: Array) -> Rotation:
     Rotation
         n - 1 rotations ``body(k)_from_body(k+1)``; second-order coning included.
     """
-    from scipy.spatial.transform import Rotation  # which takes long to import
-
     return Rotation.from_rotvec(_increments(time, gyro_body))
 
 
@@ -74,8 +73,6 @@ def attitude_from_gyro(time: Array, gyro_body: Array) -> Rotation:
     Rotation
         n rotations, the first the identity.
     """
-    from scipy.spatial.transform import Rotation  # which takes long to import
-
     return Rotation.from_quat(turn_from_gyro(time, gyro_body).T, scalar_first=True)
 
 
@@ -110,8 +107,6 @@ def attitude_at(attitude: Rotation, time: Array, gyro_body: Array, wanted: Array
     Rotation
         m rotations.
     """
-    from scipy.spatial.transform import Rotation  # which takes long to import
-
     found = turn_at(components(attitude), time, gyro_body, wanted)
     return Rotation.from_quat(found.T, scalar_first=True)
 
@@ -144,8 +139,6 @@ def attitude_from_gyro_at(time: Array, gyro_body: Array, wanted: Array) -> Rotat
     Rotation
         m rotations, as of `attitude_at` on the chain of `attitude_from_gyro`.
     """
-    from scipy.spatial.transform import Rotation  # which takes long to import
-
     return Rotation.from_quat(turn_from_gyro_at(time, gyro_body, wanted).T, scalar_first=True)
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.special import chdtrc, chdtri, fdtrc, gammaln  # scipy.stats takes long to import
+from scipy.special import chdtrc, chdtri, fdtrc, gammaln
 
 from magfusion.receiver.pieces import Pieces
 from magfusion.units import Array, ComplexArray

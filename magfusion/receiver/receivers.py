@@ -6,7 +6,9 @@ from magfusion.errors import InputError
 from magfusion.model.samples import FieldSamples, ImuSamples, Waveform
 from magfusion.model.site import Site
 from magfusion.receiver.lockin_receiver import LockinReceiver
+from magfusion.receiver.marked import MarkedReceiver
 from magfusion.receiver.receiver import Receiver
+from magfusion.receiver.slot_receiver import SlotReceiver
 from magfusion.receiver.slots import (
     SlotSettings,
     has_schedule,
@@ -25,12 +27,8 @@ def receiver_of(site: Site, settings: LockinSettings | SlotSettings | None = Non
         None chooses them by the tones or the time slots.
     """
     if is_marked(site):
-        from magfusion.receiver.marked import MarkedReceiver
-
         return MarkedReceiver(site, settings)
     if isinstance(settings, SlotSettings) or has_schedule(site):
-        from magfusion.receiver.slot_receiver import SlotReceiver
-
         return SlotReceiver(site, settings)
     return LockinReceiver(site, settings)
 

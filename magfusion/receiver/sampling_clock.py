@@ -8,6 +8,7 @@ smooth curve through stamps and ticks is the clock.
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import make_lsq_spline
 
 from magfusion.units import Array, ComplexArray, IntArray
 
@@ -194,8 +195,6 @@ def smooth_clock(tick: IntArray, stamps: Array) -> Array:
 
 def _bent_lines(tick: IntArray, stamps: Array, lines: int) -> tuple[Array, Array]:
     """Return so many connected straight lines at the ticks (s), and what stamps are off by (s)."""
-    from scipy.interpolate import make_lsq_spline  # of stamps that scatter alone
-
     inner = np.linspace(tick[0], tick[-1], lines + 1)[1:-1]
     ends = (float(tick[0]), float(tick[-1]))
     knots = np.concatenate([[ends[0]] * 2, inner, [ends[1]] * 2])

@@ -10,7 +10,9 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.estimation.online_integrity.judgement import JudgedState
 from magfusion.files.odometry_bag import UNKNOWN_VARIANCE
+from magfusion.results import ros_messages as ros
 from magfusion.results.odometry import Odometry, odometry_of
+from magfusion.results.ros_messages import Odometry as Message
 
 _TOPIC = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 _LAST_DOMAIN = 232  # its ports are the last ones that there are
@@ -26,8 +28,6 @@ def odometry_message(odometry: Odometry, frame: str, child: str) -> Any:
     frame, child : str
         Names of world and body.
     """
-    from magfusion.results import ros_messages as ros
-
     twist_cov = UNKNOWN_VARIANCE * np.eye(6)
     twist_cov[:3, :3] = odometry.velocity_cov_body
     w, x, y, z = odometry.quaternion.tolist()
@@ -73,8 +73,6 @@ class RosPublisher:
             raise InputError(
                 "--ros2: cyclonedds is not installed; pip install 'magfusion[ros2]'"
             ) from error
-        from magfusion.results.ros_messages import Odometry as Message
-
         # Reliable, since readers of ROS ask for that, but it waits for none.
         asked = Qos(
             Policy.Reliability.Reliable(max_blocking_time=duration(seconds=0)),

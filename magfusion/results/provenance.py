@@ -1,5 +1,7 @@
 """How a result came about: command, options, input files, version, date and duration."""
 
+import hashlib
+import platform
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -7,7 +9,10 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+from magfusion.files.commit import commit
 
 LARGEST_HASHED = 64 << 20  # bytes; a tenth of a second
 MOST_FILES = 60
@@ -65,10 +70,6 @@ def current_run() -> Run | None:
 @cache
 def versions() -> str:
     """Return the versions of what computed."""
-    import platform
-
-    from magfusion.files.commit import commit
-
     known = commit()
     at = f" (commit {known})" if known else ""
     libraries = [f"{name} {_version(name)}" for name in _LIBRARIES]
@@ -88,20 +89,12 @@ def input_files(run: Run) -> list[tuple[str, int, str]]:
 
 
 def _sha256(path: Path) -> str:
-    import hashlib
-
     if path.stat().st_size > LARGEST_HASHED:
         return f"not taken (above {LARGEST_HASHED >> 20} MiB)"
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _version(name: str) -> str:
-    import sys
-    from importlib.metadata import PackageNotFoundError, version
-
-    loaded = getattr(sys.modules.get(name), "__version__", None)
-    if isinstance(loaded, str):  # which says the same; what is installed is parsed line by line
-        return loaded
     try:
         return version(name)
     except PackageNotFoundError:

@@ -13,6 +13,7 @@ import numpy as np
 from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import Smoothed
 from magfusion.estimation.batch.likeliest import AMBIGUOUS_CHI_SQUARE
+from magfusion.estimation.snapshot.ambiguity import ambiguities, relations
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.one_axis import roll_is_open
 from magfusion.model.samples import Log
@@ -29,6 +30,7 @@ from magfusion.results.figures import (
     Value,
     determined_figures,
 )
+from magfusion.results.observability import observability
 from magfusion.results.page import write_page
 from magfusion.results.page_motion import Motion
 from magfusion.results.refinement import parameter_estimates
@@ -235,8 +237,6 @@ def smoothed_figures(result: Smoothed, directions: Section = _REPORT) -> Figures
     if states.pose_cov is not None:
         figures |= sigma_figures(states.pose_cov)
     if result.blocks:
-        from magfusion.results.observability import observability
-
         known = observability(result.calibration, result.blocks, result.calibration_cov)
         figures |= observability_figures(estimates, known, directions)
     return figures | Figures(*estimates) | determined_figures(estimates)
@@ -313,8 +313,6 @@ def _listed(place: Array, digits: int) -> str:
 
 def fix_figures(fixes: Fixes, site: Site) -> Figures:
     """Return the figures of single-epoch fixes, with sentences on their ambiguities."""
-    from magfusion.estimation.snapshot.ambiguity import ambiguities, relations
-
     share = fixes.probability
     second = share[:, 1] if share.shape[1] > 1 else np.zeros(len(fixes))
     epochs, ambiguous = len(fixes), int(np.sum(second > 0.05))

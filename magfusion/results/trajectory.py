@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pyarrow as pa
 
 from magfusion.errors import InputError
 from magfusion.estimation.graph.state import State, as_trajectory
@@ -17,6 +18,7 @@ from magfusion.model.site import Site
 from magfusion.model.trajectory import Trajectory
 from magfusion.results.errors import trajectory_errors
 from magfusion.results.page_motion import Motion, path_charts, size_charts
+from magfusion.results.plots.drawn import draw_charts
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -53,8 +55,6 @@ class ResultTrajectory(Trajectory):
         ImportError
             Where pandas is not installed.
         """
-        import pyarrow as pa
-
         table = pa.table(trajectory_columns(self, self.epoch_ns))
         try:
             return table.to_pandas()
@@ -99,8 +99,6 @@ class ResultTrajectory(Trajectory):
         InputError
             Where there is no pose, or fewer than three of them have a truth.
         """
-        from magfusion.results.plots.drawn import draw_charts
-
         if len(self) == 0:
             raise InputError("the trajectory has no pose to plot")
         errors = None if truth is None else trajectory_errors(self, truth)

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from magfusion.estimation.batch.log_graph import PreparedLog, graph_of
 from magfusion.estimation.data_checks.detection import drowned, only, without_silence
 from magfusion.estimation.demodulation.motion_compensation import noisier
+from magfusion.estimation.demodulation.motion_from_field import motion_from_field
 from magfusion.estimation.graph.graph import initial_estimate, read_states
 from magfusion.estimation.graph.state import State
 from magfusion.estimation.solve.bordered import optimise
@@ -71,8 +72,6 @@ Gap = tuple[float, float, "FieldMotion"]
 
 def _followed(log: PreparedLog, states: Trajectory, calibration: Calibration) -> list[Gap]:
     """Return the gaps through which the motion could be followed, with when they begin and end."""
-    from magfusion.estimation.demodulation.motion_from_field import motion_from_field
-
     source = log.demodulation
     receiver, waveform = source.receiver, source.log.waveform
     assert isinstance(receiver, LockinReceiver)

@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from magfusion.estimation.batch.log_graph import PreparedLog, graph_of
+from magfusion.estimation.batch.search import differ, thinned
 from magfusion.estimation.graph.graph import Estimate, initial_estimate, read_states
+from magfusion.estimation.measurements.held_roll import without_roll
 from magfusion.estimation.solve.bordered import Optimised, optimise
 from magfusion.model.one_axis import roll_is_open
 from magfusion.model.trajectory import Trajectory
@@ -28,8 +30,6 @@ def likeliest(starts: list[PreparedLog]) -> PreparedLog:
     """
     if len(starts) == 1:
         return starts[0]
-    from magfusion.estimation.batch.search import differ, thinned
-
     kept = thinned(starts[0].samples)
     found, paths = [], []
     for start in starts:
@@ -79,6 +79,4 @@ def _path(found: Optimised[Estimate], log: PreparedLog) -> Trajectory:
     path, site = read_states(found.estimate.values, log.states.time), log.declared.site
     if not roll_is_open(site):
         return path
-    from magfusion.estimation.measurements.held_roll import without_roll
-
     return without_roll(path, site, signed=log.samples.signed)

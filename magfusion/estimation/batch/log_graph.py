@@ -20,11 +20,13 @@ from magfusion.estimation.graph.inertial import Link, Preintegrated, inertial_gr
 from magfusion.estimation.graph.measurement import Measurement
 from magfusion.estimation.graph.preintegration import low_passed_rate_at
 from magfusion.estimation.measurements.earth import earth_measurement, unheld
+from magfusion.estimation.measurements.held_roll import held_roll
 from magfusion.estimation.measurements.joint_phasors import JointPhasors
 from magfusion.estimation.measurements.model_error import alike_in_batch
 from magfusion.estimation.measurements.phasors import FieldPhasors, field_phasors
 from magfusion.estimation.measurements.pose_fix import pose_fixes
 from magfusion.estimation.measurements.signs import with_signs
+from magfusion.estimation.measurements.zero_rate import zero_rate
 from magfusion.estimation.measurements.zero_velocity import zero_velocity
 from magfusion.estimation.posterior.noise_tuning import Tuned, tune
 from magfusion.estimation.snapshot.fix import Fixes
@@ -139,8 +141,6 @@ class PreparedLog:
         offset = calibration.imu_offset(time[chosen])
         noise = self.declared.site.platform.imu.gyro_noise
         within = self.samples.rest_about(time[chosen])
-        from magfusion.estimation.measurements.zero_rate import zero_rate
-
         found = zero_rate(chosen, time[chosen], within, self.imu, offset, noise)
         return [] if found is None else [found]
 
@@ -172,8 +172,6 @@ def graph_of(
         for time, measurement in log.others
     ]
     if roll_is_open(log.declared.site):
-        from magfusion.estimation.measurements.held_roll import held_roll
-
         measurements.append(held_roll(log.declared.site, states))
     if standing is not None and np.any(standing):
         measurements.append(log.rests(standing))

@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from magfusion.estimation.batch.chain import Start, choose_chains, start_of, start_phases
+from magfusion.estimation.batch.search import can_search, search
 from magfusion.estimation.demodulation.demodulation import fix_inputs
+from magfusion.estimation.measurements.zero_rate import freed_of_bias
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.estimation.snapshot.fix_separation import separate_fixes
 from magfusion.estimation.snapshot.likelihood import fix_epochs
@@ -95,8 +97,6 @@ def begin(
     tracked = epochs.signed and not roll_is_open(calibration.site)
     if not tracked or not _doubtful(chains):
         return out
-    from magfusion.estimation.batch.search import can_search, search
-
     if can_search(epochs):
         still = replace(imu, gyro_body=imu.gyro_body - _rest_bias(imu, calibration))
         for found in search(epochs, fixes, still, calibration):
@@ -108,8 +108,6 @@ def unbiased(imu: ImuSamples, samples: FieldSamples, time_offset: float) -> ImuS
     """Return an inertial stream without the rate that it shows in whole rests, where those are."""
     if not samples.of_rests:
         return imu
-    from magfusion.estimation.measurements.zero_rate import freed_of_bias
-
     half, stamps = 0.5 * samples.window, samples.time - time_offset
     return freed_of_bias(imu, stamps - half, stamps + half)
 

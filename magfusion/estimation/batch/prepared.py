@@ -14,6 +14,8 @@ from magfusion.estimation.batch.offline import begin, carried, unbiased, with_re
 from magfusion.estimation.batch.settings import SmootherSettings
 from magfusion.estimation.data_checks.detection import detected, only
 from magfusion.estimation.demodulation.demodulation import Demodulation, demodulated
+from magfusion.estimation.demodulation.several_demodulation import demodulated_several
+from magfusion.estimation.measurements.held_roll import without_roll
 from magfusion.estimation.measurements.zero_velocity import quiet_before
 from magfusion.estimation.snapshot.fix import Fixes
 from magfusion.model.one_axis import roll_is_open
@@ -109,8 +111,6 @@ def _one_roll(states: Trajectory, site: Site, *, signed: bool) -> Trajectory:
     """Return states whose rolls, where nothing tells them, are those of one that does not turn."""
     if not roll_is_open(site):
         return states
-    from magfusion.estimation.measurements.held_roll import without_roll
-
     return without_roll(states, site, signed=signed)
 
 
@@ -132,9 +132,7 @@ def _demodulated(log: Log, site: Site, settings: SmootherSettings) -> _Demodulat
     loose = settings.coupling == "loose"
     heard = demodulated
     if log.waveforms:
-        from magfusion.estimation.demodulation.several_demodulation import (
-            demodulated_several as heard,
-        )
+        heard = demodulated_several
     demodulation = heard(log, site, settings.lockin)
     samples = demodulation.fields
     if loose and has_schedule(site):

@@ -15,6 +15,7 @@ import numpy as np
 
 from magfusion.errors import InputError
 from magfusion.estimation.batch.batch import Smoothed, SmootherSettings, smooth
+from magfusion.estimation.batch.beacon_placement import detected_along, places
 from magfusion.estimation.batch.log_graph import overlap
 from magfusion.estimation.demodulation.demodulation import phasors
 from magfusion.model.parameters import Calibration
@@ -93,8 +94,6 @@ def smooth_and_place(
     unknown = [beacon for beacon in site.beacons if beacon.unknown is not None]
     if not unknown:
         return smooth(log, site, settings, report, passes), ()
-    from magfusion.estimation.batch.beacon_placement import detected_along
-
     _refuse(site, unknown, settings)
     samples, _ = phasors(log, site, settings.lockin)
     states, calibration = _by_the_known(log, site, samples, settings, report)
@@ -142,8 +141,6 @@ def _by_the_known(
 
 
 def _hypotheses(detected: DetectedFields) -> Placement:
-    from magfusion.estimation.batch.beacon_placement import places
-
     found = places(detected)
     best, beacon = found[0][0], detected.beacon
     return Placement(

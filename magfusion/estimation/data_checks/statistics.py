@@ -36,7 +36,7 @@ def log_p_chi_square(value: Array | float, freedom: Array | float) -> Array:
         np.maximum(np.asarray(value, dtype=float), 0.0), np.asarray(freedom, dtype=float)
     )
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        # As chi2.logsf, without what that spends on a single number.
+        # As chi2.logsf, which is minus infinity beyond what a float holds.
         exact = np.where(freedom > 0.0, np.log(chdtrc(freedom, value)), np.nan)
         half, shape = 0.5 * value, 0.5 * freedom
         # Far out: the first terms of the asymptotic series of the incomplete gamma function.

@@ -11,6 +11,7 @@ from itertools import permutations, product
 from typing import Literal, NamedTuple
 
 import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
 
 from magfusion.model.quaternion import cross
 from magfusion.model.samples import ImuSamples, Log
@@ -190,8 +191,6 @@ def convolved(value: Array, kernel: Array, mode: Literal["valid", "same"]) -> Ar
     mode : 'valid' or 'same'
         Whether only what the kernel fits into is returned, or as many as there are values.
     """
-    from scipy.fft import irfft, next_fast_len, rfft  # not for every command
-
     whole = len(value) + len(kernel) - 1
     size = next_fast_len(whole, real=True)
     spectrum = rfft(value, size, axis=0) * rfft(kernel, size)[:, None]

@@ -14,9 +14,12 @@ from magfusion.estimation.batch.settings import EstimatorSettings
 from magfusion.estimation.data_checks.spectrum import beside_lines
 from magfusion.estimation.data_checks.stream_buffer import Buffer
 from magfusion.estimation.demodulation.demodulated_apart import each_alone
+from magfusion.estimation.demodulation.several_demodulation import demodulated_several, same_windows
 from magfusion.estimation.graph.state import POSITION, ROTATION, State
+from magfusion.estimation.initialization.among_many import among_all, score_among_all
 from magfusion.estimation.initialization.handover import last_state
 from magfusion.estimation.integrity.judge import judged_with_score
+from magfusion.estimation.integrity.magnetometer_exclusion import agreed
 from magfusion.estimation.integrity.score import Score
 from magfusion.model.audibility import are_many
 from magfusion.model.marks import Marks
@@ -179,8 +182,6 @@ class _Beginning(NamedTuple):
 def _smoothed(log: Log, site: Site, settings: EstimatorSettings) -> _Beginning:
     """Smooth the beginning and judge it."""
     if log.waveforms and are_many(site):  # by what is heard they are chosen
-        from magfusion.estimation.demodulation.several_demodulation import demodulated_several
-
         log = replace(log, fields=demodulated_several(log, site, settings.lockin).fields)
     if log.waveform is not None and has_schedule(site) and joins(site, log.waveform.marks):
         log = _of_cycles(log, log.waveform, site, settings)
@@ -231,8 +232,6 @@ def _agreed(
     """Return a start without a magnetometer that contradicts the others, as of a whole log."""
     if not site.platform.further:
         return log, site, result, ()
-    from magfusion.estimation.integrity.magnetometer_exclusion import agreed
-
     plain = replace(settings, tune=False)
     found = agreed(
         result,
@@ -248,8 +247,6 @@ def _among_all(
     state: State, score: Score | None, result: Smoothed, site: Site, settings: EstimatorSettings
 ) -> tuple[State, Score | None]:
     """Return a state and its score among all beacons and magnetometers, heard or not."""
-    from magfusion.estimation.initialization.among_many import among_all, score_among_all
-
     state = among_all(state, (*result.blocks, *result.considered), site, settings)
     if score is not None and result.calibration.site.unheard:
         score = score_among_all(score, result.blocks, site, settings)
@@ -258,8 +255,6 @@ def _among_all(
 
 def _lines_of_each(log: Log, site: Site, given: LockinSettings | None) -> dict[str, LockinSettings]:
     """Return how the receivers of several magnetometers go on that have lines to be fitted."""
-    from magfusion.estimation.demodulation.several_demodulation import same_windows
-
     lockin, found = same_windows(site, given), dict[str, LockinSettings]()
     for name, own, alone in each_alone(log, site):
         lined = beside_lines(own, alone, lockin)

@@ -10,6 +10,7 @@ import numpy as np
 
 from magfusion.errors import EstimationError, InputError
 from magfusion.estimation.data_checks.magnetometers import first_magnetometer
+from magfusion.estimation.integrity.likely_cause import cause_of
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
 from magfusion.model.trust import Finding, Trust, Verdict
@@ -61,8 +62,6 @@ def diagnosed(
     if not site.beacons or any(beacon.unknown is not None for beacon in site.beacons):
         return None
     # Of all that can be wrong nothing is needed where nothing is.
-    from magfusion.estimation.integrity.likely_cause import cause_of
-
     try:
         said = cause_of(log, site, settings)
     except (EstimationError, InputError, np.linalg.LinAlgError):

@@ -1,6 +1,7 @@
 """What holds the streams of a platform while they arrive, of one magnetometer or of several."""
 
 from magfusion.estimation.online.input_queue import Arrivals
+from magfusion.estimation.online.several_arrivals import SeveralArrivals
 from magfusion.model.site import Site
 from magfusion.receiver.receivers import receiver_of
 from magfusion.receiver.windows import LockinSettings
@@ -10,7 +11,5 @@ def arrivals_of(site: Site, lockin: LockinSettings | None) -> Arrivals:
     """Return what holds the streams of a site's platform."""
     offset = site.platform.imu.time_offset
     if site.platform.further:
-        from magfusion.estimation.online.several_arrivals import SeveralArrivals
-
         return SeveralArrivals(site, lockin, offset)
     return Arrivals(receiver_of(site, lockin), offset)

@@ -28,6 +28,7 @@ from magfusion.estimation.online.ekf import ErrorStateFilter
 from magfusion.estimation.online.epoch_update import EpochUpdate, Estimator
 from magfusion.estimation.online.fixed_lag import SlidingWindow
 from magfusion.estimation.online.input_queue import Arrivals
+from magfusion.estimation.online.navigator_data import navigator_rules
 from magfusion.estimation.online.navigator_settings import NavigatorSettings as NavigatorSettings
 from magfusion.estimation.online.short_windows import ShortWindows
 from magfusion.estimation.online.state_of_now import CarriedState, Said, StateOfNow
@@ -346,8 +347,6 @@ class Navigator:
 
     def checkpoint(self) -> dict[str, Any]:
         """Return everything needed to go on as plain data: `restored` makes a navigator of it."""
-        from magfusion.estimation.online.navigator_data import navigator_rules
-
         rules = navigator_rules(self.site, self.blocks)
         self._arrived.settle()
         self._update.score.settle()

@@ -3,6 +3,7 @@
 import numpy as np
 
 from magfusion.estimation.data_checks.stream_buffer import Buffer
+from magfusion.estimation.demodulation.motion_from_field import motion_from_field
 from magfusion.estimation.graph.state import State
 from magfusion.model.samples import ImuSamples, Waveform
 from magfusion.receiver.admission import Admission, longest_step, silences
@@ -62,8 +63,6 @@ class StandIn:
         self.time, self.rows = self.time[kept], self.rows[kept]
         if until - state.time > LONGEST:
             return
-        from magfusion.estimation.demodulation.motion_from_field import motion_from_field
-
         inertial = ImuSamples(stamps + offset, heard[:, :3], heard[:, 3:])
         part, step = Waveform(time[within], rows[within]), admission.imu_step
         followed = motion_from_field(state, part, inertial, longest_step(step))

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from magfusion.estimation.snapshot.coil_poses import nearest_truth
 from magfusion.model.one_axis import opened_poses, roll_is_open
 from magfusion.model.samples import Log
 from magfusion.model.site import Site
@@ -31,7 +32,5 @@ def comparable(log: Log, states: Trajectory, site: Site) -> Log:
     """Return a log whose truth has the roll that was taken, where nothing tells it."""
     if log.truth is None or not roll_is_open(site):
         return log
-    from magfusion.estimation.snapshot.coil_poses import nearest_truth
-
     signed = log.fields is None or log.fields.signed
     return replace(log, truth=nearest_truth(log.truth, states, site, signed=signed))

@@ -9,8 +9,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from magfusion.estimation.snapshot.axis_starts import mirrored, starts_on_grid, with_least_roll
 from magfusion.estimation.snapshot.candidates import attitudes, positions
 from magfusion.estimation.snapshot.fix import Fixes, Gravity
+from magfusion.estimation.snapshot.lone_starts import stands_alone, starts_about_one
 from magfusion.estimation.snapshot.many import fix_parts, parts_heard
 from magfusion.estimation.snapshot.place import outside
 from magfusion.estimation.snapshot.problem import GAIN_SIGMA, Epochs, Problem, State, epochs_of
@@ -152,8 +154,6 @@ def _solved(epochs: Epochs) -> Fixes:
     if again is not None:
         problem, solved = again, solved_from(again.rows(epoch), solved.state)
     if np.any(epochs.samples.partial):
-        from magfusion.estimation.snapshot.axis_starts import with_least_roll
-
         rolled = with_least_roll(problem.rows(epoch), solved.state)
         solved = solved_from(problem.rows(epoch), rolled)
     order, ranked = _ranked(
@@ -168,9 +168,6 @@ def _solved(epochs: Epochs) -> Fixes:
 
 def _starts_of_axes(epochs: Epochs) -> tuple[State, int]:
     """Return the most likely states of epochs that lack components, so many rows an epoch."""
-    from magfusion.estimation.snapshot.axis_starts import mirrored, starts_on_grid
-    from magfusion.estimation.snapshot.lone_starts import stands_alone
-
     if stands_alone(epochs.problem.calibration.site):
         return _lone_starts(epochs.problem)
     start, count = starts_on_grid(epochs.problem)
@@ -189,8 +186,6 @@ def _starts_of_axes(epochs: Epochs) -> tuple[State, int]:
 
 def _lone_starts(problem: Problem) -> tuple[State, int]:
     """Return the states that differ of those that a lone source leaves open."""
-    from magfusion.estimation.snapshot.lone_starts import starts_about_one
-
     start, count = starts_about_one(problem)
     n = len(problem.time)
     rough = solved_from(_softened(problem).rows(np.repeat(np.arange(n), count)), start)

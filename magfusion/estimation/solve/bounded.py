@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+from scipy.optimize import minimize, minimize_scalar
 
 from magfusion.units import Array, BoolArray
 
@@ -42,8 +43,6 @@ def minimise_bounded(
     decrease : float
         Of the cost, relative; the step that lowers it by less is the last.
     """
-    from scipy.optimize import minimize  # which takes long to import, and few ask
-
     aside = DIFFERENCE * np.eye(len(start))
 
     def sloped(at: Array) -> tuple[float, Array]:
@@ -150,8 +149,6 @@ def minimise_between(
     tolerance : float
         Of the unknown.
     """
-    from scipy.optimize import minimize_scalar
-
     options = {"xatol": tolerance}
     found = minimize_scalar(cost, bounds=(low, high), method="bounded", options=options)
     return float(found.x), float(found.fun)

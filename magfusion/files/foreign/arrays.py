@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
+from scipy.io import loadmat, wavfile
 
 from magfusion.errors import InputError
 from magfusion.files.foreign.source import ROWS, Column, Part, Source
@@ -161,8 +162,6 @@ def _npz(path: Path) -> Source:
 
 
 def _wav(path: Path) -> Source:
-    from scipy.io import wavfile
-
     rate, samples = wavfile.read(path, mmap=True)
     if samples.ndim == 1:
         samples = samples[:, np.newaxis]
@@ -185,8 +184,6 @@ def _mat(path: Path) -> Source:
         later = b"MATLAB 7.3" in stream.read(128) or _is_hdf5(path)
     if later:
         return _hdf5(path, by_column=True)
-    from scipy.io import loadmat
-
     content = loadmat(path, simplify_cells=True)
     fields = [one for name, array in _flat(content) for one in fields_of(name, array)]
     return _source(str(path), fields)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
+from scipy.special import k0
 
 from magfusion.units import MU0_OVER_4PI, Array, ComplexArray
 
@@ -146,8 +147,6 @@ def gathering_weights(
     -------
     weights, by_log_strength : complex ndarray, shape (k, m)
     """
-    from scipy.special import k0  # a site is read without scipy
-
     apart = float(place[1] - place[0])
     node, share = leggauss(WAVES)
     number = 0.5 * np.pi / apart * (1.0 + node)
