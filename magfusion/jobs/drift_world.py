@@ -27,6 +27,7 @@ from magfusion.model.trajectory import Trajectory
 from magfusion.results.drift import ErrorSeries
 from magfusion.simulation.demo_site import demo_site
 from magfusion.simulation.endurance import (
+    HOUR,
     Biases,
     EnduranceConfig,
     Stretch,
@@ -129,13 +130,27 @@ class _Progress:
 
 
 def declared_site(drive: str, phase_known: bool) -> Site:
-    """Return the site as its user declares it: moments as uncertain as their drive makes them."""
-    site = demo_site(synchronised=phase_known)
+    """Return the site as its user declares it: what drifts in these worlds, and no more.
+
+    A moment walks by what its gain wanders, and its coil fades, in an hour; of the field model
+    nothing is wrong but the scale that follows the magnetometer's temperature.
+    """
+    site, drift = demo_site(synchronised=phase_known), usual_drift(drive, 0.0)
+    assert drift.gain is not None
+    assert drift.coils is not None
+    assert drift.sensor is not None
+    wander = drift.gain.rms * np.sqrt(2.0 * HOUR / drift.gain.time_constant)
+    fading = drift.fading_per_kelvin * drift.coils.rise * np.sqrt(HOUR / drift.coils.time_constant)
     beacons = tuple(
         replace(b, sigma=replace(b.sigma, log_moment=np.full(len(b.coils), MOMENT_SIGMA[drive])))
         for b in site.beacons
     )
-    return replace(site, beacons=beacons)
+    return replace(
+        site,
+        beacons=beacons,
+        model_error=drift.scale_per_kelvin * drift.sensor.amplitude,
+        clock=replace(site.clock, log_moment_walk=float(np.hypot(wander, fading))),
+    )
 
 
 def draw_task(task: WorldTask) -> World:
