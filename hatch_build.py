@@ -1,11 +1,16 @@
-"""What a wheel and an sdist know of the commit that they were built of: `magfusion --version`."""
+"""Give a wheel and an sdist what the tree cannot: the commit, a README with absolute links."""
 
+import re
 import subprocess
 import tempfile
 from pathlib import Path
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+from hatchling.metadata.plugin.interface import MetadataHookInterface
+
+# ![text](place) and [text](place), where the place is a file of the repository.
+RELATIVE_LINK = re.compile(r"(!?)\[([^\]]*)\]\((?![a-z]+:|#)([^)]+)\)")
 
 
 class CommitHook(BuildHookInterface[Any]):
@@ -30,3 +35,30 @@ class CommitHook(BuildHookInterface[Any]):
         """Remove what was only on its way into the archive."""
         if hasattr(self, "written"):
             self.written.unlink(missing_ok=True)
+
+
+class ReadmeHook(MetadataHookInterface):
+    """Give the metadata the README with absolute links, as a package index shows it."""
+
+    def update(self, metadata: dict[str, Any]) -> None:
+        """Set ``readme``."""
+        text = (Path(self.root) / "README.md").read_text(encoding="utf-8")
+        repository = metadata.get("urls", {}).get("Repository")
+        text = absolute_links(text, repository, f"v{metadata['version']}")
+        metadata["readme"] = {"content-type": "text/markdown", "text": text}
+
+
+def absolute_links(text: str, repository: str | None, tag: str) -> str:
+    """Return Markdown with links to files of a tag of the repository.
+
+    Where no repository is known, the text of a link stays without its target.
+    """
+
+    def absolute(link: re.Match[str]) -> str:
+        image, label, place = link.groups()
+        if repository is None:
+            return f"*{label}*" if image else label
+        kind = "raw" if image else "blob"
+        return f"{image}[{label}]({repository.rstrip('/')}/{kind}/{tag}/{place})"
+
+    return RELATIVE_LINK.sub(absolute, text)

@@ -1,18 +1,25 @@
-"""What is built of the tree holds the package whole, and knows of which commit it is."""
+"""What is built holds the package whole and its commit, and the project's files agree."""
 
 import re
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
 import yaml
+from hatchling.metadata.core import ProjectMetadata
+from hatchling.plugin.manager import PluginManager
+from lowest import lowest
 
+from hatch_build import RELATIVE_LINK, absolute_links
 from magfusion.files.commit import commit
 
 ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def _git(*words: str) -> str:
@@ -67,14 +74,75 @@ def test_every_python_that_the_package_accepts_is_tried() -> None:
     workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text())
     tried = workflow["jobs"]["suite"]["strategy"]["matrix"]["python"]
     assert tried == ["3.11", "3.12", "3.13", "3.14"]
-    project = (ROOT / "pyproject.toml").read_text()
-    assert f'requires-python = ">={tried[0]}"' in project
-    steps = workflow["jobs"]["oldest-dependencies"]["steps"]
-    assert any("lowest-direct" in step.get("run", "") for step in steps)
+    assert PROJECT["requires-python"] == f">={tried[0]}"
+    named = [text.rpartition(" ")[2] for text in PROJECT["classifiers"] if ":: 3." in text]
+    assert named == tried
+    steps = workflow["jobs"]["lowest-dependencies"]["steps"]
+    assert any("tools/lowest.py" in step.get("run", "") for step in steps)
+
+
+def test_every_dependency_has_a_lower_bound_and_one_alone() -> None:
+    pins = lowest(PROJECT)
+    names = [pin.partition("==")[0] for pin in pins]
+    assert {"numpy", "scipy", "rerun-sdk", "distributed", "pytest"} <= set(names)
+    assert len(names) == len(set(names))
+    with pytest.raises(ValueError, match="numpy: no lower bound"):
+        lowest({"dependencies": ["numpy"], "optional-dependencies": {}})
 
 
 def test_the_changelog_is_headed_by_the_version() -> None:
-    version = re.findall(r'^version = "(.+)"$', (ROOT / "pyproject.toml").read_text(), re.M)
-    first = re.search(r"^## (\S+?),? ", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    text = (ROOT / "CHANGELOG.md").read_text()
+    first = re.search(r"^## \[(\S+)\] - (unreleased|\d{4}-\d\d-\d\d)$", text, re.M)
     assert first is not None
-    assert version == [first[1]]
+    assert first[1] == PROJECT["version"]
+    kinds = set(re.findall(r"^### (.+)$", text, re.M))
+    assert kinds <= {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
+
+
+def test_the_citation_agrees_with_the_package() -> None:
+    """Keys and values by the schema of CFF 1.2.0, as far as they are used."""
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)
+    assert citation["cff-version"] == "1.2.0"
+    assert citation["type"] == "software"
+    for key in ("version", "license", "keywords", "authors"):
+        assert citation[key] == PROJECT[key]
+
+
+def test_a_bug_report_asks_for_what_explains_it() -> None:
+    forms = {
+        path.stem: yaml.safe_load(path.read_text())
+        for path in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml")
+    }
+    assert set(forms) == {"bug_report", "feature_request"}
+    for form in forms.values():
+        assert {"name", "description", "body"} <= set(form)
+        fields = [field for field in form["body"] if field["type"] != "markdown"]
+        assert len({field["id"] for field in fields}) == len(fields) > 0
+    asked = str(forms["bug_report"])
+    assert all(what in asked for what in ("report.json", "magfusion --version", "magfusion check"))
+
+
+def test_the_readme_of_a_package_index_has_absolute_links() -> None:
+    relative = [link[2] for link in RELATIVE_LINK.findall(README)]
+    assert {".github/readme.png", "docs/measured.md", "LICENSE"} <= set(relative)
+    shown = absolute_links(README, "https://example.org/magfusion/", "v0.1.0")
+    assert not RELATIVE_LINK.search(shown)
+    assert "](https://example.org/magfusion/raw/v0.1.0/.github/readme.png)" in shown
+    assert "](https://example.org/magfusion/blob/v0.1.0/docs/formats.md#the-log)" in shown
+    assert shown.count("https://example.org") == len(relative)
+
+
+def test_without_a_repository_no_link_leads_nowhere() -> None:
+    shown = absolute_links(
+        "![a walk](walk.png), [more](docs/x.md), [GTSAM](https://gtsam.org)", None, ""
+    )
+    assert shown == "*a walk*, more, [GTSAM](https://gtsam.org)"
+
+
+def test_the_metadata_have_the_readme_with_its_links() -> None:
+    metadata = ProjectMetadata(str(ROOT), PluginManager())
+    repository = PROJECT.get("urls", {}).get("Repository")
+    assert metadata.core.readme_content_type == "text/markdown"
+    assert metadata.core.readme == absolute_links(README, repository, f"v{PROJECT['version']}")
+    assert not RELATIVE_LINK.search(metadata.core.readme)

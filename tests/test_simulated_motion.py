@@ -5,6 +5,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from scipy.interpolate import BPoly, BSpline
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
@@ -32,6 +33,17 @@ def still(position=(3.0, 2.5, 1.0), rotvec=(0.1, -0.2, 0.7)):
 
 def chi2_bounds(degrees, miss=1e-4):
     return chi2.ppf([miss / 2.0, 1.0 - miss / 2.0], degrees)
+
+
+def test_derivatives_above_the_degree_of_a_path_are_zero():
+    """SciPy before 1.17 writes beyond its memory when it is asked for them."""
+    time = np.linspace(0.0, 1.0, 1000)
+    assert not np.any(still().velocity_world(time))
+    assert not np.any(still().acceleration_world(time))
+    rate = BPoly(np.ones((6, 1)), np.array([0.0, 1.0]))
+    straight = replace(still(), position=BSpline([0.0, 0.0, 1.0, 1.0], np.eye(2, 3), 1), rate=rate)
+    assert not np.any(straight.acceleration_world(time))
+    np.testing.assert_allclose(straight.velocity_world(time), [[-1.0, 1.0, 0.0]] * 1000, atol=1e-12)
 
 
 @pytest.mark.parametrize("motion", [walk(), turn()], ids=["walk", "turn"])

@@ -26,8 +26,8 @@ ROOMS = {
     for wing, rooms in {
         "model": """
             arguments correlation drive field_map fixed_axes groups hall hermite marks
-            perturbation physics platform_motion probe progress quaternion region
-            response rotor short_repr temperature time_division trust
+            perturbation physics platform_motion probe progress quaternion region response rotor
+            short_repr temperature time_division trust
             magnetometer
             site trajectory
             antenna channel_effects coil_field once one_axis receive_coils samples strapdown

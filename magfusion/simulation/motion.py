@@ -58,18 +58,24 @@ class Motion:
 
     def position_world(self, time: Array) -> Array:
         """Return the body's position (m), shape (n, 3)."""
-        return self.position(self._progress(time)[0])
+        return self._path(self._progress(time)[0], 0)
+
+    def _path(self, parameter: Array, order: int) -> Array:
+        """Return a derivative of the path (n, 3); SciPy < 1.17 corrupts memory above its degree."""
+        if order > self.position.k:
+            return np.zeros((*parameter.shape, 3))
+        return self.position(parameter, nu=order)
 
     def velocity_world(self, time: Array) -> Array:
         """Return the body's velocity (m/s), shape (n, 3)."""
         parameter, rate, _ = self._progress(time)
-        return self.position(parameter, nu=1) * rate
+        return self._path(parameter, 1) * rate
 
     def acceleration_world(self, time: Array) -> Array:
         """Return the body's acceleration (m/s^2), shape (n, 3)."""
         parameter, rate, change = self._progress(time)
-        curvature = self.position(parameter, nu=2) * rate**2
-        return curvature + self.position(parameter, nu=1) * change
+        curvature = self._path(parameter, 2) * rate**2
+        return curvature + self._path(parameter, 1) * change
 
     def rate_body(self, time: Array) -> Array:
         """Return the angular rate (rad/s), shape (n, 3)."""
