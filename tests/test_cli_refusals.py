@@ -300,7 +300,7 @@ def test_a_full_disk_is_told_in_one_sentence(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "x"))
 
-    monkeypatch.setattr("magfusion.files.tum.write_tum", full)
+    monkeypatch.setattr("magfusion.jobs.fix.write_tum", full)
     sentence = refuse("fix", worked.log, "-o", tmp_path / "deep" / "run")
     assert "No space left on device" in sentence
     assert "free some space" in sentence

@@ -282,7 +282,7 @@ def test_progress_is_told_while_the_runs_write(tmp_path, monkeypatch):
             time.sleep(0.2)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("magfusion.simulation.monte_carlo.run_many", run_many)
+    monkeypatch.setattr("magfusion.jobs.drift.run_many", run_many)
     settings = DriftSettings(hours=1.0, worlds=2)
     with pytest.raises(KeyboardInterrupt):
         run_drift(settings, tmp_path / "drift", lambda *given: told.append(given))

@@ -61,7 +61,7 @@ def table(path: Path, names: str, *columns: np.ndarray, delimiter: str = ",") ->
 def _unchecked(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the check, which has its own tests, but where it is what is tested."""
     if "check" not in request.node.name:
-        monkeypatch.setattr("magfusion.jobs.check.run_check", lambda _: Figures())
+        monkeypatch.setattr("magfusion.jobs.import_log.run_check", lambda _: Figures())
 
 
 @pytest.fixture

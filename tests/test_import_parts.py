@@ -21,7 +21,7 @@ FIELD = np.array([2e-5, -1e-6, 4.5e-5])
 @pytest.fixture(autouse=True)
 def _unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the check, which has its own tests."""
-    monkeypatch.setattr("magfusion.jobs.check.run_check", lambda _: Figures())
+    monkeypatch.setattr("magfusion.jobs.import_log.run_check", lambda _: Figures())
 
 
 def gyro(time: Array) -> Array:
