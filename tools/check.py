@@ -1,4 +1,4 @@
-"""Check the tree: format, lint, types, floors, tests.
+"""Check the tree: format, lint, types, floors, words, tests.
 
 ``python tools/check.py`` before every commit; ``--no-tests`` where the suite has just run.
 """
@@ -15,6 +15,7 @@ STATIC = {
     "lint": ["ruff", "check", "."],
     "types": ["mypy"],
     "floors": ["pytest", "-q", "tests/test_structure.py"],
+    "words": ["pytest", "-q", "tests/test_words.py"],
 }
 TESTS = {"tests": ["pytest", "-q"]}
 
@@ -34,7 +35,9 @@ def passes(name: str, command: list[str]) -> bool:
 
 def main() -> int:
     """Run all checks, also after one has failed, and return 1 where one did."""
-    parser = argparse.ArgumentParser(description="Check format, lint, types, floors and tests.")
+    parser = argparse.ArgumentParser(
+        description="Check format, lint, types, floors, words and tests."
+    )
     parser.add_argument("--no-tests", action="store_true", help="leave the test suite out")
     checks = STATIC if parser.parse_args().no_tests else STATIC | TESTS
     failed = [name for name, command in checks.items() if not passes(name, command)]
