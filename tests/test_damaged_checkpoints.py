@@ -22,7 +22,7 @@ from magfusion.files.checkpoint import MAGIC, read_checkpoint, write_checkpoint
 from magfusion.files.log import write_log
 from magfusion.files.plain_data import from_plain
 from magfusion.files.site import save_site
-from magfusion.jobs import replay
+from magfusion.jobs import navigate
 from magfusion.jobs.drift_world import WorldTask, run_world
 from magfusion.jobs.inputs import named
 from magfusion.jobs.navigate import run_navigate
@@ -218,7 +218,7 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Interrupted:
     save_site(walk.site, path / "site.yaml")
     output = tmp_path / "run"
     settings = NavigateSettings(log=path, estimator="ekf", every=1.0)
-    usual, fed = replay.feed, []
+    usual, fed = navigate.feed, []
 
     def interrupted(*given: Any) -> None:
         fed.append(given)
@@ -226,7 +226,7 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Interrupted:
             raise KeyboardInterrupt
         usual(*given)
 
-    monkeypatch.setattr(replay, "feed", interrupted)
+    monkeypatch.setattr(navigate, "feed", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run_navigate(settings, output)
     resumed = replace(settings, resume=True)
