@@ -1,5 +1,6 @@
 """What is built holds the package whole and its commit, and the project's files agree."""
 
+import importlib.util
 import re
 import subprocess
 import sys
@@ -7,6 +8,7 @@ import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import yaml
@@ -14,12 +16,24 @@ from hatchling.metadata.core import ProjectMetadata
 from hatchling.plugin.manager import PluginManager
 from lowest import lowest
 
-from hatch_build import RELATIVE_LINK, absolute_links
 from magfusion.files.commit import commit
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def _build_hook() -> ModuleType:
+    """Return the build's own module, which is not installed."""
+    spec = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+HOOK = _build_hook()
 
 
 def _git(*words: str) -> str:
@@ -124,17 +138,17 @@ def test_a_bug_report_asks_for_what_explains_it() -> None:
 
 
 def test_the_readme_of_a_package_index_has_absolute_links() -> None:
-    relative = [link[2] for link in RELATIVE_LINK.findall(README)]
+    relative = [link[2] for link in HOOK.RELATIVE_LINK.findall(README)]
     assert {".github/readme.png", "docs/measured.md", "LICENSE"} <= set(relative)
-    shown = absolute_links(README, "https://example.org/magfusion/", "v0.1.0")
-    assert not RELATIVE_LINK.search(shown)
+    shown = HOOK.absolute_links(README, "https://example.org/magfusion/", "v0.1.0")
+    assert not HOOK.RELATIVE_LINK.search(shown)
     assert "](https://example.org/magfusion/raw/v0.1.0/.github/readme.png)" in shown
     assert "](https://example.org/magfusion/blob/v0.1.0/docs/formats.md#the-log)" in shown
     assert shown.count("https://example.org") == len(relative)
 
 
 def test_without_a_repository_no_link_leads_nowhere() -> None:
-    shown = absolute_links(
+    shown = HOOK.absolute_links(
         "![a walk](walk.png), [more](docs/x.md), [GTSAM](https://gtsam.org)", None, ""
     )
     assert shown == "*a walk*, more, [GTSAM](https://gtsam.org)"
@@ -144,5 +158,5 @@ def test_the_metadata_have_the_readme_with_its_links() -> None:
     metadata = ProjectMetadata(str(ROOT), PluginManager())
     repository = PROJECT.get("urls", {}).get("Repository")
     assert metadata.core.readme_content_type == "text/markdown"
-    assert metadata.core.readme == absolute_links(README, repository, f"v{PROJECT['version']}")
-    assert not RELATIVE_LINK.search(metadata.core.readme)
+    assert metadata.core.readme == HOOK.absolute_links(README, repository, f"v{PROJECT['version']}")
+    assert not HOOK.RELATIVE_LINK.search(metadata.core.readme)
