@@ -192,16 +192,3 @@ def test_a_prediction_between_epochs_of_a_walk_is_not_curved() -> None:
     """Half a second of dead reckoning leaves millimetres: nothing is linearised twice."""
     narrow = np.repeat([1e-3, 3e-3, 0.01, 0.01, 1e-4], 3)
     assert not is_curved(predicted_state(a_site(), narrow, np.zeros(15)))
-
-
-def test_a_field_of_nonsense_is_left_as_it_is() -> None:
-    rng, site = np.random.default_rng(5), a_site()
-    predicted = predicted_state(site, AFTER_A_MINUTE, np.zeros(15))
-    phasors = an_epoch(site, predicted, rng)
-    false = replace(phasors, measured=-20.0 * phasors.measured)
-    at = relinearized(false, predicted, ())
-    assert at is None or np.all(np.isfinite(at.linearize(*_at(predicted)).error))
-
-
-def _at(state: State) -> tuple:  # type: ignore[type-arg]
-    return states_of([state]), state.calibration, ()
