@@ -140,7 +140,7 @@ def test_a_beacon_that_was_hardly_heard_is_named(world: World, survey: Survey) -
     phasor = points.phasor_sensor.copy()
     phasor[7:, 1] = np.nan
     with pytest.raises(
-        EstimationError, match="beacon M2 was detected at 7 points, and a map needs 8"
+        EstimationError, match="beacon M2 was detected at 7 points; a map requires 8"
     ):
         learn_field_map(world.site, replace(points, phasor_sensor=phasor))
 
@@ -282,7 +282,7 @@ def test_too_few_points_are_refused(
     )
     write_survey(few, surveyed / "survey.parquet")
     said = refuse("calibrate", "fieldmap", surveyed, "-o", tmp_path / "out")
-    assert f"{surveyed}: beacon M1 was detected at 7 points, and a map needs 8" in said
+    assert f"{surveyed}: beacon M1 was detected at 7 points; a map requires 8" in said
 
 
 def test_a_survey_has_no_use_for_a_trajectory(
