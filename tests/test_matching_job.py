@@ -147,7 +147,7 @@ def test_both_pitches_are_written_where_there_are_two(logs: Path, tmp_path: Path
 
 def test_a_platform_whose_yaw_wanders_makes_no_database(logs: Path, refuse: Refuse) -> None:
     told = refuse("calibrate", "attitude-database", logs / "wander", "-o", logs / "none")
-    assert "yaw turns by" in told
+    assert "yaw rotates by" in told
     assert "gravity" in told
 
 

@@ -321,7 +321,7 @@ def test_epochs_that_hear_too_little_are_refused_with_the_reason(
         ),
     )
     sentence = _refused_fix(log, surveyed[1], tmp_path, refuse)
-    assert "fewer than three beacons heard" in sentence
+    assert "fewer than three beacons detected" in sentence
 
 
 @pytest.mark.parametrize(
