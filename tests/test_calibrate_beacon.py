@@ -145,7 +145,7 @@ def test_what_a_survey_cannot_tell_is_refused(tmp_path: Path, refuse: Refuse) ->
     amplitude = replace(
         survey, phasor_sensor=None, amplitude=np.linalg.norm(survey.phasor_sensor, axis=2)
     )
-    assert "holds amplitudes" in refuse(*spoilt(tmp_path, amplitude), *out)
+    assert "contains amplitudes" in refuse(*spoilt(tmp_path, amplitude), *out)
     same = replace(taken(survey, [0, 0, 0]), point=np.arange(3))
     assert "do not determine" in refuse(*spoilt(tmp_path, same), *out)
     far = survey_of(site, true_site, ROUND + np.array([60.0, 0.0, 0.0]))

@@ -154,4 +154,4 @@ def test_a_site_without_sigmas_has_nothing_to_calibrate(
         *("calibrate", "log", recorded[0], "--site", tmp_path / "site.yaml"),
         *("-o", tmp_path / "out", "--end", 8),
     )
-    assert "nothing to calibrate" in said
+    assert "no parameter can be calibrated" in said

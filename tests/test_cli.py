@@ -72,7 +72,7 @@ def test_what_one_coil_leaves_open_is_told_and_not_smoothed_over(
     assert ended.value.code == 1
     assert err.count("\n") == 1
     assert "add a beacon or a coil" in err
-    assert "single-epoch fixes were saved" in err
+    assert "single-epoch fixes are saved" in err
     assert json.loads((tmp_path / "run" / "report.json").read_text())["failed"] in err
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"report.json", "failed"}
     assert (tmp_path / "run" / "failed" / "fixes.parquet").is_file()

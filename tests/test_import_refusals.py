@@ -58,7 +58,7 @@ def told(capfd: pytest.CaptureFixture[str], line: str) -> str:
 
 BOTH = "imu.csv mag.csv"
 SLIPS = [
-    ("", "nothing to import"),
+    ("", "no recording given"),
     ("nowhere.csv mag.csv", "nowhere.csv: there is no such file"),
     ("imu.csv", "No table is given for the magnetometer; give --magnetometer FILE"),
     ("--imu imu.csv --magnetometer imu.csv", "imu.csv: no column is found for magnetometer.field"),

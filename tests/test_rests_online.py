@@ -186,7 +186,7 @@ def test_rests_go_through_log_and_pipe(tmp_path: Path, refuse: Refuse) -> None:
         ({"reference": {"time": [0.0], "field": [[0, 0]]}}, "three numbers"),
         (
             {"fields": {"time": 1.0, "window": 0.4, "sigma": 1e-9, "phasors": {}}},
-            "leave fields out",
+            "omit fields",
         ),
     ],
 )

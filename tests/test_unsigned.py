@@ -117,7 +117,7 @@ def test_jobs_that_take_no_amplitudes_say_so(
     write_log(Log("few", 0, "test", ImuSamples.empty(), fields=fields), tmp_path / "log")
     save_site(calibration.site, tmp_path / "log" / "site.yaml")
     said = refuse("check", tmp_path / "log")
-    assert "amplitudes without sign are taken by fix, smooth and navigate alone" in said
+    assert "unsigned amplitudes are supported by fix, smooth and navigate only" in said
 
 
 def test_the_pipe_takes_amplitudes_as_a_log_has_them(calibration: Calibration) -> None:
