@@ -154,7 +154,7 @@ def at_rest(
         Where there is no waveform or no long rest, or coils are driven in time slots.
     """
     if log.waveform is None:
-        raise InputError("has no magnetometer.parquet to integrate at rest; use the raw log")
+        raise InputError("has no magnetometer.parquet to integrate at rest; give the raw log")
     check_tones(site)
     usual = default_settings(site)
     mains_hz = (usual if lockin is None else lockin).mains_hz
