@@ -108,8 +108,8 @@ def _refuse(site: Site, unknown: list[Beacon], settings: SmootherSettings) -> No
     known = len(site.beacons) - len(unknown)
     if known < FEWEST_KNOWN:
         raise InputError(
-            f"the site has {known} beacons of known position, but {FEWEST_KNOWN} are needed to place"
-            f" beacon {unknown[0].name}; survey another one"
+            f"the site has {known} beacons of known position, but {FEWEST_KNOWN} are needed to"
+            f" place beacon {unknown[0].name}; survey another one"
         )
     groups = settings.estimate
     if settings.coupling == "loose" or (groups is not None and "beacons" not in groups):

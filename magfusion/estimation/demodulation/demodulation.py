@@ -159,7 +159,7 @@ def _integrated_once(
     windows: Windows,
     site: Site,
 ) -> tuple[KnownMotion | None, BodyTurn | None]:
-    """Return the motion and rotation along the samples; None where it comes in segments."""
+    """Return the motion and rotation along the samples; None where it is processed in segments."""
     if len(waveform) > STRETCH:
         return None, None
     shape = MotionShape.of(path, imu, offset, site.gravity)
