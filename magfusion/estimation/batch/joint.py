@@ -87,7 +87,7 @@ def known_by(shared: Shared, logs: Sequence[Said], at: Array) -> Known:
 
     Parameters
     ----------
-    logs : sequence of log informations
+    logs : sequence of `Said`
         Any number.
     at : ndarray, shape (s,)
         From the declared calibration to the linearisation point of the step.

@@ -39,7 +39,7 @@ class OfLog:
         Estimated when it was smoothed alone.
     standing : bool ndarray, shape (states,)
         Where the platform is at rest.
-    said : log information
+    said : `Said`
         Its information on the shared calibration.
     """
 
