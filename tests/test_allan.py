@@ -259,7 +259,7 @@ def test_a_short_log_does_not_know_the_walk_of_a_bias(resting: Path) -> None:
 
 def test_too_few_samples_are_refused(resting: Path, tmp_path: Path, refuse: Refuse) -> None:
     said = refuse("allan", resting, "--end", "1", "-o", tmp_path / "out")
-    assert "has 100 samples in the part to use; record at rest for some minutes" in said
+    assert "has 100 samples in the selected part; record at rest for at least some minutes" in said
     assert "there is no such file" in refuse("allan", tmp_path / "nowhere")
 
 

@@ -53,7 +53,7 @@ def test_fixes_of_one_beacon_are_told_to_be_ambiguous(
     run_command("fix", tmp_path / "log", "-o", tmp_path / "run")
     out, figures = capfd.readouterr().out, _report(tmp_path / "run")
     assert figures["ambiguous_epochs"] == figures["epochs"]
-    assert "epochs are ambiguous: fixes.parquet holds every pose" in out
+    assert "epochs are ambiguous: fixes.parquet has every pose" in out
 
 
 def test_what_one_coil_leaves_open_is_told_and_not_smoothed_over(
@@ -65,7 +65,7 @@ def test_what_one_coil_leaves_open_is_told_and_not_smoothed_over(
     run_command("fix", log, "-o", tmp_path / "fixes")
     out, figures = capfd.readouterr().out, _report(tmp_path / "fixes")
     assert figures["undetermined_epochs"] == figures["epochs"]
-    assert "leave a direction of the pose open" in out
+    assert "do not determine the pose in one direction" in out
     with pytest.raises(SystemExit) as ended:
         main(["smooth", str(log), "-o", str(tmp_path / "run"), "--window", "0.4"])
     err = capfd.readouterr().err

@@ -232,7 +232,7 @@ BAD_OPTIONS = [
     ("simulate -o OUT --seed -1", "--seed must not be negative"),
     ("simulate -o OUT --seed 1.5", "--seed.*integer"),
     ("simulate -o OUT --motion foo", "'walk', 'turn', 'static'"),
-    ("simulate -o OUT --box 1,2", "--box '1,2': six numbers"),
+    ("simulate -o OUT --box 1,2", "--box '1,2': give six numbers"),
     ("simulate -o OUT --box 1,2,1,2,nan,3", "each lower limit must be below its upper"),
     ("simulate -o OUT --box 2,1,1,2,1,3", "each lower limit must be below its upper"),
     ("simulate -o OUT --site NONE", "NONE: there is no such file"),

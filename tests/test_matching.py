@@ -239,7 +239,7 @@ def test_three_angles_of_one_vector_are_refused_with_what_is_lacking(
 
 def test_too_few_attitudes_are_refused() -> None:
     rpy = np.repeat(attitudes(3), 100, axis=0)
-    with pytest.raises(InputError, match="needs 12"):
+    with pytest.raises(InputError, match="requires 12"):
         build_database(predict_field(rpy, FIELD_WORLD), matrices(rpy), "log")
 
 

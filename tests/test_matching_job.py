@@ -157,7 +157,7 @@ def test_a_platform_whose_yaw_wanders_makes_no_database(logs: Path, refuse: Refu
         ((), "give the yaw"),
         (("--angles", "roll-pitch-yaw"), "two of three angles"),
         (("--angles", "roll-pitch-yaw", "--database", "nod_table"), "two of three angles"),
-        (("--angles", "roll", "--database", "nod_table"), "holds roll-pitch"),
+        (("--angles", "roll", "--database", "nod_table"), "has roll-pitch"),
         (("--angles", "roll", "--yaw-deg", "3"), "requires --pitch-deg"),
         (("--yaw-deg", "nan"), "--yaw-deg"),
         (("--yaw-deg", "3", "--database", "nod_table"), "those of the database"),

@@ -126,7 +126,7 @@ def box_option(text: str | None) -> Array | None:
     if np.max(np.abs(box)) > LARGEST_BOX or np.min(box[1] - box[0]) < SMALLEST_BOX:
         raise InputError(
             f"--box {text!r}: limits must lie within {LARGEST_BOX:g} m of the origin and at least"
-            f" {SMALLEST_BOX:g} m from each other"
+            f" {SMALLEST_BOX:g} m apart"
         )
     return box
 
