@@ -153,7 +153,7 @@ def test_amplitudes_among_phasors_are_refused(calibration: Calibration) -> None:
     site, samples = calibration.site, amplitudes(calibration, poses(), 1e-10)
     navigator = Navigator(site, NavigatorSettings("ekf"))
     navigator.add_fields(samples.rows(slice(0, 1)))
-    with pytest.raises(InputError, match="amplitudes without sign come among phasors"):
+    with pytest.raises(InputError, match="amplitudes without sign are mixed with phasors"):
         navigator.add_fields(replace(samples.rows(slice(1, 2)), signed=True))
 
 
