@@ -233,7 +233,7 @@ def test_the_name_of_the_only_one_is_taken_and_another_refused(tmp_path: Path) -
 
 
 def test_the_earth_field_of_several_is_refused(site: Site) -> None:
-    with pytest.raises(InputError, match="--earth measures by one magnetometer"):
+    with pytest.raises(InputError, match="--earth uses a single magnetometer"):
         Navigator(site, NavigatorSettings(earth=True))
 
 

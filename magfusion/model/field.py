@@ -52,9 +52,7 @@ class _Mapped(NamedTuple):
 
     model_beacon: AnyArray  # (..., coils, 3), field of each coil without the map
     correction: Array  # (..., 1, 3, 3), multiplies it
-    slope: (
-        AnyArray  # (..., coils, 3, 3), contribution of the map's gradient to the field gradient
-    )
+    slope: AnyArray  # (..., coils, 3, 3), contribution of the map's gradient to the field gradient
 
 
 def _mapped(source: Sources, offset_beacon: Array, model_beacon: AnyArray) -> _Mapped | None:

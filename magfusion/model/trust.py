@@ -64,7 +64,7 @@ CODES = {
     "imu_clock": "the IMU's clock runs at another rate than the magnetometer's",
     "imu_noise": "the inertial samples scatter by more than declared",
     "imu_spikes": "single samples of the inertial sensor are outliers",
-    "inertial_residuals": "IMU data are inconsistent with the magnetic-field solution",
+    "inertial_residuals": "the IMU data are inconsistent with the magnetic-field solution",
     "iron": "the fields deviate from the beacons' model, depending on position",
     "jitter": "stamps are uneven",
     "length_units": "the positions of beacons are in another unit",
