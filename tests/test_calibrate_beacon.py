@@ -151,7 +151,7 @@ def test_what_a_survey_cannot_tell_is_refused(tmp_path: Path, refuse: Refuse) ->
     far = survey_of(site, true_site, ROUND + np.array([60.0, 0.0, 0.0]))
     assert "to it" in refuse(*spoilt(tmp_path, far), *out)
     strange = replace(survey, channels=(("A", 0), ("Z", 0)))
-    assert "beacon Z is unknown" in refuse(*spoilt(tmp_path, strange), *out)
+    assert "beacon Z is not in the site" in refuse(*spoilt(tmp_path, strange), *out)
     assert "was not surveyed" in refuse(*spoilt(tmp_path, strange), *out, "--beacon", "B")
     assert "--beacon Q" in refuse(*spoilt(tmp_path, survey), *out, "--beacon", "Q")
     tones = replace(survey, channels=(("A", 0), ("A", 1)))

@@ -312,4 +312,4 @@ def claim_place(place: Path) -> None:
         elif path.name in (_ERROR_ROWS, _PACE_ROWS):
             claim_rows(path)
         elif not re.fullmatch(abandoned_pattern(r"(progress\.bin|(errors|pace)\.rows)"), path.name):
-            raise InputError(f"{path}: is not a file of an unfinished drift run; move it elsewhere")
+            raise InputError(f"{path}: is of no unfinished drift run and is kept; move it away")
