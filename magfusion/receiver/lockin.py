@@ -101,8 +101,7 @@ class WindowOperator:
         measured_sensor : ndarray, shape (samples, 3)
             (T).  Where a prediction has been subtracted, the noise next to the tones excludes
             the leakage of motion.  For the steady field, subtract the known offset or a
-            prediction first: the gyro rotates the samples, but these are fixed to the
-            platform.
+            prediction first: the gyro rotates an offset along with the samples.
         """
         samples, steady, _ = self.demodulate_both(measured_sensor)
         return samples, steady
