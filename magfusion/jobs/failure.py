@@ -3,12 +3,11 @@
 import json
 from pathlib import Path
 
-from magfusion.errors import EstimationError, InputError
+from magfusion.errors import UNOBSERVABLE, EstimationError, InputError
 from magfusion.model.trust import Finding, Trust, Verdict
 from magfusion.results.figures import Figure, Figures, Section, heading
 from magfusion.results.verdict import trust_figures
 
-OPEN = "the measurements do not determine the motion in one direction"
 # They report failures themselves, and their files allow a killed run to be resumed.
 _OWN = ("navigate", "drift")
 _SHOWN = {"job": Section.TITLE, "log": Section.TITLE} | dict.fromkeys(
@@ -73,5 +72,5 @@ def reason_of(error: RuntimeError) -> str:
     if isinstance(error, EstimationError):
         return str(error)
     if "Indeterminate" in str(error):
-        return OPEN
+        return UNOBSERVABLE
     raise error

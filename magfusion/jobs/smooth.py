@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from magfusion.errors import EstimationError, InputError
+from magfusion.errors import UNOBSERVABLE, EstimationError, InputError
 from magfusion.estimation.data_checks.recording import BRIDGED, beyond, recorded
 from magfusion.estimation.snapshot.coil_gain import with_found_gain
 from magfusion.estimation.solve.memory import give_back_memory
 from magfusion.files.checkpoint import claim_checkpoint, read_position, run_key
-from magfusion.jobs.failure import OPEN, reason_of
+from magfusion.jobs.failure import reason_of
 from magfusion.jobs.fix import write_fix_result
 from magfusion.jobs.rates import RateSettings, refuse_rate
 from magfusion.jobs.region import RegionSettings
@@ -344,9 +344,9 @@ def _save_fixes_instead(
     samples, dropped = phasors(log, site, settings.lockin)
     fixes = first_fixes(samples, log, initial_calibration(site, float(np.mean(samples.time))))
     code = "no_solution"
-    if reason.startswith(OPEN):
+    if reason.startswith(UNOBSERVABLE):
         code = "geometry" if np.mean(fixes.determined[:, 0]) < 0.5 else "diverged"
-        what = f"{OPEN}: add a beacon or a coil"
+        what = f"{UNOBSERVABLE}: add a beacon or a coil"
         reason = what if code == "geometry" else CONTRADICTION
     text = f"There is no trajectory: {reason}."
     none = Finding(code, text, Verdict.FAILED, weight=0.0)

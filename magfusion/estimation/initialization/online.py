@@ -150,7 +150,7 @@ def find_online_start(
     except (EstimationError, InputError) as error:
         return NoStart(f"{error}.")
     except (RuntimeError, np.linalg.LinAlgError):
-        return NoStart("The measurements leave a direction of the motion open.")
+        return NoStart("The measurements do not determine the motion in one direction.")
     if found.trust.verdict is Verdict.FAILED:
         return NoStart(found.trust.reasons[0].text, found.trust)
     return _start_of(found, log, site, settings.lockin)

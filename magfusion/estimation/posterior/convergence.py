@@ -4,7 +4,7 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 from scipy.spatial.transform import Rotation
 
-from magfusion.errors import EstimationError
+from magfusion.errors import UNOBSERVABLE, EstimationError
 from magfusion.estimation.graph.graph import Estimate, Graph
 from magfusion.estimation.solve.bordered import eliminate
 from magfusion.model.parameters import Calibration
@@ -56,9 +56,7 @@ def refuse_open(states: Trajectory) -> None:
     assert states.pose_cov is not None
     widest = np.linalg.eigvalsh(states.pose_cov[:, :3, :3])[:, -1]
     if np.min(widest) > OPEN_ROTATION**2:
-        raise EstimationError(
-            "the measurements leave a direction of the motion open: add a beacon or a coil"
-        )
+        raise EstimationError(f"{UNOBSERVABLE}: add a beacon or a coil")
 
 
 def settled_at(before: Trajectory, after: Trajectory, old: Calibration, new: Calibration) -> bool:
